@@ -54,11 +54,13 @@ class FramePoses:
 
     def locate_last(self, keyframe: int, T_keyframe_camera: Sequence[np.ndarray]) -> None:
         """The last frames, which were lost, have these poses [4, 4] relative to a keyframe that came after them."""
-        for k, T in enumerate(T_keyframe_camera, start=len(self.frames) - len(T_keyframe_camera)):
-            self.frames[k] = replace(
-                self.frames[k], keyframe=keyframe, T_keyframe_camera=T, status=TrackingStatus.RECOVERED.value,
-                reason="from the frame after it, with which a part of the map begins",
-            )  # fmt: skip
+        count, reason = len(T_keyframe_camera), "from the frame with which a part of the map begins"
+        located = [
+            replace(
+                frame, keyframe=keyframe, T_keyframe_camera=T, status=TrackingStatus.RECOVERED.value, reason=reason
+            ) for frame, T in zip(self.frames[len(self.frames) - count :], T_keyframe_camera, strict=True)
+        ]  # fmt: skip
+        self.frames = [*self.frames[: len(self.frames) - count], *located]  # checkpoints know a list that only grows
 
     def as_tracked(self, frame: TrackedFrame) -> np.ndarray:
         """T_world_camera [4, 4] of a frame that was just added as tracked."""

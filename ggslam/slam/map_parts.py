@@ -71,8 +71,11 @@ class MapParts:
             which = f"frames {first}-{last} are {name}, which" if last > first else f"frame {first} is {name}, which"
             reason = f"{which} could not be joined to the rest: no place of it was seen again"
             loops.events.append(LoopEvent("left out", first, frames[begin].keyframe, -1, reason))
-        for k in gone:
-            frames[k] = replace(frames[k], status=TrackingStatus.LOST.value, reason=NOT_JOINED)
+        left = set(gone)
+        self._poses.frames = [
+            replace(frame, status=TrackingStatus.LOST.value, reason=NOT_JOINED) if k in left else frame
+            for k, frame in enumerate(frames)
+        ]
         self._mapper.leave_out(set(range(len(loops.poses))) - kept)
         first_kept = min(kept)
         if first_kept > 0:  # the world is its first keyframe's camera

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ import pytest
 from kept import build_once, generated_recording, session_folder
 from lost_camera import BEGINNING, COVERED, way, write_lost_camera
 
-from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.jobs.progress import SilentObserver
+from ggslam.jobs.run.pipeline import RunRequest, execute, resume
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.loops import LoopsRecord
@@ -24,7 +25,7 @@ from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
 from ggslam.slam.map_parts import NOT_JOINED
 from ggslam.slam.realtime import RealtimeSlam
-from ggslam.slam.result import SlamResult
+from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.saved_state import describe_state, restore_state
 from ggslam.slam.slam import Slam
 from ggslam.slam.verdicts import judge_run
@@ -42,7 +43,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return generated_recording(tmp_path_factory, "walk", frames=100, width=160, height=120, trajectory="round")
 
 
-def recording(factory: pytest.TempPathFactory, walk: Path, name: str, frames: list[int], covered: range) -> Path:
+def recording(
+    factory: pytest.TempPathFactory, walk: Path, name: str, frames: list[int], covered: Iterable[int]
+) -> Path:
     folder = session_folder(factory) / "recordings" / name
     return build_once(folder, lambda out: write_lost_camera(out, walk, frames, covered))
 
@@ -163,6 +166,25 @@ def test_a_smaller_part_is_left_out(walk: Path, tmp_path_factory: pytest.TempPat
     assert np.abs(alone.trajectory()[:30] - result.trajectory()[:30]).max() < 0.005
 
 
+@pytest.mark.long("two runs of a hundred frames")
+@pytest.mark.parametrize(("third", "gone"), [(range(60, 99), range(10)), (range(60, -1, -1), range(18, 30))])
+def test_of_three_parts_two_are_joined(
+    walk: Path, tmp_path_factory: pytest.TempPathFactory, third: range, gone: range
+) -> None:
+    """The third leads to the second, or to the first; the other one is left out."""
+    after = [*range(99, 87, -1), *np.linspace(87, 60, COVERED).round().astype(int), *third]
+    hidden = [*HIDDEN, *range(30, 38)]
+    frames = frames_of(recording(tmp_path_factory, walk, f"three{gone.start}", way(BEGINNING, after), hidden))
+    result = run(frames).finish()
+    assert len([event for event in result.loop_events if event.kind == "new part"]) == 2
+    assert lost(result) == sorted({*gone, *hidden})
+    errors = errors_mm(result, frames)
+    assert np.sqrt((errors**2).mean()) < 25 and errors.max() < 60
+    assert_in_one_room(result)
+    number = 1 if gone.start == 0 else 2
+    assert judge_parts(result)[0].startswith(f"frames {gone.start}-{gone.stop - 1} are part {number}")
+
+
 def test_parts_are_compared_once_more_at_the_end(back: Path, joined: tuple[Slam, SlamResult]) -> None:
     """One loop was verified, no second one confirmed it: pairs of keyframes from anywhere may."""
     frames = frames_of(back)
@@ -194,6 +216,43 @@ def test_another_run_goes_on_bit_for_bit(back: Path, joined: tuple[Slam, SlamRes
         ours, theirs = (getattr(r.gaussians, name).detach().numpy() for r in (result, whole))
         assert ours.tobytes() == theirs.tobytes(), name
     assert result.places == whole.places
+
+
+class KilledAt(SilentObserver):
+    """Kills a run after a frame, or, if that never comes, in its refinement."""
+
+    def __init__(self, frame: int) -> None:
+        self._frame, self._stage = frame, ""
+
+    def begin(self, stage: str, total: int) -> None:
+        self._stage = stage
+
+    def frame(self, report: StepReport) -> None:
+        if report.frame.frame_index == self._frame:
+            raise SystemExit
+
+    def advance(self, done: int, total: int) -> None:
+        if self._stage == "refine" and done >= 20:
+            raise SystemExit
+
+
+@pytest.mark.long("four runs, three of them in two halves")
+def test_a_run_that_is_killed_goes_on_from_its_checkpoint(away: Path, tmp_path: Path) -> None:
+    """Amidst the frames that are watched (some were saved as lost before), in the new part, and after the other one
+    was left out."""
+
+    def request(out: str) -> RunRequest:
+        cheap = [*CHEAP, "refine_iterations=40"]
+        return RunRequest(SequenceRequest(away), tmp_path / out, overrides=cheap, evaluate=False, checkpoint_every=4)
+
+    execute(request("whole"))
+    for at in (23, 35, 1000):
+        out = f"killed{at}"
+        with pytest.raises(SystemExit):
+            execute(request(out), KilledAt(at))
+        resume(tmp_path / out, checkpoint_every=4)
+        for name in ("trajectory.txt", "keyframes.json", "map.ply", "places.npz", "points.ply"):
+            assert (tmp_path / out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), (at, name)
 
 
 def behind_a_board(frames: Sequence[Frame], hidden: range) -> list[Frame]:
