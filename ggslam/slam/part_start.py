@@ -70,7 +70,7 @@ class PartStart:
         """Whether a part may begin with this frame, which was watched last."""
         recovery = tracker.settings.recovery
         enough = 0 < recovery.new_part_after <= len(self.poses)
-        return enough and frame.timestamp - self.since >= recovery.new_part_seconds
+        return enough and not 0 < frame.timestamp - self.since < recovery.new_part_seconds  # 0: there are no times
 
     def begin(
         self, keyframe: int, lost: TrackingResult, surface: MeasuredSurface, T_world_camera: np.ndarray,

@@ -218,6 +218,36 @@ def test_another_run_goes_on_bit_for_bit(back: Path, joined: tuple[Slam, SlamRes
     assert result.places == whole.places
 
 
+@pytest.mark.parametrize(
+    ("settings", "times", "begins"),
+    [
+        ((), True, 27),
+        (("tracking.recovery.new_part_after=3",), True, 27),
+        (("tracking.recovery.new_part_after=2", "tracking.recovery.new_part_seconds=0"), True, 19),
+        (("tracking.recovery.new_part_after=3", "tracking.recovery.new_part_seconds=0.12"), True, 22),
+        (("tracking.recovery.new_part_after=2",), False, 19),
+        (("tracking.recovery.new_part_after=11",), True, 29),  # frame 28 is held out for scoring
+        (("loops.enabled=false",), True, None),
+        (("memory_limit_mb=4000",), True, None),
+    ],
+)
+def test_when_a_part_begins(away: Path, settings: tuple[str, ...], times: bool, begins: int | None) -> None:
+    """Ten frames, and three tenths of a second: whichever comes later. The frames that were waited for belong to it."""
+    frames = frames_of(away)[:35]
+    if not times:
+        frames = [dataclasses.replace(frame, timestamp=0.0) for frame in frames]
+    slam = run(frames, *settings)
+    firsts = [keyframe.frame_index for keyframe in slam.mapper.keyframes if keyframe.frame_index >= 18]
+    statuses = [frame.status for frame in slam.frames]
+    slam.close()
+    if begins is None:
+        assert not firsts and statuses[10:] == ["lost"] * 25
+        return
+    assert firsts[0] == begins and statuses[begins] == "first"
+    assert statuses[10:18] == ["lost"] * 8 and statuses[18:begins] == ["recovered"] * (begins - 18)
+    assert "lost" not in statuses[begins:]
+
+
 class KilledAt(SilentObserver):
     """Kills a run after a frame, or, if that never comes, in its refinement."""
 
