@@ -16,6 +16,7 @@ from ggslam.mapping.keyframe import make_keyframe
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import se3_exp
 from ggslam.sequences import open_sequence
+from ggslam.slam.loop_closing import LoopEvent
 from ggslam.slam.result import StepReport, TrackedFrame
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import extract_mesh
@@ -91,6 +92,25 @@ def test_lost_frames_are_left_out(frames: list[Frame]) -> None:
     slam.play(live, frames[1], np.full((4, 4), np.nan), status="lost")
     assert maps.tsdf.revision == before and len(seen) == len(maps.times.rows) == 1
     assert maps.times.summary()["all"]["mean_ms"] > 500  # a robot waits for the pose, too
+
+
+def test_what_was_left_out_in_the_end_is_not_in_the_volumes(frames: list[Frame]) -> None:
+    """A part of the recording that nothing joined lay a hundred metres above."""
+    maps, slam, above = VolumeMaps(SETTINGS, esdf=True), Played(), np.eye(4)
+    above[1, 3] = -100
+    live = LiveVolumes(maps, lambda frame, T: None, objects=False)
+    for k, frame in enumerate(frames[:4]):
+        slam.play(live, frame, (above if k > 1 else np.eye(4)) @ frame.T_world_camera)
+    assert len({at[1] < -50 / (8 * SETTINGS.tsdf.voxel) for at in values(maps)}) == 2
+    events = [LoopEvent("new part", 2, -1, -1, ""), LoopEvent("left out", 2, -1, -1, "")]
+    result: Any = SimpleNamespace(loop_events=events, keyframes=slam.mapper.keyframes[:2])
+    assert live.follow_parts(result)
+    kept = VolumeMaps(SETTINGS, esdf=True)
+    for frame in frames[:2]:
+        kept.add(frame, frame.T_world_camera)
+    found, expected = values(maps), values(kept)
+    assert found.keys() == expected.keys() and len(found) > 50
+    assert not live.follow_parts(SimpleNamespace(loop_events=[], keyframes=[]))  # type: ignore[arg-type]
 
 
 def test_objects_that_turn_out_to_be_one_get_one_id(frames: list[Frame]) -> None:
