@@ -7,7 +7,7 @@ another either; they begin nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,11 +18,29 @@ from ggslam.tracking.gicp import AlignmentStatus, GicpTarget, align
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
-from ggslam.tracking.tracker import Tracker, TrackingResult
+from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
 
+MOST_KEPT = 8
+"""Frames that are kept to become keyframes."""
 APART = 12.5
 """How far apart parts are laid, in units of the farthest depth that is used: 100 m in a room, where float32 still tells
 hundredths of a millimetre."""
+
+
+@dataclass(frozen=True)
+class PartBeginning:
+    """What a part begins with.
+
+    Attributes:
+        keyframes: of the frames watched before the last; there may be none.
+        T_world_camera: [4, 4], of the last.
+        T_first_camera: of the frames watched before it, [4, 4] each, in the camera's frame of the first keyframe (of
+            the last frame, if there is none).
+    """
+
+    keyframes: list[tuple[Frame, TrackingResult]]
+    T_world_camera: np.ndarray
+    T_first_camera: list[np.ndarray]
 
 
 @dataclass
@@ -37,7 +55,8 @@ class PartStart:
         reference: number in `poses` and points of the frame that the next one is aligned to.
         before: points of the latest.
         turned: float64 [4, 4], how the image had turned by then since the camera was lost (`CameraMotion.turned`).
-        keyframe: number of the keyframe that began the newest part.
+        kept: frames of these that may become keyframes, with their numbers in `poses` and their points.
+        keyframe: number of the last keyframe that the newest part began with.
         target: what frames are aligned to until that is in.
     """
 
@@ -47,12 +66,13 @@ class PartStart:
     reference: tuple[int, FramePoints] | None = None
     before: FramePoints | None = None
     turned: np.ndarray = field(default_factory=lambda: np.eye(4))
+    kept: list[tuple[int, Frame, FramePoints]] = field(default_factory=list)
     keyframe: int = -1
     target: GicpTarget | None = None
 
     def forget(self) -> None:
         """The camera is not lost, or shows nothing that it could be tracked by."""
-        self.poses, self.reference, self.before = [], None, None
+        self.poses, self.kept, self.reference, self.before = [], [], None, None
 
     def watch(self, frame: Frame, lost: TrackingResult, tracker: Tracker, context: NativeContext) -> None:
         """A frame was lost, and no place tells where it is."""
@@ -61,7 +81,7 @@ class PartStart:
             return
         points, T = lost.points.read(), self._locate(lost, tracker, context)
         if T is None:
-            T, self.poses, self.reference = np.eye(4), [], (0, points)
+            T, self.poses, self.kept, self.reference = np.eye(4), [], [], (0, points)
             self.first, self.since = frame.index, frame.timestamp
         self.poses.append(T)
         self.before, self.turned = points, tracker.state.motion.turned.copy()
@@ -72,21 +92,42 @@ class PartStart:
         enough = 0 < recovery.new_part_after <= len(self.poses)
         return enough and not 0 < frame.timestamp - self.since < recovery.new_part_seconds  # 0: there are no times
 
-    def begin(
-        self, keyframe: int, lost: TrackingResult, surface: MeasuredSurface, T_world_camera: np.ndarray,
-        context: NativeContext,
-    ) -> list[np.ndarray]:  # fmt: skip
-        """A part begins with a keyframe [4, 4]; frames are aligned to its points until it is in the surface.
+    def keep(self, frame: Frame, with_mask: bool, gap: int) -> None:
+        """The frame that was watched last may become a keyframe; it is kept unless one was so few frames ago, or enough
+        are. Its mask is read now, for the recording may be read elsewhere by then."""
+        number = len(self.poses) - 1
+        if self.before is None or len(self.kept) >= MOST_KEPT or (self.kept and number - self.kept[-1][0] < gap):
+            return
+        mask = frame.load_mask() if with_mask else None
+        self.kept.append((number, replace(frame, mask=mask, mask_loader=None, T_world_camera=None), self.before))
 
-        Returns:
-            Where the watched frames before it were, in its camera's frame [4, 4], in their order.
+    def begin(
+        self, keyframe: int, lost: TrackingResult, surface: MeasuredSurface, T_world_first: np.ndarray,
+        context: NativeContext,
+    ) -> PartBeginning:  # fmt: skip
+        """A part begins with the frames that were watched; frames are aligned to what its keyframes show until they are
+        in the surface.
+
+        Args:
+            keyframe: number of its first keyframe.
+            lost: what tracking said of the frame watched last.
+            surface: that keyframes will join.
+            T_world_first: where the first of the frames is to be [4, 4].
+            context: threads.
         """
         own = MeasuredSurface(surface.settings, context)
         own.finish = surface.finish
-        self.keyframe, self.target = keyframe, own.add(lost.points, T_world_camera)
-        *earlier, last = self.poses
+        keyframes, reason = [], "a new part of the map begins"
+        for number, frame, points in self.kept:
+            T = T_world_first @ self.poses[number]
+            own.add(points, T)
+            keyframes.append((frame, TrackingResult(T, TrackingStatus.FIRST, 1.0, 0.0, reason, points)))
+        T_world_last = T_world_first @ self.poses[-1]
+        self.keyframe, self.target = keyframe + max(0, len(keyframes) - 1), own.add(lost.points, T_world_last)
+        anchor = self.kept[0][0] if self.kept else len(self.poses) - 1
+        found = [inverse(self.poses[anchor]) @ T for T in self.poses[:-1]]
         self.forget()
-        return [inverse(last) @ T for T in earlier]
+        return PartBeginning(keyframes, T_world_last, found)
 
     def _locate(self, lost: TrackingResult, tracker: Tracker, context: NativeContext) -> np.ndarray | None:
         """The pose of a lost frame among those watched [4, 4]; None if it cannot be tracked from them."""

@@ -84,6 +84,8 @@ class RealtimeSlam:
         with self._beside_mapper:
             tracking = slam.track(frame)
         frame = slam.without_movers(frame)
+        for early in slam.take_early():
+            self._jobs.put((*early, slam.moves_followed))
         is_keyframe = slam.takes_keyframes and slam.wants_keyframe(frame, tracking)
         if is_keyframe:
             slam.poses.add_keyframe(tracking.T_world_camera)

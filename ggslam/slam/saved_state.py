@@ -51,6 +51,7 @@ from ggslam.objects.evidence import PairEvidence, _Pair
 from ggslam.objects.fragments import Fragment, FragmentMemory
 from ggslam.objects.table import Observation
 from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.sequences.moving_pixels import MovingPixels
@@ -287,7 +288,7 @@ RULES: Rules = {
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
          ShutterTimes, RigClock, EarlierViews, EarlierView, KeyframeParts, FramePoints,
-         LeftParts),
+         LeftParts, Frame),
         Rule(),
     ),
 }  # fmt: skip

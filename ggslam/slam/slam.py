@@ -35,6 +35,7 @@ from ggslam.slam.depth_edges import DepthEdges
 from ggslam.slam.earlier_views import EarlierViews
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.left_parts import LeftParts
+from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
 from ggslam.slam.part_start import PartStart, pose_apart
@@ -110,6 +111,7 @@ class Slam:
         self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
         self.earlier_views = EarlierViews()
         self.part_start, self.left_parts = PartStart(), LeftParts()
+        self._early: list[tuple[Frame, TrackingResult]] = []
         self.takes_keyframes = True
         """Whether the next keyframe would be taken now; in real time none is while too many wait."""
         self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"), self.context)
@@ -155,6 +157,8 @@ class Slam:
         frame = self.receive(frame)
         tracking = self.track(frame)
         frame = self.without_movers(frame)
+        for early in self.take_early():
+            self.insert(*early, self.moves_followed)
         is_keyframe = self.wants_keyframe(frame, tracking)
         if is_keyframe:
             self.tracker.target = None  # the surface may be made anew; the next frame gets what it is then
@@ -332,16 +336,35 @@ class Slam:
         if loops is None or not self.growing or not wanted:
             return lost
         start.watch(frame, lost, self.tracker, self.tracker.context)
-        held_out = self.config.evaluation.is_held_out(frame.index)
-        if held_out or not self.takes_keyframes or not start.is_due(frame, self.tracker):
+        if self.config.evaluation.is_held_out(frame.index) or not self.takes_keyframes:
             return lost
-        self.left_parts.leave(*self.poses.anchor, self.tracker)
-        T = pose_apart(lost.T_world_camera, self.surface.poses, self.tracker.settings.points.max_depth)
-        loops.begin_part(frame, start.first)
-        keyframe = self.poses.keyframes_made
-        self.poses.locate_last(keyframe, start.begin(keyframe, lost, self.surface, T, self.tracker.context))
+        if start.is_due(frame, self.tracker):
+            return self._begin_part(frame, lost, loops)
+        start.keep(frame, self.masks.active, self.config.keyframes.max_gap)
+        return lost
+
+    def _begin_part(self, frame: Frame, lost: TrackingResult, loops: LoopCloser) -> TrackingResult:
+        """A part of the map begins with the frames that were lost; what tracking says of the last of them."""
+        start, tracker = self.part_start, self.tracker
+        self.left_parts.leave(*self.poses.anchor, tracker)
+        T_world_first = pose_apart(lost.T_world_camera, self.surface.poses, tracker.settings.points.max_depth)
+        keyframe, first = self.poses.keyframes_made, start.first
+        begun = start.begin(keyframe, lost, self.surface, T_world_first, tracker.context)
+        loops.begin_part(begun.keyframes[0][0] if begun.keyframes else frame, first)
+        self.poses.locate_last(keyframe, begun.T_first_camera)
         self.policy.begin_again()
-        return self.tracker.begin_part(FeatureView(frame.color, frame.depth, T), lost.points, T)
+        for early, tracking in begun.keyframes:
+            self.policy.decide(early.index, tracking)
+            self.poses.add_keyframe(tracking.T_world_camera)
+        self._early = begun.keyframes
+        T = begun.T_world_camera
+        return tracker.begin_part(FeatureView(frame.color, frame.depth, T), lost.points, T)
+
+    def take_early(self) -> list[tuple[Frame, TrackingResult]]:
+        """Keyframes to insert before the frame that was tracked last: of those that a part begins with. `poses` knows
+        them."""
+        early, self._early = self._early, []
+        return early
 
     def without_movers(self, frame: Frame) -> Frame:
         """The frame that was tracked last as the map gets it: without depth where something moves."""
