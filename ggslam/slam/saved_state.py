@@ -80,6 +80,7 @@ from ggslam.tracking.keyframes import KeyframeKind, KeyframePolicy
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.residual_noise import ResidualNoise
 from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.still_camera import SmallFrame, StillCamera
 from ggslam.tracking.surface import MeasuredSurface, _Part
 from ggslam.tracking.tracker import TrackerState
 
@@ -269,7 +270,7 @@ RULES: Rules = {
     # plain values
     **dict.fromkeys(
         (Camera, CameraFixtures, Trail, Track, MoverSight, Patch, RigidTracker, DepthEdges, DepthNoise,
-         ResidualNoise, KeyframeKind,
+         ResidualNoise, StillCamera, SmallFrame, KeyframeKind,
          FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
          KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers,
          IdentityClassifier,

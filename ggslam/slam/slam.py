@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop: frames in, trajectory and map out.
 
-    sequence = open_sequence("recording", scale=0.5)
-    slam = Slam(sequence.camera)
-    for frame in sequence.stream():
-        slam.step(frame)
-    result = slam.finish()
+sequence = open_sequence("recording", scale=0.5)
+slam = Slam(sequence.camera)
+for frame in sequence.stream():
+    slam.step(frame)
+result = slam.finish()
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ from ggslam.system.process_memory import trim
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.scale import scale_settings, scene_scale
 from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.still_camera import still_notes
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 TRIM_EVERY = 8
@@ -240,7 +241,8 @@ class Slam:
             gaussians, self.mapper.keyframes, self.frames, self.times, self.mapper.times, self.dropped_frames,
             self.refine_iterations, objects, self.loops.events if self.loops else [],
             self._places(gaussians, cells), cells, None if self.pager is None else self.pager.report(),
-            [*self._notes, *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
+            [*self._notes, *still_notes(self.tracker.state.still.frames, len(self.frames)),
+             *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
              *self.earlier_views.notes(),
              *([] if self.pager is None else self.pager.budget.notes)],
             None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),

@@ -23,6 +23,7 @@ from ggslam.tracking.points import PointSource
 from ggslam.tracking.seen_before import share_seen_before
 from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
 from ggslam.tracking.shared_features import JUMP_SLACK, SharedFeatures
+from ggslam.tracking.still_camera import SmallFrame
 from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
 
 MIN_TEXTURED = 200
@@ -87,10 +88,16 @@ class GicpTracker(Tracker):
         motion.wary = max(0, motion.wary - 1)
         view = FeatureView(frame.color, frame.depth, motion.T_world_camera)
         motion.watch(frame.color, self.camera)
+        small, still = SmallFrame.of(frame.color, frame.depth), self.state.still
         if target is None:
+            still.renew(small, motion.T_world_camera)
             return self._begin(view, points)
         self.noise = noise  # what could not be measured before the first keyframe is taken as usual
         self._features = None
+        if not motion.lost and still.holds(small, noise):
+            stayed = self._stay(view, points, target)
+            if stayed is not None:
+                return stayed
         found, reason = self._locate(view, points, target)
         if not motion.wary and found.photometric_share > 0 and motion.is_sudden(found.photometric_residual):
             motion.wary = self.settings.recovery.wary_frames
@@ -102,6 +109,7 @@ class GicpTracker(Tracker):
         self._look_at_residuals(points, found)
         doubt = self._features.contradict(T, JUMP_SLACK) if self._features is not None else ""
         self._features = None
+        still.renew(small, T)
         motion.follow(view, T)
         if found.photometric_share > 0:
             motion.note_greys(found.photometric_residual)
@@ -113,6 +121,20 @@ class GicpTracker(Tracker):
         return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
 
     # --- parts -------------------------------------------------------------------------------------------------------
+
+    def _stay(self, view: FeatureView, points: PointSource, target: GicpTarget) -> TrackingResult | None:
+        """A camera that stands still is where it was, whatever moves before it; None: too little matches the map."""
+        still, motion = self.state.still, self.state.motion
+        assert still.T_world_camera is not None
+        found = self._align(points, target, still.T_world_camera, None, coarse=False)
+        if found.status is AlignmentStatus.LOST:
+            return None
+        T = still.T_world_camera
+        still.frames += 1
+        motion.follow(view, T.copy())
+        motion.remember(view, points, self.settings)
+        held = dataclasses.replace(found, T_world_camera=T.copy())
+        return TrackingResult(T.copy(), TrackingStatus.OK, found.overlap, found.rmse, "", points, held, still=True)
 
     def _points(self, depth: np.ndarray, noise: DepthNoise) -> PointSource:
         settings = self.settings.points
@@ -348,6 +370,7 @@ class GicpTracker(Tracker):
     def _give_up(self, points: PointSource, found: AlignmentResult) -> TrackingResult:
         """Stays where it was last known, standing still."""
         self.state.motion.lose()
+        self.state.still.forget()
         limit = self.settings.recovery.min_overlap
         reason = f"{found.overlap:.0%} of {len(points)} points match the map, {limit:.0%} needed, from every start"
         if found.overlap >= limit:
