@@ -18,8 +18,8 @@ from rich.markup import escape
 from ggslam.cli import options, settings_help
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
-from ggslam.cli.summary import print_scores
-from ggslam.errors import ConfigError
+from ggslam.cli.summary import print_scores, print_verdict
+from ggslam.errors import ConfigError, TrackingLostError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.jobs.run.pipeline import RunOutcome, RunRequest
@@ -54,7 +54,7 @@ _WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host",
 
 
 STRICT_EXIT_CODE = 3
-"""Of runs that came to an end, but with verdicts, under --strict."""
+"""Of runs that came to an end, but are bad or of a recording that seems wrong, under --strict."""
 
 
 class DeviceName(str, Enum):
@@ -118,7 +118,7 @@ CheckpointEvery = Annotated[
     ),
 ]
 Strict = Annotated[
-    bool, typer.Option("--strict", help="Exit with code 3 if something seems wrong with the recording or the run.")
+    bool, typer.Option("--strict", help="Exit with code 3 if the verdict is bad or something seems wrong.")
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in the output folder.")]
 
@@ -270,18 +270,29 @@ def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) 
             wait_for_interrupt(lambda: console.print(text, highlight=False, markup=False))
     if outcome.error is not None:
         raise outcome.error
-    if watched.strict and outcome.verdicts:
+    if failure := _failure(outcome):
+        raise TrackingLostError(f"{failure}; what there is was saved to {outcome.folder.path}")
+    if watched.strict and (outcome.verdicts or (outcome.verdict is not None and outcome.verdict.grade == "bad")):
         raise typer.Exit(STRICT_EXIT_CODE)
 
 
 def _print(outcome: RunOutcome) -> None:
     console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
-    if outcome.metrics is not None:
+    if outcome.metrics is not None and not _failure(outcome):  # scores of the few frames that were located mislead
         print_scores(outcome.metrics)
     for verdict in outcome.verdicts:
         console.print(f"[yellow]{verdict.severity}:[/] {escape(verdict.text)}", highlight=False)
+    if outcome.verdict is not None:
+        print_verdict(outcome.verdict)
+    if _failure(outcome):
+        return
     for hint in next_commands(outcome.folder.path) if outcome.error is None else go_on_command(outcome.folder.path):
         console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks
+
+
+def _failure(outcome: RunOutcome) -> str:
+    """Why the run is no result, as a sentence; "": it is one."""
+    return "" if outcome.verdict is None else outcome.verdict.failure
 
 
 def go_on_command(run: Path) -> list[str]:

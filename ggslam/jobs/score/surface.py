@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, GgslamError
 from ggslam.evaluation.surface import SurfaceScores, score_surface
 from ggslam.formats.point_ply import METRIC_FILE, read_points
 from ggslam.formats.voxel_cloud import VoxelCloud
@@ -68,7 +68,11 @@ class SurfaceScorer:
             self.reason = f"{METRIC_FILE} is scored against the depth of the frames up to {frame.index}"
             return
         depth = frame.depth if frame.moving is None else np.where(frame.moving, np.float32(0), frame.depth)
-        self._tsdf.integrate(depth, frame.camera, T_world_camera)
+        try:
+            self._tsdf.integrate(depth, frame.camera, T_world_camera)
+        except GgslamError as error:  # depth that goes too far for the voxels of the points
+            self.reason, self._tsdf = f"its points are not scored: {error}", None
+            return
         rest = np.flatnonzero(~self._measured)
         row, column, inside = frame.camera.project(transform_points(self._points[rest], inverse(T_world_camera)))
         self._measured[rest] = inside & (depth[row, column] > 0)

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well the map of a run shows its keyframes: the figures that `verdict.json` stands on.
+
+Each of some keyframes is rendered from its refined pose, in its own exposure, and compared where depth was measured and
+nothing moved. Colours are divided by the brightness of the keyframe first, so that a dark image counts as a bright one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ggslam.evaluation.images import ssim_map
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.rendering.cpu import CpuRasterizer
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.tracking.noise import estimate_noise
+from ggslam.tracking.settings import DepthNoise
+
+LOOKED_AT = 12
+"""Keyframes, spread over the run."""
+SAME_DEPTH, SIGMAS = 0.05, 3.0
+"""Depths agree within this share of the measured depth or so many standard deviations of its noise."""
+BRIGHT, DARKEST = 0.8, 0.02
+"""The 95th percentile of a keyframe's values is brought here; that of a darker image than this is taken for this."""
+BLURS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0)
+"""Pixels: standard deviations of the blurs that a rendering is likened to."""
+FEWEST_PIXELS = 500
+"""With depth, or a keyframe tells nothing."""
+_OPAQUE = 0.5
+
+
+@dataclass(frozen=True)
+class MapFit:
+    """Medians over keyframes; `agreeing` and `covered` are means.
+
+    Attributes:
+        views: keyframes that were compared.
+        psnr: dB, in the keyframe's own exposure.
+        ssim: of the same.
+        blur: the Gaussian blur of the keyframe that is as far from it as the rendering, standard deviation in
+            thousandths of the image's width.
+        brightness: of the map against the keyframes: 1: as bright.
+        agreeing: share of the pixels with depth whose rendered depth is the measured one, see `SAME_DEPTH`.
+        covered: share of them that have a rendered depth.
+        depth_error: median of |rendered - measured| / measured.
+    """
+
+    views: int
+    psnr: float
+    ssim: float
+    blur: float
+    brightness: float
+    agreeing: float
+    covered: float
+    depth_error: float
+
+
+def measure_fit(
+    keyframes: Sequence[Keyframe], map_in_view: Callable[[Camera, np.ndarray], GaussianMap]
+) -> MapFit | None:
+    """Compares a map with what it was made from; None: no keyframe of this run has enough depth.
+
+    Args:
+        keyframes: of the run, their images still there.
+        map_in_view: what of the map a camera at T_camera_world [4, 4] may see.
+    """
+    rasterizer, rows = CpuRasterizer(), []
+    for keyframe in _spread([k for k in keyframes if k.frame_index != ELSEWHERE]):
+        view = rasterizer.forward(
+            map_in_view(keyframe.camera, keyframe.T_camera_world), keyframe.camera, keyframe.T_camera_world,
+            features=False,
+        )  # fmt: skip
+        depth = np.where(view.alpha.numpy() > _OPAQUE, view.expected_depth.numpy(), 0)
+        row = _compare(keyframe, view.image.numpy().transpose(1, 2, 0), depth)
+        rows += [] if row is None else [row]
+    return _summary(rows)
+
+
+def _spread(keyframes: list[Keyframe]) -> Iterable[Keyframe]:
+    chosen = np.linspace(0, len(keyframes) - 1, min(LOOKED_AT, len(keyframes))).round().astype(int)
+    return (keyframes[i] for i in chosen.tolist())
+
+
+def _compare(keyframe: Keyframe, image: np.ndarray, rendered: np.ndarray) -> list[float] | None:
+    """Figures of one keyframe in the order of `MapFit`; `image` [H, W, 3] in the map's exposure."""
+    depth, color = keyframe.depth_m(), keyframe.color.astype(np.float32) / 255
+    known = depth > 0
+    if keyframe.moving is not None:
+        known &= ~keyframe.moving
+    if known.sum() < FEWEST_PIXELS:
+        return None
+    gain, offset = keyframe.exposure.astype(np.float32).T
+    own = np.clip(image * gain + offset, 0, 1)
+    level = BRIGHT / max(float(np.percentile(color[known], 95)), DARKEST)
+    square = float(np.square(own - color)[known].mean())
+    brightness = float(np.clip(image, 0, 1)[known].mean() / max(float(color[known].mean()), 1e-3))
+    return [
+        -10 * np.log10(max(square, 1e-10)), float(ssim_map(level * own, level * color)[known].mean()),
+        _blur_like(square, color, known), brightness, *_compare_depth(depth, rendered, known, keyframe.camera),
+    ]  # fmt: skip
+
+
+def _blur_like(square: float, color: np.ndarray, known: np.ndarray) -> float:
+    """The blur of an image [H, W, 3] with this mean square error, thousandths of its width."""
+    blurred = (cv2.GaussianBlur(color, (0, 0), sigma) for sigma in BLURS)
+    errors = np.maximum.accumulate([float(np.square(b - color)[known].mean()) for b in blurred])
+    return 1000 * float(np.interp(square, errors, BLURS)) / color.shape[1]
+
+
+def _compare_depth(
+    depth: np.ndarray, rendered: np.ndarray, known: np.ndarray, camera: Camera
+) -> tuple[float, float, float]:
+    """Share that agrees, share that is covered, median relative error."""
+    noise = estimate_noise(depth, camera) or DepthNoise()
+    z, both = depth[known], rendered[known] > 0
+    if not both.any():
+        return 0.0, 0.0, 1.0
+    error = np.abs(rendered[known] - z)
+    within = SIGMAS * (noise.constant + noise.square * z * z)
+    agrees = both & (error <= np.maximum(SAME_DEPTH * z, within))
+    return float(agrees.mean()), float(both.mean()), float(np.median((error / z)[both]))
+
+
+def _summary(rows: list[list[float]]) -> MapFit | None:
+    if not rows:
+        return None
+    psnr, ssim, blur, brightness, agreeing, covered, error = np.array(rows).T
+    middle = [float(np.median(values)) for values in (psnr, ssim, blur, brightness)]
+    return MapFit(len(rows), *middle, float(agreeing.mean()), float(covered.mean()), float(np.median(error)))
