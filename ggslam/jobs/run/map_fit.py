@@ -27,8 +27,8 @@ SAME_DEPTH, SIGMAS = 0.05, 3.0
 """Depths agree within this share of the measured depth or so many standard deviations of its noise."""
 BRIGHT, DARKEST = 0.8, 0.02
 """The 95th percentile of a keyframe's values is brought here; that of a darker image than this is taken for this."""
-BLURS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0)
-"""Pixels: standard deviations of the blurs that a rendering is likened to."""
+COARSE = 160
+"""Pixels of width at which structure is compared: noise is averaged away there, what is misplaced stays."""
 FEWEST_PIXELS = 500
 """With depth, or a keyframe tells nothing."""
 _OPAQUE = 0.5
@@ -42,8 +42,7 @@ class MapFit:
         views: keyframes that were compared.
         psnr: dB, in the keyframe's own exposure.
         ssim: of the same.
-        blur: the Gaussian blur of the keyframe that is as far from it as the rendering, standard deviation in
-            thousandths of the image's width.
+        coarse_ssim: the same of images reduced to `COARSE` pixels of width.
         brightness: of the map against the keyframes: 1: as bright.
         agreeing: share of the pixels with depth whose rendered depth is the measured one, see `SAME_DEPTH`.
         covered: share of them that have a rendered depth.
@@ -53,7 +52,7 @@ class MapFit:
     views: int
     psnr: float
     ssim: float
-    blur: float
+    coarse_ssim: float
     brightness: float
     agreeing: float
     covered: float
@@ -101,15 +100,18 @@ def _compare(keyframe: Keyframe, image: np.ndarray, rendered: np.ndarray) -> lis
     brightness = float(np.clip(image, 0, 1)[known].mean() / max(float(color[known].mean()), 1e-3))
     return [
         -10 * np.log10(max(square, 1e-10)), float(ssim_map(level * own, level * color)[known].mean()),
-        _blur_like(square, color, known), brightness, *_compare_depth(depth, rendered, known, keyframe.camera),
+        _coarse_ssim(level * own, level * color, known), brightness,
+        *_compare_depth(depth, rendered, known, keyframe.camera),
     ]  # fmt: skip
 
 
-def _blur_like(square: float, color: np.ndarray, known: np.ndarray) -> float:
-    """The blur of an image [H, W, 3] with this mean square error, thousandths of its width."""
-    blurred = (cv2.GaussianBlur(color, (0, 0), sigma) for sigma in BLURS)
-    errors = np.maximum.accumulate([float(np.square(b - color)[known].mean()) for b in blurred])
-    return 1000 * float(np.interp(square, errors, BLURS)) / color.shape[1]
+def _coarse_ssim(own: np.ndarray, color: np.ndarray, known: np.ndarray) -> float:
+    """SSIM of two images [H, W, 3], reduced to `COARSE` pixels of width, where all of a pixel is known."""
+    factor = min(1.0, COARSE / color.shape[1])
+    size = (max(16, round(factor * color.shape[1])), max(16, round(factor * color.shape[0])))
+    small = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (own, color, known.astype(np.float32))]
+    whole = small[2] > 0.99
+    return float(ssim_map(small[0], small[1])[whole if whole.any() else small[2] > 0].mean())
 
 
 def _compare_depth(
@@ -129,6 +131,6 @@ def _compare_depth(
 def _summary(rows: list[list[float]]) -> MapFit | None:
     if not rows:
         return None
-    psnr, ssim, blur, brightness, agreeing, covered, error = np.array(rows).T
-    middle = [float(np.median(values)) for values in (psnr, ssim, blur, brightness)]
+    psnr, ssim, coarse, brightness, agreeing, covered, error = np.array(rows).T
+    middle = [float(np.median(values)) for values in (psnr, ssim, coarse, brightness)]
     return MapFit(len(rows), *middle, float(agreeing.mean()), float(covered.mean()), float(np.median(error)))

@@ -44,7 +44,7 @@ def judge_result(
         metrics: its scores; None: it was not scored.
         recording: its path, for commands.
     """
-    scored = _scored(metrics)
+    scored = _figures_of_scores(metrics)
     aspects = {
         "tracked": grade_tracked(result, found), "sharp": grade_sharp(fit, scored),
         "geometry": grade_geometry(fit, found), "objects": grade_objects(table, scored),
@@ -65,7 +65,7 @@ def overall(aspects: dict[str, AspectRecord]) -> Grade:
     return worst([*grades, "doubtful" if aspects["objects"].is_grade("bad") else "good"])
 
 
-def _scored(metrics: MetricsRecord | None) -> ScoredFigures:
+def _figures_of_scores(metrics: MetricsRecord | None) -> ScoredFigures:
     if metrics is None:
         return ScoredFigures()
     keyframes, held_out = (metrics.number("images", name, "psnr_affine") for name in ("keyframes", "held_out"))
