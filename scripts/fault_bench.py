@@ -47,7 +47,8 @@ class Ended:
             found = [line for line in lines if line.lower().startswith(tuple(word.lower() for word in words))]
             if found:
                 return found[-1 if words[0] == "error" else 0]
-        told = lines[: next((k for k, line in enumerate(lines) if line.startswith("next:")), len(lines))]
+        ends = (k for k, line in enumerate(lines) if line.startswith(("verdict:", "next:")))
+        told = lines[: next(ends, len(lines))]
         return told[-1] if told else ""
 
 

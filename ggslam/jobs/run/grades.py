@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.jobs.run.map_fit import COARSE, MapFit
+from ggslam.jobs.run.map_fit import MapFit
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.records.verdict import AspectRecord, Grade, worst
 from ggslam.sequences.verdicts import Verdict
@@ -31,10 +31,10 @@ MUCH_SEARCHED = 0.5
 JUMP_MEDIAN, JUMP_P90, JUMP_M = 8.0, 3.0, 0.05
 """A change of step from frame to frame of so many usual ones, of so many 90th percentiles and of so many metres is a
 jump of the path: sound walks reach 5.3 medians and 2.4 percentiles."""
-BAD_SSIM, DOUBTFUL_SSIM = 0.885, 0.925
-"""SSIM at 160 pixels of width, where image noise and compression hardly count: sound runs have 0.93 to 0.99, an
-iPhone's with smoothed depth 0.91; depth one frame off has 0.85, of another kind or place 0.71 to 0.85, turned images
-0.61 to 0.67. PSNR and SSIM at full size do not tell these apart: the iPhone's are 20 dB and 0.71."""
+BAD_STRUCTURE, DOUBTFUL_STRUCTURE = 0.9, 0.95
+"""SSIM at 160 pixels of width over what image noise allows there: sound runs have 0.93 to 1, the lowest of them an
+iPhone's with smoothed depth; depth one frame off has 0.87, of another kind or place 0.78 to 0.86, mirrored images 0.68.
+PSNR and SSIM at full size do not tell these apart: the iPhone's are 20 dB and 0.71."""
 OTHER_BRIGHTNESS, FAR_BRIGHTNESS = 1.5, 2.5
 """Factors between the brightness of the map and that of the keyframes. A map that took the exposure of a first, dark
 frame looks right frame by frame and black as a whole: a factor of 6."""
@@ -113,10 +113,10 @@ def grade_sharp(fit: MapFit | None, scored: ScoredFigures) -> AspectRecord:
     off = max(fit.brightness, 1 / max(fit.brightness, 1e-6))
     overfit = scored.overfit_db is not None and scored.overfit_db > OVERFIT_DB
     grades = [
-        _at_least(fit.coarse_ssim, DOUBTFUL_SSIM, BAD_SSIM), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
+        _at_least(fit.structure, DOUBTFUL_STRUCTURE, BAD_STRUCTURE), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
         "doubtful" if overfit else "good",
     ]  # fmt: skip
-    words = [f"keyframes {fit.psnr:.1f} dB, SSIM {fit.ssim:.2f} ({fit.coarse_ssim:.3f} at {COARSE} pixels of width)"]
+    words = [f"{fit.structure:.1%} of the structure that the noise of the keyframes leaves, {fit.psnr:.1f} dB"]
     if off > OTHER_BRIGHTNESS:
         words.append(f"the map is {fit.brightness:.2f} times as bright as they are")
     words += [f"held-out frames are {scored.overfit_db:.1f} dB worse"] if overfit else []

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ggslam.evaluation.images import ssim_map
+from ggslam.evaluation.images import SSIM_WINDOW, ssim_map
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
@@ -32,6 +32,11 @@ COARSE = 160
 FEWEST_PIXELS = 500
 """With depth, or a keyframe tells nothing."""
 _OPAQUE = 0.5
+_NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+_C2 = 0.03**2
+"""Of SSIM: K2 squared, for a data range of 1."""
+_MEDIAN_OF_NORMAL = 0.6745
+"""Of |x| of a standard normal distribution."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,7 @@ class MapFit:
         views: keyframes that were compared.
         psnr: dB, in the keyframe's own exposure.
         ssim: of the same.
-        coarse_ssim: the same of images reduced to `COARSE` pixels of width.
+        structure: SSIM of images reduced to `COARSE` pixels of width, over that of the keyframe without its noise.
         brightness: of the map against the keyframes: 1: as bright.
         agreeing: share of the pixels with depth whose rendered depth is the measured one, see `SAME_DEPTH`.
         covered: share of them that have a rendered depth.
@@ -52,7 +57,7 @@ class MapFit:
     views: int
     psnr: float
     ssim: float
-    coarse_ssim: float
+    structure: float
     brightness: float
     agreeing: float
     covered: float
@@ -100,18 +105,32 @@ def _compare(keyframe: Keyframe, image: np.ndarray, rendered: np.ndarray) -> lis
     brightness = float(np.clip(image, 0, 1)[known].mean() / max(float(color[known].mean()), 1e-3))
     return [
         -10 * np.log10(max(square, 1e-10)), float(ssim_map(level * own, level * color)[known].mean()),
-        _coarse_ssim(level * own, level * color, known), brightness,
+        _structure(level * own, level * color, known), brightness,
         *_compare_depth(depth, rendered, known, keyframe.camera),
     ]  # fmt: skip
 
 
-def _coarse_ssim(own: np.ndarray, color: np.ndarray, known: np.ndarray) -> float:
-    """SSIM of two images [H, W, 3], reduced to `COARSE` pixels of width, where all of a pixel is known."""
+def _structure(own: np.ndarray, color: np.ndarray, known: np.ndarray) -> float:
+    """SSIM of two images [H, W, 3], reduced to `COARSE` pixels of width, over what noise allows; where all of a pixel
+    is known."""
     factor = min(1.0, COARSE / color.shape[1])
     size = (max(16, round(factor * color.shape[1])), max(16, round(factor * color.shape[0])))
-    small = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (own, color, known.astype(np.float32))]
-    whole = small[2] > 0.99
-    return float(ssim_map(small[0], small[1])[whole if whole.any() else small[2] > 0].mean())
+    images = (own, color, known.astype(np.float32))
+    ours, seen, share = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images)
+    whole = share > 0.99 if (share > 0.99).any() else share > 0
+    return float(ssim_map(ours, seen)[whole].mean() / _best_ssim(seen, whole))
+
+
+def _best_ssim(color: np.ndarray, known: np.ndarray) -> float:
+    """SSIM with an image [H, W, 3] of what it would be without noise, whose standard deviation is measured where the
+    image is smooth (Immerkaer, "Fast Noise Variance Estimation", 1996, with the median): the structure of a window of
+    variance v is v - noise^2."""
+    response = cv2.filter2D(color, -1, _NOISE_KERNEL)
+    noise = float(np.median(np.abs(response[known]))) / (6 * _MEDIAN_OF_NORMAL)
+    mean, square = (cv2.GaussianBlur(image, (SSIM_WINDOW, SSIM_WINDOW), 1.5) for image in (color, color * color))
+    variance = np.maximum(square - mean * mean, 0)
+    true = np.maximum(variance - noise * noise, 0)
+    return float(((2 * true + _C2) / (true + variance + _C2))[known].mean())
 
 
 def _compare_depth(
@@ -131,6 +150,6 @@ def _compare_depth(
 def _summary(rows: list[list[float]]) -> MapFit | None:
     if not rows:
         return None
-    psnr, ssim, coarse, brightness, agreeing, covered, error = np.array(rows).T
-    middle = [float(np.median(values)) for values in (psnr, ssim, coarse, brightness)]
+    psnr, ssim, structure, brightness, agreeing, covered, error = np.array(rows).T
+    middle = [float(np.median(values)) for values in (psnr, ssim, structure, brightness)]
     return MapFit(len(rows), *middle, float(agreeing.mean()), float(covered.mean()), float(np.median(error)))
