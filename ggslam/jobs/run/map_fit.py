@@ -46,7 +46,6 @@ class MapFit:
     Attributes:
         views: keyframes that were compared.
         psnr: dB, in the keyframe's own exposure.
-        ssim: of the same.
         structure: SSIM of images reduced to `COARSE` pixels of width, over that of the keyframe without its noise.
         brightness: of the map against the keyframes: 1: as bright.
         agreeing: share of the pixels with depth whose rendered depth is the measured one, see `SAME_DEPTH`.
@@ -56,7 +55,6 @@ class MapFit:
 
     views: int
     psnr: float
-    ssim: float
     structure: float
     brightness: float
     agreeing: float
@@ -104,8 +102,7 @@ def _compare(keyframe: Keyframe, image: np.ndarray, rendered: np.ndarray) -> lis
     square = float(np.square(own - color)[known].mean())
     brightness = float(np.clip(image, 0, 1)[known].mean() / max(float(color[known].mean()), 1e-3))
     return [
-        -10 * np.log10(max(square, 1e-10)), float(ssim_map(level * own, level * color)[known].mean()),
-        _structure(level * own, level * color, known), brightness,
+        -10 * np.log10(max(square, 1e-10)), _structure(level * own, level * color, known), brightness,
         *_compare_depth(depth, rendered, known, keyframe.camera),
     ]  # fmt: skip
 
@@ -118,7 +115,7 @@ def _structure(own: np.ndarray, color: np.ndarray, known: np.ndarray) -> float:
     images = (own, color, known.astype(np.float32))
     ours, seen, share = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images)
     whole = share > 0.99 if (share > 0.99).any() else share > 0
-    return float(ssim_map(ours, seen)[whole].mean() / _best_ssim(seen, whole))
+    return min(1.0, float(ssim_map(ours, seen)[whole].mean() / _best_ssim(seen, whole)))
 
 
 def _best_ssim(color: np.ndarray, known: np.ndarray) -> float:
@@ -150,6 +147,6 @@ def _compare_depth(
 def _summary(rows: list[list[float]]) -> MapFit | None:
     if not rows:
         return None
-    psnr, ssim, structure, brightness, agreeing, covered, error = np.array(rows).T
-    middle = [float(np.median(values)) for values in (psnr, ssim, structure, brightness)]
+    psnr, structure, brightness, agreeing, covered, error = np.array(rows).T
+    middle = [float(np.median(values)) for values in (psnr, structure, brightness)]
     return MapFit(len(rows), *middle, float(agreeing.mean()), float(covered.mean()), float(np.median(error)))

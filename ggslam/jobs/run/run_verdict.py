@@ -25,7 +25,7 @@ from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.tracking.tracker import TrackingStatus
 
-_CAUSES = ("depth_scale", "intrinsics", "poses", "alignment", "step", "time", "textureless")
+_CAUSES = ("depth_scale", "intrinsics", "poses", "alignment", "step", "time", "textureless", "degenerate")
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 _SAME_GAIN = 1.3
 
@@ -85,10 +85,11 @@ def _advice(
     aspects: dict[str, AspectRecord], result: SlamResult, found: list[Verdict], fit: MapFit | None, recording: str
 ) -> str:
     """One thing to try: what the verdicts on the recording say, else what helps the worst aspect."""
-    for code in _CAUSES:
-        for verdict in found:
-            if verdict.code == code and verdict.severity == "wrong" and "; " in verdict.text:
-                return verdict.text.rpartition("; ")[2].removeprefix("try ")
+    for severity in ("wrong", "doubtful"):
+        for code in _CAUSES:
+            for verdict in found:
+                if (verdict.code, verdict.severity) == (code, severity) and "; " in verdict.text:
+                    return verdict.text.rpartition("; ")[2].removeprefix("try ")
     look = f"ggslam inspect {recording}"
     if fit is not None and not 1 / OTHER_BRIGHTNESS <= fit.brightness <= OTHER_BRIGHTNESS:
         return _start_later(result) or "fix the camera's exposure"
