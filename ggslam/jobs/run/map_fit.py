@@ -148,5 +148,8 @@ def _summary(rows: list[list[float]]) -> MapFit | None:
     if not rows:
         return None
     psnr, structure, brightness, agreeing, covered, error = np.array(rows).T
-    middle = [float(np.median(values)) for values in (psnr, structure, brightness)]
-    return MapFit(len(rows), *middle, float(agreeing.mean()), float(covered.mean()), float(np.median(error)))
+    return MapFit(
+        len(rows), psnr=float(np.median(psnr)), structure=float(np.median(structure)),
+        brightness=float(np.median(brightness)), agreeing=float(agreeing.mean()), covered=float(covered.mean()),
+        depth_error=float(np.median(error)),
+    )  # fmt: skip
