@@ -62,15 +62,15 @@ def short(text: str) -> str:
     return text if len(text) <= WIDEST else text[: WIDEST - 1] + "…"
 
 
-def run_cases(cases: Sequence[Case], data: Path, out: Path, progress: Progress) -> int:
-    """Prints the table; returns how many are not met."""
+def run_cases(cases: Sequence[Case], data: Path, out: Path, progress: Progress) -> tuple[int, int]:
+    """Prints the table; returns how many are not met, and how many are not there."""
     columns = ("case", "what is said", "value", "right", "met")
     progress.console.print(line(columns), line(["---"] * len(columns)), sep="\n")
-    task, failed = progress.add_task("cases", total=len(cases)), 0
+    task, failed, absent = progress.add_task("cases", total=len(cases)), 0, 0
     for number, case in enumerate(cases):
         progress.update(task, description=case.title, completed=number)
         if not (data / case.below / case.name).is_dir():
-            cells = [case.title, "", "", case.right, "not there"]
+            cells, absent = [case.title, "", "", case.right, "not there"], absent + 1
         else:
             found = outcome_of(case.command(data, out / f"case{number:02d}"), out / f"case{number:02d}")
             found = replace(found, text=found.text.replace(str(data / case.below / case.name), "."))  # names tell much
@@ -80,7 +80,7 @@ def run_cases(cases: Sequence[Case], data: Path, out: Path, progress: Progress) 
             cells = [case.title, short(said), case.value(found), case.right, "yes" if met else "**no**"]
         progress.console.print(line(cells))
     progress.update(task, completed=len(cases))
-    return failed
+    return failed, absent
 
 
 def run_recordings(recordings: Sequence[Path], more: Sequence[str], out: Path, progress: Progress) -> None:
@@ -140,8 +140,9 @@ def main() -> None:
             return
         words = [word for word in given.only.split(",") if word]
         cases = [case for case in CASES if not words or any(word in case.title for word in words)]
-        failed = run_cases(cases, given.data.absolute(), out, progress)
-        console.print(f"\n{len(cases) - failed} of {len(cases)} cases met")
+        failed, absent = run_cases(cases, given.data.absolute(), out, progress)
+        lacking = f", {absent} not there" if absent else ""
+        console.print(f"\n{len(cases) - failed - absent} of {len(cases)} cases met{lacking}")
     sys.exit(1 if failed else 0)
 
 

@@ -160,7 +160,7 @@ class Case:
         return ", ".join(text for check in self.mended if (text := check.value(outcome)))
 
 
-def _names(pattern: str) -> Says:
+def naming(pattern: str) -> Says:
     """A line in which ggslam names a mistake."""
     return Says(rf"^(?:error|warning|wrong|doubtful|note)\b.*(?:{pattern})")
 
@@ -215,7 +215,7 @@ _LOCALIZE = ("localize", "{case}/map.ply", "{case}", "--full-map", "--start-pose
 
 CASES = (
     Case("d435_unregistered", _INSPECT, "depth is not registered: enlarge 1.6 times",
-         _names(r"not registered|enlarge.*1\.[56]|1\.6 times")),
+         naming(r"not registered|enlarge.*1\.[56]|1\.6 times")),
     Case("d435_unregistered", _run("--depth-camera", "{data}/recordings/calibrations/d435_0.015.yaml"),
          "with its calibration: no run that is bad", mended=(Says(r"^verdict: (good|doubtful)"),), label="calibrated"),
     Case("kitti00_learned_depth", _INSPECT, "depth scale near 470",
@@ -226,7 +226,7 @@ CASES = (
          mended=(Between("lost", 0, 4), Says(r"^verdict: (good|doubtful)"))),
     Case("saturated", _run(), "32.1 dB, depth 1.1 cm, ATE 0.17 cm", mended=(*_SHARP, Between("depth", 0, 2.5))),
     Case("onebased", _run("--skip-bad-frames"), "n with n+1, or said to be a frame off",
-         _names(r"(one|a) frame off|numbered from 1|one frame (later|earlier|after|before)"),
+         naming(r"(one|a) frame off|numbered from 1|one frame (later|earlier|after|before)"),
          (Between("ATE", 0.0, 0.3),)),
     Case("npy_depth", _INSPECT, "read, 1 unit a metre", mended=(Says(r"depth\s.*\b1 units? a metre"),)),
     _calibration("orb.yaml", "ORB-SLAM"), _calibration("ros.yaml", "ROS camera_info"),
@@ -234,23 +234,23 @@ CASES = (
     Case("no_yaml", (*_INSPECT, "--intrinsics", "120 120 79.5 59.5", "--depth-scale", "5000"),
          "as with --format folder", mended=(_CAMERA,)),
     Case("rtabmap_export", _INSPECT, "K of calib/, poses with ids", mended=(_CAMERA, Says(r"poses\s+\d+ frames"))),
-    Case("ray_depth", _INSPECT, "z = d / sqrt(1 + x² + y²): consistency 0.5 %", _names(r"along the ray|ray depth"),
+    Case("ray_depth", _INSPECT, "z = d / sqrt(1 + x² + y²): consistency 0.5 %", naming(r"along the ray|ray depth"),
          (Between(rf"agrees with the poses to {NUMBER}%", 0, 0.7),)),
-    Case("ray_depth", _run(), "located to some mm", _names(r"along the ray|ray depth"), (Between("ATE", 0, 1.0),),
+    Case("ray_depth", _run(), "located to some mm", naming(r"along the ray|ray depth"), (Between("ATE", 0, 1.0),),
          label="run"),
-    Case("mirror_depth", _INSPECT, "depth is mirrored", _names(r"mirror")),
-    Case("exif3", _INSPECT, "colour is stored turned by its tag", _names(r"turned|orientation|rotat")),
-    Case("exif6", _INSPECT, "colour is stored turned by its tag", _names(r"turned|orientation|rotat")),
-    Case("inverse_depth", _INSPECT, "depth is inverse (disparity)", _names(r"inverse|disparity")),
-    Case("scale_inverse", _INSPECT, "5000 = 1 / 0.0002", _names(r"depth.scale.* 5000\b"),
+    Case("mirror_depth", _INSPECT, "depth is mirrored", naming(r"mirror")),
+    Case("exif3", _INSPECT, "colour is stored turned by its tag", naming(r"turned|orientation|rotat")),
+    Case("exif6", _INSPECT, "colour is stored turned by its tag", naming(r"turned|orientation|rotat")),
+    Case("inverse_depth", _INSPECT, "depth is inverse (disparity)", naming(r"inverse|disparity")),
+    Case("scale_inverse", _INSPECT, "5000 = 1 / 0.0002", naming(r"depth.scale.* 5000\b"),
          (Says(r"5000 units a metre"),)),
     Case("tum_gt_otherclock", ("run", "{case}", "--no-eval"), "runs without truth, with a warning",
          mended=(Ends(0), Says(r"(warning|note).*(pose|truth|clock|time)"))),
-    Case("tum_slowdepth", _INSPECT, "31 colour images are left out", _names(r"\b31\b.*left out|left out.*\b31\b")),
+    Case("tum_slowdepth", _INSPECT, "31 colour images are left out", naming(r"\b31\b.*left out|left out.*\b31\b")),
     Case("kitti_fewer", ("run", "{case}", "--stop", "15"), "runs, truth for 15",
          mended=(Ends(0), Between("frames", 15, 15), Between("ATE", 0, 5))),
     Case("shift1", _run(), "a frame off; true pairs: 32.46 dB, 0.16 cm",
-         _names(r"(one|a|1) frame (off|later|earlier|after|before)|frames? after it"), _SHARP),
+         naming(r"(one|a|1) frame (off|later|earlier|after|before)|frames? after it"), _SHARP),
     Case("dark_start", _run(), "map as bright as most frames: 32 dB", mended=(Between("PSNR", 30, 99),)),
     Case("lidar_radius", _LOCALIZE, "both scans located", mended=(_ALL_FOUND,), below="maps"),
     Case("utm_map", _LOCALIZE, "both scans located", mended=(_ALL_FOUND,), below="maps"),
