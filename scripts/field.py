@@ -26,6 +26,7 @@ from field_cases import CASES, Case, Outcome
 from rich.console import Console
 from rich.progress import Progress
 
+from ggslam.cli.argument_names import with_options
 from ggslam.errors import GgslamError
 from ggslam.runs.folder import RunFolder
 
@@ -105,7 +106,7 @@ def figures(found: Outcome) -> list[str]:
         verdict = RunFolder.open(found.run).verdict()
     except GgslamError as error:
         return [*texts, short(str(error)), ""]
-    return [*texts, "-" if verdict is None else verdict.summary(), "" if verdict is None else short(verdict.next)]
+    return [*texts, *(("-", "") if verdict is None else (verdict.summary(), short(with_options(verdict.next))))]
 
 
 def parse_arguments() -> argparse.Namespace:
