@@ -211,6 +211,10 @@ def test_what_to_try_is_the_cause_if_it_is_known(sound: RunOutcome) -> None:
     assert verdict.grade == "bad" and verdict.next == "`depth_scale` 5000, then 1 m"
     assert verdict.failure.startswith("the camera was lost in 20 of 24 frames (the first: 4)")
     assert verdict.sharp.grade is None  # of the few others it would be good
+    noisy = replace(fit_of(sound), structure=0.94)
+    empty = replace(sound.folder.object_table(), objects=[])
+    assert judge_result(sound.result, [], noisy, empty, None, "room").next == "`refine` 3000"
+    assert judge_result(sound.result, [], fit_of(sound), empty, None, "room").next.startswith("`masks` FOLDER")
     unnamed = judge_result(lost, [], None, None, None, "room")
     assert unnamed.next.startswith("ggslam inspect room")
 

@@ -103,9 +103,7 @@ def _advice(
             return f"{look} (do depth and colour belong to one frame and one camera?)"
         if "sharp" in weak:
             return "`refine` 3000"
-        if "objects" in weak:
-            return "`masks` FOLDER, with masks of a segmenter"
-    return look
+    return "`masks` FOLDER, with masks of a segmenter"  # only the objects are left
 
 
 def _slower(result: SlamResult, look: str) -> str:
