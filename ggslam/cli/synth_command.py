@@ -58,6 +58,24 @@ class PathName(str, Enum):
     walk = "walk"
 
 
+PathOption = Annotated[
+    PathName | None,
+    typer.Option(
+        help="loop: around the room and back; round: around it, seeing all of it; pan: turning on the spot; turns: "
+        "looking quickly from side to side; still: a tripod; route, walk: along a loop's or a corridor's way. "
+        "Default: loop in the room, else the scene's way."
+    ),
+]
+MoversOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAMES",
+        help="What moves while the room is recorded: some of walker,mug,door; movers.json tells where it is in each "
+        "frame. The same seed and frames without it: the same, with nothing that moves.",
+    ),
+]
+
+
 def synth(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write the recording to.")],
     scene: Annotated[
@@ -75,14 +93,7 @@ def synth(
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
     seed: Annotated[int, typer.Option(help="Seed of textures, camera path and noise.", min=0)] = 0,
-    path: Annotated[
-        PathName | None,
-        typer.Option(
-            help="loop: around the room and back; round: around it, seeing all of it; pan: turning on the spot; turns: "
-            "looking quickly from side to side; still: a tripod; route, walk: along a loop's or a corridor's way. "
-            "Default: loop in the room, else the scene's way."
-        ),
-    ] = None,
+    path: PathOption = None,
     speed: Annotated[
         int, typer.Option(help="How many times as far as usual the camera moves between two frames.", min=1)
     ] = 1,
@@ -118,14 +129,7 @@ def synth(
         typer.Option(help="Things of the room that differ between two visits; the second one's are in changes.json."),
     ] = None,
     visit: Annotated[int, typer.Option(help="Which of the two visits to record.", min=1, max=2)] = 1,
-    movers: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAMES",
-            help="What moves while the room is recorded: some of walker,mug,door; movers.json tells where it is "
-            "in each frame. The same seed and frames without it: the same, with nothing that moves.",
-        ),
-    ] = None,
+    movers: MoversOption = None,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
     from ggslam.synthetic import FRAMES_WITH_MOVERS, SCENES, Shutter
