@@ -50,9 +50,14 @@ def inspect(
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
+    depth_kind: options.DepthKind = None,
+    depth_delay: options.DepthDelay = None,
+    upright: options.Upright = False,
+    void_id: options.VoidId = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
     formats: Annotated[bool, typer.Option("--formats", help="List the formats that ggslam reads.")] = False,
+    skip_bad_frames: options.SkipBadFrames = False,
     samples: int = typer.Option(8, help="Number of frames to read and check.", min=1),
 ) -> None:
     """Print what was recognised in a recording, and likely mistakes; of a coded file, what is in it and its bytes."""
@@ -78,6 +83,8 @@ def inspect(
         sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
         depth_scale=depth_scale, depth_camera=depth_camera, min_confidence=min_confidence, topics=topics or (),
         pose_convention=pose_convention, camera=camera, intrinsics=intrinsics,
+        depth_kind=depth_kind, depth_delay=depth_delay, upright=upright, void_id=void_id,
+        on_bad_frame="skip" if skip_bad_frames else "error",
     )  # fmt: skip
     if isinstance(recording, RigSequence):
         _print_rig(inspect_rig(recording, samples=samples, clocks=True))

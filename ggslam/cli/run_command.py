@@ -139,6 +139,8 @@ def run(
     masks: options.Masks = None,
     camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
+    depth_kind: options.DepthKind = None, depth_delay: options.DepthDelay = None,
+    upright: options.Upright = False, void_id: options.VoidId = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
     record: Record = None,
@@ -173,7 +175,7 @@ def run(
     reading = SequenceRequest(
         _recording(sequence), format_name, start, stop, stride, scale, masks, depth_scale,
         "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
-        camera, intrinsics,
+        camera, intrinsics, depth_kind, depth_delay, upright, void_id,
     )  # fmt: skip
     given = _overrides(settings, {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,

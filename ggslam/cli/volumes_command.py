@@ -125,6 +125,9 @@ def volumes(
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
+    depth_kind: options.DepthKind = None,
+    depth_delay: options.DepthDelay = None,
+    upright: options.Upright = False,
     sequence: options.MovedSequence = None,
     skip_bad_frames: options.SkipBadFrames = False,
     device: Device = None,
@@ -142,7 +145,8 @@ def volumes(
     reading = SequenceRequest(
         source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
-        camera=camera, intrinsics=intrinsics, depth_camera=depth_camera,
+        camera=camera, intrinsics=intrinsics, depth_camera=depth_camera, depth_kind=depth_kind,
+            depth_delay=depth_delay, upright=upright,
     )  # fmt: skip
     request = VolumesRequest(
         source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,

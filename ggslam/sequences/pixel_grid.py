@@ -9,7 +9,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.recording import FrameFiles, ImageFile, Recording
-from ggslam.sequences.registration import DepthRegistration
+from ggslam.sequences.registration import DepthRegistration, undistorted_rays
 from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
 from ggslam.sequences.upsampling import upsample_depth
 from ggslam.sequences.valid_pixels import within_source
@@ -50,7 +50,8 @@ class ImageGeometry:
     Attributes:
         camera: intrinsics of the images that come out.
         native_camera: the same before scaling.
-        scale: of one to the other; None was given: 1, of much finer colour what leaves `USUAL_PIXELS`.
+        usual: scale of one to the other that is usual: 1, of much finer colour what leaves `USUAL_PIXELS`.
+        scale: of `camera` to that of usual size.
         finer: whether depth is brought to finer colour.
         valid: bool [H, W], where images of `camera` show something; None: everywhere.
         color_size, depth_size: sizes (width, height) that every stored image must have.
@@ -80,11 +81,12 @@ class ImageGeometry:
             self.finer = color_size[0] >= FINER * depth_size[0]
             size = color_size if self.finer else min(color_size, depth_size, key=lambda s: s[0] * s[1])
             self.native_camera = color_camera.resize(*size)
-        if scale is None:
-            most = USUAL_PIXELS / (self.native_camera.width * self.native_camera.height)
-            scale = min(1.0, most**0.5) if self.finer else 1.0
-        self.scale: float = scale
-        self.camera = self.native_camera.scale(scale)
+        most = USUAL_PIXELS / (self.native_camera.width * self.native_camera.height)
+        self.usual: float = min(1.0, most**0.5) if self.finer else 1.0
+        self.scale: float = 1.0 if scale is None else scale
+        if self.scale * self.usual > 1 + 1e-6:
+            raise SequenceError(f"`scale`: expected a number above 0 and at most {1 / self.usual:g}, found {scale}")
+        self.camera = self.native_camera.scale(self.scale * self.usual)
         # Finer colour is brought to its last size first: it may have many times as many pixels.
         self._work = self.camera if self.finer else self.native_camera
         self._maps = _undistortion(self._work, recording.distortion, recording.fisheye)
@@ -214,6 +216,18 @@ class ImageGeometry:
         if self._maps is not None:
             mask = cv2.remap(mask, *self._maps, interpolation=cv2.INTER_NEAREST)
         return resize_mask(mask, self.camera.width, self.camera.height, shared)
+
+
+def rays_of_depth(recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size) -> np.ndarray:
+    """Viewing rays with z = 1 of the depth image of a frame as stored, float32 [H, W, 3]."""
+    beside = recording.depth_camera
+    if beside is not None:
+        return undistorted_rays(beside.camera.resize(*depth_size), beside.distortion, beside.fisheye)
+    if recording.depth_calibration is not None:
+        camera = Camera(*depth_size, *recording.depth_calibration)
+    else:
+        camera = (files.camera or _color_camera(recording, color_size, files.color)).resize(*depth_size)
+    return undistorted_rays(camera, recording.distortion, recording.fisheye)
 
 
 def _color_camera(recording: Recording, color_size: Size, color_file: ImageFile) -> Camera:

@@ -227,7 +227,8 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
     if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
         raise ConfigError(
             f"{request.source} is a run, read as it was made: `start`, `stop`, `stride`, `format`, `depth_scale`, "
-            "`pose_convention`, `camera`, `intrinsics`, `depth_camera` and `on_bad_frame` are for recordings"
+            "`pose_convention`, `camera`, `intrinsics`, `depth_camera`, `depth_kind`, `depth_delay`, `upright` and "
+            "`on_bad_frame` are for recordings"
         )
     if request.mesh is not None:
         _check_mesh(request.mesh, request.source)
