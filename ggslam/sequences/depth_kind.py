@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,7 @@ from ggslam.errors import SequenceError
 
 Measure = Literal["z", "ray", "inverse"]
 
+SIDES = ("mirrored", "flipped", "mirrored,flipped")
 WORDS = "z, ray, inverse or inverse:NUMBER, mirrored, flipped, none:CODE"
 
 
@@ -27,6 +28,7 @@ class DepthKind:
             recording's depth scale.
         mirrored, flipped: whether left and right, or top and bottom, are exchanged against colour.
         none: stored numbers that mean "nothing measured" beside 0.
+        told: whether a user says what the measure is.
     """
 
     measure: Measure = "z"
@@ -34,6 +36,20 @@ class DepthKind:
     mirrored: bool = False
     flipped: bool = False
     none: tuple[float, ...] = ()
+    told: bool = field(default=False, compare=False)
+
+    def with_words(self, word: str) -> str:
+        """What says this and one word more."""
+        words = [] if self.measure == "z" or word.startswith(("ray", "inverse")) else [self.measure_word]
+        words += [name for name in ("mirrored", "flipped") if getattr(self, name) != (name in word.split(","))]
+        words += [] if word in SIDES else [word]
+        words += [f"none:{code:g}" for code in self.none]
+        return ",".join(words) or "z"
+
+    @property
+    def measure_word(self) -> str:
+        """The measure as a user says it."""
+        return self.measure if self.inverse_units is None else f"{self.measure}:{self.inverse_units:g}"
 
     def to_z(self, depth: np.ndarray, rays: np.ndarray, depth_scale: float) -> np.ndarray:
         """Depth image as stored -> distance along the optical axis, metres.
@@ -72,7 +88,7 @@ def read_depth_kind(text: str | None) -> DepthKind:
     for word in [] if text is None else [part.strip() for part in text.split(",")]:
         name, _, number = word.partition(":")
         if name in ("z", "ray", "inverse") and "measure" not in kind and (not number or name == "inverse"):
-            kind["measure"] = name
+            kind["measure"], kind["told"] = name, True
             if number:
                 kind["inverse_units"] = _positive(text, number)
         elif word in ("mirrored", "flipped"):

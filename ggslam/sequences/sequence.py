@@ -20,7 +20,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.sequences.depth_kind import PLAIN
+from ggslam.sequences.depth_kind import PLAIN, DepthKind
 from ggslam.sequences.images import read_color, read_confidence, read_depth
 from ggslam.sequences.masks import MaskReader
 from ggslam.sequences.moving_pixels import MovingPixels
@@ -70,6 +70,8 @@ class Sequence:
         finer: whether colour is much finer than depth, which is brought to colour.
         valid: bool [H, W], where delivered images show something; None: everywhere.
         depth_scale: units per metre of the stored depth images.
+        depth_kind: what the numbers of depth images mean.
+        upright: whether colour images are turned as their orientation tag says.
         color_size, depth_size: (width, height) of the stored images.
         lens: distortion that is undone and intrinsics that change, in words; "" for a pinhole camera that stays one.
         min_confidence: depth less sure than this is dropped; None: the recording has no confidence images.
@@ -116,6 +118,8 @@ class Sequence:
         self.name: str = recording.path.stem if recording.path.is_file() else recording.path.name
         self.format: str = recording.format
         self.depth_scale: float = recording.depth_scale
+        self.depth_kind: DepthKind = recording.depth_kind
+        self.upright: bool = recording.upright
         self.instance_names: dict[int, str] = dict(recording.instance_names)
         self.pose_source: str = recording.pose_source
         self.pose_problem = recording.pose_problem
