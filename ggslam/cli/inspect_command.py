@@ -194,11 +194,17 @@ def _images(r: SequenceReport) -> str:
     return "; ".join(words)
 
 
-def _lines(r: SequenceReport) -> list[tuple[str, str]]:
+def _times(r: SequenceReport) -> str:
+    if r.time_source.startswith("nominal"):
+        return f"{r.frames}, without times ({r.time_source} assumed)"
     rate = f" at {r.rate_hz:.1f} Hz" if r.rate_hz > 0 else ""  # NaN: a single frame, or all of one time
+    return f"{r.frames}, {r.duration_s:.1f} s{rate} ({r.time_source})"
+
+
+def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     lines = [
         ("recording", f"{r.name} ({r.format})"),
-        ("frames", f"{r.frames}, {r.duration_s:.1f} s{rate} ({r.time_source})"),
+        ("frames", _times(r)),
         ("camera", _camera(r.camera) + (f" ({r.camera_source})" if r.camera_source else "")),
         ("depth", f"{r.depth_m[0]:.2f} to {r.depth_m[2]:.2f} m, median {r.depth_m[1]:.2f} m; {r.valid_share:.0%} of "
                   f"pixels; {r.depth_scale:g} units a metre"),

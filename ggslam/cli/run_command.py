@@ -106,6 +106,9 @@ Log = Annotated[
 ]
 ShowPage = Annotated[bool, typer.Option("--view", help="Show the map in a browser while it grows, and afterwards.")]
 Evaluate = Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")]
+Check = Annotated[
+    bool, typer.Option("--check/--no-check", help="Look at depth first, and refuse it where it is certainly wrong.")
+]
 Resume = Annotated[
     Path | None,
     typer.Option(metavar="RUN", help="Go on with a run that was cut off. Settings and recording are those it had."),
@@ -129,9 +132,7 @@ def run(
     out: Out = None,
     config: options.ConfigName = None,
     settings: options.Settings = None,
-    start: options.Start = 0,
-    stop: options.Stop = None,
-    stride: options.Stride = 1,
+    start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
     scale: options.Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
@@ -154,7 +155,7 @@ def run(
     loops: Loops = None,
     threads: Threads = None,
     seed: Seed = None,
-    skip_bad_frames: options.SkipBadFrames = False,
+    skip_bad_frames: options.SkipBadFrames = False, check: Check = True,
     log: Log = None,
     view: ShowPage = False,
     host: options.Host = "127.0.0.1", port: options.Port = 8080,
@@ -183,7 +184,7 @@ def run(
     })  # fmt: skip
     request = replace(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
-        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every,
+        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check,
     )  # fmt: skip
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
 

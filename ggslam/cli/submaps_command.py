@@ -80,9 +80,6 @@ def submaps(
     depth_scale: options.DepthScale = None,
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
-    depth_kind: options.DepthKind = None,
-    depth_delay: options.DepthDelay = None,
-    upright: options.Upright = False,
     columns: options.Columns = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what is in the store as JSON.")] = False,
 ) -> None:  # fmt: skip
@@ -98,7 +95,7 @@ def submaps(
             source, out, visit, poses, at, {name: value for name, value in settings.items() if value is not None},
             SequenceRequest(
                 source, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
-                camera=camera, intrinsics=intrinsics, depth_kind=depth_kind, depth_delay=depth_delay, upright=upright,
+                camera=camera, intrinsics=intrinsics,
             ), columns,
         )  # fmt: skip
         with progress_bar() as bar:

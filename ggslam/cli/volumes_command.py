@@ -115,19 +115,14 @@ def volumes(
     network_ms: NetworkMs = 0.0,
     config: options.ConfigName = None,
     settings: options.Settings = None,
-    start: options.Start = 0,
-    stop: options.Stop = None,
-    stride: options.Stride = 1,
+    start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
     scale: Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
-    camera: options.OwnCamera = None,
-    intrinsics: options.Intrinsics = None,
+    camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
-    depth_kind: options.DepthKind = None,
-    depth_delay: options.DepthDelay = None,
-    upright: options.Upright = False,
+    depth_kind: options.DepthKind = None, depth_delay: options.DepthDelay = None, upright: options.Upright = False,
     sequence: options.MovedSequence = None,
     skip_bad_frames: options.SkipBadFrames = False,
     device: Device = None,
@@ -135,7 +130,7 @@ def volumes(
     engine: options.CellEngine = options.EngineName.local,
     workers: options.CellWorkers = None,
     address: options.CellAddress = None,
-) -> None:
+) -> None:  # fmt: skip
     """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
     from ggslam.jobs.submaps.stores import is_store
     from ggslam.jobs.volumes.fuse import VolumesRequest

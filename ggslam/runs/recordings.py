@@ -219,7 +219,7 @@ def _open_as(
         raise RunFolderError(f"{run}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()
     if sequence.finer and scale is None and sequence.camera.width != record.camera.width:  # of an older version
-        own = request.scale * record.camera.width / sequence.camera.width
+        own = sequence.scale * record.camera.width / sequence.camera.width
         sequence = replace(request, scale=own).open()
     if isinstance(sequence, RigSequence):
         found = {name: value for name, value in describe_rig(sequence).items() if name != "cameras" or scale is None}

@@ -32,6 +32,11 @@ from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.triangulation import TruePoints, triangulate
 from ggslam.sequences.verdicts import USUAL_MEDIAN_DEPTH, Verdict, judge_inverse_scale
 
+CODES = frozenset({
+    "orientation", "depth_side", "depth_kind", "depth_delay", "registration", "depth_repeats", "color_repeats",
+    "depth_codes",
+})  # fmt: skip
+"""Of the verdicts that doubt depth itself."""
 LOOKS = 8
 """Frames spread over the recording that planes are looked for in."""
 POSED = 5
@@ -172,8 +177,8 @@ class DepthDoubts:
     def _step_verdict(self, frames: int, better: Better) -> Verdict:
         side = "after" if frames > 0 else "before"
         text = (
-            f"depth is 1 frame off: it was taken 1 frame {side} the colour beside it (its outlines fit the edges of the "
-            f"frame {side} it to {better.best:.2f}, of its own to {better.strength:.2f})"
+            f"depth is 1 frame off: it was taken 1 frame {side} the colour beside it (its outlines fit the edges of "
+            f"the frame {side} it to {better.best:.2f}, of its own to {better.strength:.2f})"
         )
         told = self.sequence.options.get("depth_delay") if self.sequence.options else None
         remedy = f"; try `depth_delay` {frames}f" if told is None else f"; `depth_delay` {told} is 1 frame off"

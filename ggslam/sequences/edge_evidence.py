@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How depth lies on colour, by outlines and edges over stretches of successive frames: as it stands, mirrored or turned,
-against the colour of other frames, and enlarged about the centre."""
+"""How depth lies on colour, by outlines and edges over stretches of successive frames: as it stands, mirrored or
+turned, against the colour of other frames, and enlarged about the centre."""
 
 from __future__ import annotations
 
@@ -211,5 +211,5 @@ def _peak(surface: np.ndarray) -> tuple[float, float, float, float]:
     """Scale, right, down (shares of the width) and strength of the highest place."""
     scale, row, column = np.unravel_index(int(np.nanargmax(surface)), surface.shape)
     reach = surface.shape[1] // 2
-    width = reach / SHIFT
-    return float(SCALES[scale]), float(column - reach) / width, float(row - reach) / width, float(surface[scale, row, column])
+    right, down = (float(place - reach) * SHIFT / reach for place in (column, row))
+    return float(SCALES[scale]), right, down, float(surface[scale, row, column])

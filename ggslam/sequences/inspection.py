@@ -121,10 +121,11 @@ class SequenceReport:
 
 
 def inspect_sequence(
-    sequence: Sequence, samples: int = 8, masks: bool = True, clocks: bool = False
+    sequence: Sequence, samples: int = 8, masks: bool = True, clocks: bool = False, depth: list[Verdict] | None = None
 ) -> SequenceReport:
     """Reads `samples` frames spread over the sequence, with or without their masks, and reports what they hold; with
-    `clocks` also by how much time depth and colour are apart, for which it reads some 50 frames more."""
+    `clocks` also by how much time depth and colour are apart, for which it reads some 50 frames more. `depth`:
+    what `DepthDoubts` said before; None: it is asked."""
     times = sequence.timestamps
     intervals = np.diff(times)
     report = SequenceReport(
@@ -141,7 +142,7 @@ def inspect_sequence(
     except SequenceError as error:
         report.warnings.append(str(error))
     doubts = DepthDoubts(sequence, frames)
-    report.judge(doubts.judge() if frames else [])
+    report.judge(depth if depth is not None else doubts.judge() if frames else [])
     certain = any(verdict.severity == "wrong" for verdict in report.verdicts)
     report.judge(judge_intrinsics(report.camera))
     pairs = _pairs(report, sequence, frames)
@@ -306,7 +307,7 @@ def _warn(report: SequenceReport, times: np.ndarray, frames: list[Frame]) -> Non
         add("no depth at all in the sampled frames")
     if frames and 0 < report.valid_share < 0.2:
         add(f"only {report.valid_share:.0%} of the pixels have depth")
-    report.judge(judge_times(times))
+    report.judge(judge_times(times, report.time_source.startswith("nominal")))
     if report.motion is not None and (report.motion.step_m[1] > 0.2 or report.motion.turn_deg[1] > 15):
         add(
             f"large motion between frames (90th percentile {report.motion.step_m[1]:.2f} m, "

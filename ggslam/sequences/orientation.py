@@ -17,6 +17,9 @@ WORDS = {
 }  # fmt: skip
 """How the pixels of a file with each tag lie; 1 is upright (CIPA DC-008, Exif 2.32, table 6)."""
 
+QUARTER_TURNS = (5, 6, 7, 8)
+"""Tags that exchange width and height."""
+
 
 def orientation_of(file: object) -> int:
     """The tag of a JPEG file, 1 to 8; 1 where there is none, and of images that are no file of their own."""

@@ -8,6 +8,8 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
+from ggslam.sequences.orientation import QUARTER_TURNS, orientation_of
+from ggslam.sequences.orientation import WORDS as ORIENTATIONS
 from ggslam.sequences.recording import FrameFiles, ImageFile, Recording
 from ggslam.sequences.registration import DepthRegistration, undistorted_rays
 from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
@@ -61,11 +63,8 @@ class ImageGeometry:
         self, recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size, scale: float | None
     ) -> None:
         if recording.depth_camera is None and not same_aspect(color_size, depth_size):
-            raise SequenceError(
-                f"{files.depth}: depth is {_text(depth_size)}, but colour {files.color.name} is {_text(color_size)}: "
-                "not the same view at another resolution (the calibration of a depth camera beside the colour camera "
-                "would tell how they belong together)"
-            )
+            found = f"{files.depth}: depth is {_text(depth_size)}, but colour {files.color.name} is {_text(color_size)}"
+            raise SequenceError(f"{found}: {_why_other_aspect(recording, files, color_size, depth_size)}")
         self.color_size, self.depth_size = color_size, depth_size
         self._common = color_camera = _color_camera(recording, color_size, files.color)
         self._warp: np.ndarray | None = None
@@ -216,6 +215,19 @@ class ImageGeometry:
         if self._maps is not None:
             mask = cv2.remap(mask, *self._maps, interpolation=cv2.INTER_NEAREST)
         return resize_mask(mask, self.camera.width, self.camera.height, shared)
+
+
+def _why_other_aspect(recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size) -> str:
+    """What may be the matter with colour and depth of such sizes, and what to do about it."""
+    if same_aspect(color_size, (depth_size[1], depth_size[0])):
+        tag = orientation_of(files.color)
+        if tag in QUARTER_TURNS and not recording.upright:
+            return f"colour is stored {ORIENTATIONS[tag]} (orientation tag {tag}); try `upright`"
+        return "one of them is stored turned by 90 degrees; turn it back, so that both show the same view"
+    return (
+        "not the same view at another resolution (the calibration of a depth camera beside the colour camera would "
+        "tell how they belong together)"
+    )
 
 
 def rays_of_depth(recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size) -> np.ndarray:

@@ -12,7 +12,7 @@ from ggslam.scene.frame import Frame
 from ggslam.sequences.depth_kind import Measure
 
 MEASURES: tuple[Measure, ...] = ("z", "ray", "inverse")
-COLUMNS = 120
+COLUMNS = 96
 """Of the images that are looked at, about."""
 WINDOW = 3
 """Windows are so many times smaller than the image, and overlap by half."""
@@ -97,8 +97,9 @@ def _residual(values: np.ndarray, rays: np.ndarray) -> float:
     weights = np.ones(len(values))
     relative = np.zeros(len(values))
     for _ in range(5):
-        scaled = (np.sqrt(weights) / values)[:, None] * rays
-        solution = np.linalg.lstsq(scaled, np.sqrt(weights), rcond=None)[0]
+        scaled = rays / values[:, None]
+        weighted = scaled.T * weights
+        solution = np.linalg.lstsq(weighted @ scaled, weighted.sum(1), rcond=None)[0]
         relative = rays @ solution / values - 1
         spread = 1.48 * float(np.median(np.abs(relative))) + 1e-6
         weights = 1 / (1 + (relative / (2 * spread)) ** 2) ** 2

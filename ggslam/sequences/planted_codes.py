@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers in depth images that are no distance: one that many pixels hold in all images, beyond all that is measured."""
+"""Numbers in depth images that are no distance: one that many pixels of all images hold, beyond all that is
+measured."""
 
 from __future__ import annotations
 
@@ -13,10 +14,10 @@ from ggslam.sequences.sequence import Sequence
 
 LOOKS = 6
 LEAST_SHARE, NEAR, LARGEST_NEAR = 0.005, 0.9, 0.1
-"""Share of the known pixels that hold the largest number; what is at least so large a part of it counts as near; so many
-times as many pixels may be near."""
-FRAMES = 0.6
-"""Share of the images that hold it."""
+"""Share of the known pixels that hold the largest number; what is at least so large a part of it counts as near; so
+many times as many pixels may be near."""
+FRAMES, LEAST_REST = 0.6, 0.3
+"""Share of the images that hold it, and of the known pixels that hold a number much smaller."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ def find_planted_code(sequence: Sequence) -> PlantedCode | None:
     values = np.concatenate(images)
     top = float(values.max())
     held, near = float((values == top).mean()), float(((values >= NEAR * top) & (values < top)).mean())
+    rest = 1 - held - near
     often = float(np.mean([(known == top).mean() > LEAST_SHARE / 5 for known in images]))
-    planted = held > LEAST_SHARE and near < LARGEST_NEAR * held and often >= FRAMES
+    planted = held > LEAST_SHARE and near < LARGEST_NEAR * held and often >= FRAMES and rest > LEAST_REST
     return PlantedCode(top, held) if planted else None

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images that a recording holds several times: the same depth beside new colour, or the same colour beside new depth."""
+"""Images that a recording holds several times: the same depth beside new colour, or the same colour beside new
+depth."""
 
 from __future__ import annotations
 

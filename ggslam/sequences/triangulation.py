@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far points really are by the true poses: points matched in two colour images are triangulated, and what depth says
-of them is held against that. It tells the unit of depth, and what its numbers mean."""
+"""How far points really are by the true poses: points matched in two colour images are triangulated, and what depth
+says of them is held against that. It tells the unit of depth, and what its numbers mean."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _points(number: int, first: Frame, second: Frame) -> np.ndarray:
     matched = _match(first.color, second.color)
     if matched is None:
         return np.zeros((0, 4))
-    c, (here, there) = first.camera, matched
+    c, here = first.camera, matched[0]
     a, b = (np.column_stack([(p[:, 0] - c.cx) / c.fx, (p[:, 1] - c.cy) / c.fy, np.ones(len(p))]) for p in matched)
     T = inverse(second.T_world_camera) @ first.T_world_camera
     turned, moved = a @ T[:3, :3].T, np.broadcast_to(T[:3, 3], b.shape)

@@ -156,8 +156,9 @@ def judge_intrinsics(camera: Camera) -> list[Verdict]:
     return []
 
 
-def judge_times(timestamps: np.ndarray) -> list[Verdict]:
-    """What timestamps [n] in seconds, in the order of the frames, say."""
+def judge_times(timestamps: np.ndarray, nominal: bool = False) -> list[Verdict]:
+    """What timestamps [n] in seconds, in the order of the frames, say. `nominal`: they only count frames, by the
+    numbers in the images' names."""
     intervals = np.diff(timestamps)
     verdicts = []
     back = np.flatnonzero(intervals <= 0)
@@ -172,7 +173,9 @@ def judge_times(timestamps: np.ndarray) -> list[Verdict]:
     if len(gaps):
         missing, longest = int(np.rint(intervals[gaps] / usual - 1).sum()), gaps[intervals[gaps].argmax()]
         if missing > MISSING_SHARE * len(timestamps) or intervals[longest] > max(MISSING_S, 6 * usual):
-            text = f"about {missing} frames are missing in {len(gaps)} gaps of the timestamps"
-            text += f" (the longest: {intervals[longest]:.2f} s before frame {longest + 1})"
+            place = "numbers of the images" if nominal else "timestamps"
+            length = f"{round(intervals[longest] / usual) - 1} frames" if nominal else f"{intervals[longest]:.2f} s"
+            text = f"about {missing} frames are missing in {len(gaps)} gaps of the {place}"
+            text += f" (the longest: {length} before frame {longest + 1})"
             verdicts.append(Verdict("frames_missing", "doubtful", f"{text}; record to a faster disk, or fewer pixels"))
     return verdicts

@@ -15,12 +15,13 @@ from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.checkpointing import Checkpointing, start_record
-from ggslam.jobs.run.health import judge
+from ggslam.jobs.run.health import doubt_movers, judge
 from ggslam.jobs.run.map_fit import MapFit, measure_fit
 from ggslam.jobs.run.rescue import save_somewhere
 from ggslam.jobs.run.resuming import Resumption
 from ggslam.jobs.run.run_verdict import judge_result
 from ggslam.jobs.run.slam_loop import Follower, SlamLoop
+from ggslam.jobs.run.start_check import check_depth
 from ggslam.jobs.score.run import score_run
 from ggslam.runs.checkpoints import Checkpoints
 from ggslam.runs.folder import RunFolder
@@ -45,7 +46,8 @@ T = TypeVar("T")
 @dataclass(frozen=True)
 class RunRequest:
     """A whole run; with `map` in the map of an earlier one, which grows unless `localize_only`. Its state is saved
-    after every `checkpoint_every` frames: 0: never; None: as often as it hardly takes time."""
+    after every `checkpoint_every` frames: 0: never; None: as often as it hardly takes time. `check`: look at the
+    recording's depth first, and refuse what is certainly wrong with it."""
 
     sequence: SequenceRequest
     out: Path | None = None
@@ -56,6 +58,7 @@ class RunRequest:
     map: Path | None = None
     localize_only: bool = False
     checkpoint_every: int | None = None
+    check: bool = True
 
 
 @dataclass
@@ -110,9 +113,12 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     out = request.out if request.out is not None else Path("runs") / sequence.name
     if earlier is not None and out.resolve() in ancestors(earlier):
         raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
+    observer = observer or SilentObserver()
+    verdicts = check_depth(sequence, observer) if request.check else None
     folder = RunFolder.create(out, overwrite=request.overwrite)
     with stop_on_request() as stop, folder_lock(folder.path):
-        return _Run(request, config, sequence, earlier, folder, observer or SilentObserver(), follower, stop).run(None)
+        run = _Run(request, config, sequence, earlier, folder, observer, follower, stop, depth=verdicts)
+        return run.run(None)
 
 
 def resume(
@@ -147,7 +153,7 @@ def resume(
 
 @dataclass
 class _Run:
-    """A run about to be made; see `RunRequest`."""
+    """A run about to be made; see `RunRequest`. `depth`: what `check_depth` said; None: it was not asked."""
 
     request: RunRequest
     config: Config
@@ -157,6 +163,7 @@ class _Run:
     observer: Observer
     follower: Follower | None
     stop: StopRequest
+    depth: list[Verdict] | None = None
     fit: MapFit | None = None
 
     def run(self, resumption: Resumption | None) -> RunOutcome:
@@ -218,13 +225,14 @@ class _Run:
         """Writes the folder, or if that cannot be, another one."""
         described = describe(self.request.sequence, self.sequence, self.earlier)
         lacking = _objects_notes(self.sequence, result, self.config, self.earlier)
+        verdicts = self._or_note(lambda: judge(self.sequence, result, self.depth)) or []
+        result.notes = doubt_movers(result.notes, verdicts)
         for text in [*LoopsRecord.of_result(result).notes(), *described.notes(), *lacking, *result.notes]:
             self.observer.note(text)
         names = {**_names(self.earlier), **self.sequence.instance_names}
         scored = self.request.evaluate and error is None and self._frames_stay()
         wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)
         told = None if error is None else repr(error)
-        verdicts = self._or_note(lambda: judge(self.sequence, result)) or []
         try:
             folder, failure = save_somewhere(
                 self.folder, RunToWrite(self.config, described, result, told, names, wanted, verdicts)

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A look at a recording's depth before a run spends its time on it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ggslam.errors import SequenceError
+from ggslam.jobs.progress import Observer
+from ggslam.sequences import Sequence
+from ggslam.sequences.depth_doubts import DepthDoubts
+from ggslam.sequences.live import LiveSequence
+from ggslam.sequences.rig import RigSequence
+from ggslam.sequences.verdicts import Verdict
+
+
+def check_depth(sequence: Sequence | LiveSequence, observer: Observer) -> list[Verdict]:
+    """What is doubtful about depth; each is told as a note.
+
+    Raises:
+        SequenceError: depth is certainly not what it is taken for; says what it is and what to do.
+    """
+    found = _judge(sequence)
+    certain = [verdict.text for verdict in found if verdict.severity == "wrong"]
+    if certain:
+        raise SequenceError(f"{sequence.path}: {'; '.join(certain)} (or `check` to run it as it is)")
+    for verdict in found:
+        observer.note(verdict.text)
+    return found
+
+
+def _judge(sequence: Sequence | LiveSequence) -> list[Verdict]:
+    if isinstance(sequence, LiveSequence):
+        return []
+    if isinstance(sequence, RigSequence):
+        return [
+            replace(verdict, text=f"{part.name}: {verdict.text}")
+            for part in sequence.parts for verdict in DepthDoubts(part.sequence).judge()
+        ]  # fmt: skip
+    return DepthDoubts(sequence).judge()
