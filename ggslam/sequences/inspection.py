@@ -29,10 +29,15 @@ from ggslam.sequences.verdicts import (
     judge_scale_signs,
     judge_times,
 )
+from ggslam.sequences.void_ids import has_void_id
 
 LARGEST_RATIO, SCALE_TOLERANCE = 1.25, 0.05
 """Factor between depth and true poses from which the depth scale is doubted, and how exactly (natural logarithm) it is
 known."""
+VOID_TEXT = (
+    "id 255 stands in most masks and is far from all other ids: it seems to mean that nobody decided what is there; "
+    "`void_id` 255 leaves it out"
+)
 APART = 12
 """Frames from one to the other of those that are compared where no true pose tells how far the camera moved."""
 
@@ -110,7 +115,7 @@ class SequenceReport:
     verdicts: list[Verdict] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
-    def told(self, code: str) -> bool:
+    def has_verdict(self, code: str) -> bool:
         """Whether there is a verdict of this kind."""
         return any(verdict.code == code for verdict in self.verdicts)
 
@@ -145,6 +150,8 @@ def inspect_sequence(
     report.judge(depth if depth is not None else doubts.judge() if frames else [])
     certain = any(verdict.severity == "wrong" for verdict in report.verdicts)
     report.judge(judge_intrinsics(report.camera))
+    if masks and has_void_id(sequence):
+        report.judge([Verdict("void_id", "doubtful", VOID_TEXT)])
     pairs = _pairs(report, sequence, frames)
     if sequence.ground_truth is not None:
         report.posed_frames = int(np.isfinite(sequence.ground_truth).all((1, 2)).sum())
@@ -163,10 +170,10 @@ def inspect_sequence(
 
 def _check_scale(report: SequenceReport, sequence: Sequence, frames: list[Frame], certain: bool) -> None:
     """Judges the depth scale by the size of what is seen, where no pose tells more and depth is depth."""
-    if certain or report.told("depth_scale") or not report.valid_share or report.scale_known:
+    if certain or report.has_verdict("depth_scale") or not report.valid_share or report.scale_known:
         return
     report.judge(judge_depth_scale(report.depth_scale, report.depth_m[1]))
-    if not report.posed_frames and not report.told("depth_scale"):
+    if not report.posed_frames and not report.has_verdict("depth_scale"):
         signs = measure_scale_signs(sequence, frames)
         report.judge([] if signs is None else judge_scale_signs(report.depth_scale, signs))
 
@@ -259,7 +266,7 @@ def _pairs(report: SequenceReport, sequence: Sequence, frames: list[Frame]) -> l
 
 def _check_camera(report: SequenceReport, pairs: list[tuple[Frame, Frame]]) -> None:
     """Judges intrinsics by pairs of frames, unless they are implausible by themselves."""
-    doubt = None if report.told("intrinsics") else doubt_focal_length(pairs)
+    doubt = None if report.has_verdict("intrinsics") else doubt_focal_length(pairs)
     if doubt is not None and doubt.wrong:
         text = (
             f"intrinsics are suspicious: with fx {report.native_camera.fx * doubt.factor:.0f} instead of "

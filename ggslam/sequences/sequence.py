@@ -72,6 +72,7 @@ class Sequence:
         depth_scale: units per metre of the stored depth images.
         depth_kind: what the numbers of depth images mean.
         upright: whether colour images are turned as their orientation tag says.
+        void_id: id of stored masks that means "unlabelled" besides 0, or None.
         color_size, depth_size: (width, height) of the stored images.
         lens: distortion that is undone and intrinsics that change, in words; "" for a pinhole camera that stays one.
         min_confidence: depth less sure than this is dropped; None: the recording has no confidence images.
@@ -120,6 +121,7 @@ class Sequence:
         self.depth_scale: float = recording.depth_scale
         self.depth_kind: DepthKind = recording.depth_kind
         self.upright: bool = recording.upright
+        self.void_id: int | None = recording.void_id
         self.instance_names: dict[int, str] = dict(recording.instance_names)
         self.pose_source: str = recording.pose_source
         self.pose_problem = recording.pose_problem

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A look at a recording's depth before a run spends its time on it."""
+"""A look at a recording's depth and masks before a run spends its time on it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from ggslam.errors import SequenceError
 from ggslam.jobs.progress import Observer
 from ggslam.sequences import Sequence
 from ggslam.sequences.depth_doubts import DepthDoubts
+from ggslam.sequences.inspection import VOID_TEXT
 from ggslam.sequences.live import LiveSequence
 from ggslam.sequences.rig import RigSequence
 from ggslam.sequences.verdicts import Verdict
+from ggslam.sequences.void_ids import has_void_id
 
 
 def check_depth(sequence: Sequence | LiveSequence, observer: Observer) -> list[Verdict]:
@@ -37,4 +39,5 @@ def _judge(sequence: Sequence | LiveSequence) -> list[Verdict]:
             replace(verdict, text=f"{part.name}: {verdict.text}")
             for part in sequence.parts for verdict in DepthDoubts(part.sequence).judge()
         ]  # fmt: skip
-    return DepthDoubts(sequence).judge()
+    void = [Verdict("void_id", "doubtful", VOID_TEXT)] if has_void_id(sequence) else []
+    return [*DepthDoubts(sequence).judge(), *void]
