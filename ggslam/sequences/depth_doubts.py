@@ -66,10 +66,10 @@ class DepthDoubts:
     frames: list[Frame] = field(default_factory=list)
 
     def judge(self) -> list[Verdict]:
-        """All doubts. Those about the side and the kind of depth come first: they make others wrong."""
-        found = [*self._judge_units(), *self._judge_side()]
+        """All doubts. One about units, place or kind of depth hides those that it may be the cause of."""
+        found = self._judge_units()
+        found += self._judge_edges() if not found else []
         found += self._judge_measure() if not found else []
-        found += self._judge_moment_and_place() if not found else []
         return [*found, *self._judge_repeats(), *self._judge_codes()]
 
     @cached_property
@@ -103,12 +103,15 @@ class DepthDoubts:
     def _edges(self) -> EdgeImages:
         return look_at_edges(stretches(self.sequence))
 
-    def _judge_side(self) -> list[Verdict]:
-        """Whether depth is mirrored or turned against colour."""
-        found = find_turn(self._edges)
-        if found is None:
-            return []
-        name, better = found
+    def _judge_edges(self) -> list[Verdict]:
+        """Whether depth is mirrored or turned, a frame off, or of another camera: what fits best."""
+        turn, step, place = find_turn(self._edges), find_step(self._edges), find_place(self._edges)
+        found = [(place.best, self._place_verdict(place))] if place else []
+        found += [(step[1].best, self._step_verdict(*step))] if step else []
+        found += [(turn[1].best, self._side_verdict(*turn))] if turn else []
+        return [max(found, key=lambda one: one[0])[1]] if found else []
+
+    def _side_verdict(self, name: str, better: Better) -> Verdict:
         how = f"its outlines fit the edges of colour then (strength {better.best:.2f}, as it is {better.strength:.2f})"
         tag = 1 if self.sequence.upright else orientation_of(self.sequence.files(0).color)
         if UNDONE_BY_TAG.get(tag) == name:
@@ -116,10 +119,10 @@ class DepthDoubts:
                 f"colour is stored {ORIENTATIONS[tag]} (orientation tag {tag} of {self.sequence.files(0).color.name}) "
                 f"and depth is upright: {how}; try `upright`"
             )
-            return [Verdict("orientation", "wrong", text)]
+            return Verdict("orientation", "wrong", text)
         remedy = self._kind.with_words(name)
         text = f"depth is {SIDES[name]} against colour: {how}; try `depth_kind` {remedy}"
-        return [Verdict("depth_side", "wrong", text)]
+        return Verdict("depth_side", "wrong", text)
 
     def _judge_measure(self) -> list[Verdict]:
         """Whether depth is z, or measured along the ray, or inverse."""
@@ -165,14 +168,6 @@ class DepthDoubts:
             depths = np.concatenate([frame.depth[frame.depth > 0] for frame in self.spread])
             units = USUAL_MEDIAN_DEPTH * float(np.median(depths)) * self.sequence.depth_scale
         return float(f"{units:.2g}")
-
-    def _judge_moment_and_place(self) -> list[Verdict]:
-        """Whether depth was taken a frame earlier or later, or by another camera."""
-        step = find_step(self._edges)
-        if step is not None:
-            return [self._step_verdict(*step)]
-        place = find_place(self._edges)
-        return [] if place is None else [self._place_verdict(place)]
 
     def _step_verdict(self, frames: int, better: Better) -> Verdict:
         side = "after" if frames > 0 else "before"

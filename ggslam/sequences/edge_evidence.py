@@ -15,19 +15,24 @@ from ggslam.scene.frame import Frame
 from ggslam.sequences.alignment import edges_of, outlines_of
 from ggslam.sequences.sequence import Sequence
 
-STRETCHES, LENGTH = 3, 9
+STRETCHES, LENGTH = 3, 10
 """Where in a recording one looks, and how many successive frames there."""
-FEWEST_OUTLINES, FEWEST_FRAMES, FEWEST_IN_ALL = 15, 4, 150
+FEWEST_OUTLINES, FEWEST_FRAMES, FEWEST_IN_ALL = 15, 8, 150
 """Pixels of outlines that a frame needs to count, frames that do, and their pixels together."""
 REACH = 2
 """Frames before and after whose colour is compared."""
-SURE = 4.0
-"""Standard errors by which another explanation has to be better."""
+SURE_BY_FRAME, SURE_BY_PART = 4.0, 2.5
+"""Standard errors by which another explanation has to be better, by frames and by parts of the image."""
+FEWEST_PARTS = 4
 LEAST_GAIN, LEAST_STRENGTH = 0.15, 0.25
 """And by how much, in standard deviations of the edge images, and how strong the edges under it have to be."""
 WORST = 0.6
-"""Strength as it stands against that of another place, mirrored or turned, from which nothing seems wrong."""
+"""Strength as it stands against that of another place, from which nothing seems wrong."""
 
+PARTS = 4
+"""Rows and columns of the parts of an image whose edges are told apart."""
+WORST_TURNED = 0.4
+"""The same where depth may be mirrored or turned: little is left by chance."""
 TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mirrored": lambda image: image[:, ::-1],
     "flipped": lambda image: image[::-1],
@@ -104,16 +109,13 @@ def stretches(sequence: Sequence, count: int = STRETCHES, length: int = LENGTH) 
 
 def find_turn(seen: EdgeImages) -> tuple[str, Better] | None:
     """The name of `TURNS` that lays depth on colour; None if as it stands, or nothing can be told."""
-    pairs = seen.pairs()
-    if not _enough([outlines for outlines, _ in pairs]):
-        return None
-    weights = _weights([outlines for outlines, _ in pairs])
-    plain = np.array([edges[outlines > 0].mean() for outlines, edges in pairs])
     found = None
     for name, turn in TURNS.items():
-        turned = np.array([edges[turn(outlines) > 0].mean() for outlines, edges in pairs])
-        better = _compare(plain, turned, weights)
-        if better is not None and better.strength < WORST * better.best:
+        hits = _Hits()
+        for outlines, edges in seen.pairs():
+            hits.add(outlines, [edges, turn(edges)])  # each of them undoes itself
+        better = hits.compare(0, 1)
+        if better is not None and better.strength < WORST_TURNED * better.best:
             found = max(found, (name, better), key=lambda one: one[1].best) if found else (name, better)
     return found
 
@@ -121,20 +123,15 @@ def find_turn(seen: EdgeImages) -> tuple[str, Better] | None:
 def find_step(seen: EdgeImages) -> tuple[int, Better] | None:
     """Frames by which depth was taken after the colour beside it (negative: before); None if at the same time, or
     nothing can be told."""
-    rows, areas = [], []
+    hits = _Hits()
     for k, outlines in seen.outlines.items():
-        around = [seen.edges.get(k + step) for step in range(-REACH, REACH + 1)]
-        if outlines.sum() >= FEWEST_OUTLINES and all(edges is not None for edges in around):
-            rows.append([edges[outlines > 0].mean() for edges in around if edges is not None])
-            areas.append(outlines)
-    if not _enough(areas):
-        return None
-    strengths, weights = np.array(rows), _weights(areas)
-    means = weights @ strengths
-    best = int(means.argmax())
+        around = [edges for step in range(-REACH, REACH + 1) if (edges := seen.edges.get(k + step)) is not None]
+        if outlines.sum() >= FEWEST_OUTLINES and len(around) == 2 * REACH + 1:
+            hits.add(outlines, around)
     # At the right step strength falls off to both sides; where it goes on rising, something else is wrong.
-    better = _compare(strengths[:, REACH], strengths[:, best], weights) if best != REACH else None
-    return None if better is None or best in (0, 2 * REACH) else (best - REACH, better)
+    best = hits.best()
+    better = hits.compare(REACH, best) if best in range(1, 2 * REACH) and best != REACH else None
+    return None if better is None else (best - REACH, better)
 
 
 def find_place(seen: EdgeImages) -> BetterPlace | None:
@@ -147,14 +144,33 @@ def find_place(seen: EdgeImages) -> BetterPlace | None:
     strength = float(_weights([outlines for outlines, _ in pairs]) @ plain)
     if strength > GOOD:
         return None
-    halves = [_surface(pairs[k::2]) for k in (0, 1)]
+    middle = len(pairs) // 2  # in time: what is next to one another looks alike
+    halves = [_surface(part) for part in (pairs[:middle], pairs[middle:])]
     first, second, place = (_peak(surface) for surface in (*halves, (halves[0] + halves[1]) / 2))
     apart = abs(np.log(first[0] / second[0])), float(np.hypot(first[1] - second[1], first[2] - second[2]))
     if apart[0] > SAME_SCALE or apart[1] > SAME_SHIFT or abs(np.log(place[0])) < SAME_SCALE:
         return None
-    found = BetterPlace(strength, place[3], place[0], (place[1], place[2]))
-    sure = min(first[3], second[3]) > max(LEAST_STRENGTH, strength / WORST) and place[3] - strength > 2 * LEAST_GAIN
-    return found if sure else None
+    if min(first[3], second[3]) < max(LEAST_STRENGTH, strength / WORST) or place[3] - strength < 2 * LEAST_GAIN:
+        return None
+    better = _compare_place(pairs, place[0], place[1], place[2])
+    return None if better is None else BetterPlace(better.strength, better.best, place[0], (place[1], place[2]))
+
+
+def _compare_place(
+    pairs: list[tuple[np.ndarray, np.ndarray]], scale: float, right: float, down: float
+) -> Better | None:
+    """Outlines enlarged and moved against outlines as they stand, of those that stay in the image."""
+    hits = _Hits()
+    for outlines, edges in pairs:
+        height, width = edges.shape
+        centre = np.array([(width - 1) / 2, (height - 1) / 2])
+        warp = np.column_stack([scale * np.eye(2), (1 - scale) * centre + np.array([right, down]) * width])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP  # what an outline falls on comes to where it is now
+        moved = cv2.warpAffine(edges, warp, (width, height), flags=flags, borderValue=float("nan"))
+        inside = outlines * np.isfinite(moved)
+        if inside.any():
+            hits.add(inside, [edges, np.nan_to_num(moved)])
+    return hits.compare(0, 1)
 
 
 def _enough(outlines: list[np.ndarray]) -> bool:
@@ -167,14 +183,48 @@ def _weights(outlines: list[np.ndarray]) -> np.ndarray:
     return weights / weights.sum()
 
 
-def _compare(plain: np.ndarray, other: np.ndarray, weights: np.ndarray) -> Better | None:
-    """The other of two strengths of each frame, if it is clearly better in all."""
-    difference = other - plain
-    gain = float(weights @ difference)
-    error = float(np.sqrt((weights**2 * (difference - gain) ** 2).sum()))
-    found = Better(float(weights @ plain), float(weights @ other))
-    clear = gain > LEAST_GAIN and gain > SURE * error and found.best > LEAST_STRENGTH
-    return found if clear else None
+class _Hits:
+    """Strengths of edges under outlines, laid on several images, summed by frame and by part of the image: both tell
+    how sure a difference is. Neighbouring frames show the same edges, so frames alone would make it look too sure."""
+
+    def __init__(self) -> None:
+        self._sums: list[np.ndarray] = []
+        self._outlines: list[np.ndarray] = []
+
+    def add(self, outlines: np.ndarray, images: list[np.ndarray]) -> None:
+        """Takes a frame in: its outlines [H, W], and edges [H, W] that they may belong to."""
+        rows, columns = np.nonzero(outlines)
+        part = rows * PARTS // outlines.shape[0] * PARTS + columns * PARTS // outlines.shape[1]
+        weight = 1 / np.sqrt(len(rows))  # a frame full of outlines counts more, but not in proportion
+        values = [np.ones(len(rows)), *(edges[rows, columns] for edges in images)]
+        self._sums.append(weight * np.stack([np.bincount(part, v, PARTS**2) for v in values]))
+        self._outlines.append(outlines)
+
+    def best(self) -> int:
+        """Number of the image that fits best; -1: nothing can be told."""
+        return int(np.sum(self._sums, axis=(0, 2))[1:].argmax()) if _enough(self._outlines) else -1
+
+    def compare(self, plain: int, other: int) -> Better | None:
+        """Another image against that of the frame itself, if it fits clearly better."""
+        if not _enough(self._outlines):
+            return None
+        sums = np.stack(self._sums)[:, [0, 1 + plain, 1 + other]]
+        by_part, by_frame = sums.sum(0), sums.sum(2).T
+        count, strength, best = by_part.sum(1)
+        found = Better(float(strength / count), float(best / count))
+        gain = found.best - found.strength
+        sure = gain > SURE_BY_PART * _error(by_part) and gain > SURE_BY_FRAME * _error(by_frame)
+        return found if sure and gain > LEAST_GAIN and found.best > LEAST_STRENGTH else None
+
+
+def _error(sums: np.ndarray) -> float:
+    """Standard error of the gain by leaving out one group in turn: counts and two strengths of groups [3, n]."""
+    used = sums[:, sums[0] > 0]
+    count, plain, other = used.sum(1)[:, None] - used
+    if used.shape[1] < FEWEST_PARTS:
+        return float("inf")
+    left = (other - plain) / count
+    return float(np.sqrt((len(left) - 1) / len(left) * ((left - left.mean()) ** 2).sum()))
 
 
 def _surface(pairs: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:

@@ -20,7 +20,7 @@ FULL = 0.7
 """Share of a window's pixels that must have depth."""
 FLAT = 0.01
 """Median relative residual up to which a window shows a plane, read in one way at least."""
-FEWEST_WINDOWS, FEWEST_FRAMES = 12, 4
+FEWEST_WINDOWS, FEWEST_FRAMES, FEWEST_PLACES = 12, 4, 6
 MOST, LEAST_RATIO = 0.67, 0.75
 """Share of the windows in which a reading has to be the flattest, and by which factor in their median."""
 
@@ -34,6 +34,7 @@ class PlaneEvidence:
         residuals: medians over the windows of the median relative residuals.
         ratios: medians of the residuals against those as z.
         wins: shares of the windows that each reading makes the flattest.
+        places: in the image where planes are seen: neighbouring frames show the same ones.
     """
 
     windows: int
@@ -41,11 +42,12 @@ class PlaneEvidence:
     residuals: tuple[float, ...]
     ratios: tuple[float, ...]
     wins: tuple[float, ...]
+    places: int = 0
 
     @property
     def measure(self) -> Measure | None:
         """The reading that fits clearly better than all others; None: none does."""
-        if self.windows < FEWEST_WINDOWS or self.frames < FEWEST_FRAMES:
+        if self.windows < FEWEST_WINDOWS or self.frames < FEWEST_FRAMES or self.places < FEWEST_PLACES:
             return None
         best = int(np.argmax(self.wins))
         others = [ratio for k, ratio in enumerate(self.ratios) if k != best]
@@ -55,10 +57,11 @@ class PlaneEvidence:
 
 def look_at_planes(frames: list[Frame]) -> PlaneEvidence:
     """Fits planes to windows of depth images, read in each way."""
-    found, frames_used = [], 0
+    found, frames_used, places = [], 0, set()
     for frame in frames:
         rows = _residuals(frame)
-        found += rows
+        found += list(rows.values())
+        places |= set(rows)
         frames_used += bool(rows)
     if not found:
         return PlaneEvidence(0, 0, (np.nan,) * 3, (np.nan,) * 3, (0.0,) * 3)
@@ -67,18 +70,18 @@ def look_at_planes(frames: list[Frame]) -> PlaneEvidence:
     wins = np.bincount(residuals.argmin(1), minlength=len(MEASURES)) / len(residuals)
     return PlaneEvidence(
         len(residuals), frames_used, tuple(map(float, np.median(residuals, axis=0))), tuple(map(float, ratios)),
-        tuple(map(float, wins)),
+        tuple(map(float, wins)), len(places),
     )  # fmt: skip
 
 
-def _residuals(frame: Frame) -> list[list[float]]:
-    """Of the windows of a frame that show a plane, the median relative residual of each reading."""
+def _residuals(frame: Frame) -> dict[tuple[int, int], list[float]]:
+    """Of the windows of a frame that show a plane, by place, the median relative residual of each reading."""
     step = max(1, frame.depth.shape[1] // COLUMNS)
     depth = frame.depth[::step, ::step].astype(np.float64)
     rays = frame.camera.rays()[::step, ::step].astype(np.float64)
     length = np.linalg.norm(rays, axis=2)
     height, width = depth.shape[0] // WINDOW, depth.shape[1] // WINDOW
-    found = []
+    found = {}
     for top in range(0, depth.shape[0] - height + 1, max(1, height // 2)):
         for left in range(0, depth.shape[1] - width + 1, max(1, width // 2)):
             window = np.s_[top : top + height, left : left + width]
@@ -88,7 +91,7 @@ def _residuals(frame: Frame) -> list[list[float]]:
             d, along, ray = depth[window][known], length[window][known], rays[window][known]
             row = [_residual(values, ray) for values in (1 / d, along / d, d)]
             if min(row) < FLAT:
-                found.append(row)
+                found[top, left] = row
     return found
 
 
