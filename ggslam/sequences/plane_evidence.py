@@ -16,6 +16,8 @@ COLUMNS = 96
 """Of the images that are looked at, about."""
 WINDOW = 3
 """Windows are so many times smaller than the image, and overlap by half."""
+SMALLEST = 4
+"""Rows or columns of a window."""
 FULL = 0.7
 """Share of a window's pixels that must have depth."""
 FLAT = 0.01
@@ -81,7 +83,9 @@ def _residuals(frame: Frame) -> dict[tuple[int, int], list[float]]:
     rays = frame.camera.rays()[::step, ::step].astype(np.float64)
     length = np.linalg.norm(rays, axis=2)
     height, width = depth.shape[0] // WINDOW, depth.shape[1] // WINDOW
-    found = {}
+    found: dict[tuple[int, int], list[float]] = {}
+    if min(height, width) < SMALLEST:
+        return found
     for top in range(0, depth.shape[0] - height + 1, max(1, height // 2)):
         for left in range(0, depth.shape[1] - width + 1, max(1, width // 2)):
             window = np.s_[top : top + height, left : left + width]
