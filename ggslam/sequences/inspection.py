@@ -286,7 +286,8 @@ def _check_steps(report: SequenceReport, sequence: Sequence) -> None:
     side = "before" if doubt.behind > 0 else "after"
     text = (
         f"colour and depth are out of step: depth fits the colour of {count} {side} it better (strength of edges "
-        f"{doubt.best:.2f}, not {doubt.strength:.2f}); pair images of the same time"
+        f"{doubt.best:.2f}, not {doubt.strength:.2f}); pair images of the same time, perhaps with `depth_delay` "
+        f"{-doubt.behind}f"
     )
     report.judge([Verdict("step", "wrong", text)])
 
