@@ -186,6 +186,7 @@ class Mapper(ABC):
         keyframe = self._new_keyframe(frame, T_world_camera)
         self._insert(keyframe, T_world_camera, labeller)
         self.keyframes.append(keyframe)
+        self.use_typical_exposure()
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
             prune(self.map, self.settings.pruning)
         if self._is_noisy and not self.is_live and is_look_due(len(self.keyframes)):
@@ -197,6 +198,14 @@ class Mapper(ABC):
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         """Goes on with a map made before. Keyframes without images keep their Gaussians but are never trained on."""
         self.map, self.keyframes = gaussians, keyframes
+
+    def use_typical_exposure(self, at_end: bool = False) -> None:  # noqa: B027
+        """If exposures are compensated and most keyframes are brighter or darker than the map, the map gets the
+        exposure that is typical of them; on the CPU.
+
+        Args:
+            at_end: before the final refinement: exposures are measured again first, and every difference counts.
+        """
 
     def move_keyframes(self, T_new_old: np.ndarray) -> None:
         """Moves keyframes, and with each the Gaussians that it inserted.

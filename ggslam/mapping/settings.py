@@ -126,6 +126,10 @@ class ExposureSettings:
     that regulate themselves a little stay below."""
     least: float = setting(0.1, 0.001, 10)
     """Change of a gain, as a natural logarithm, from which a keyframe is then given an exposure of its own."""
+    typical: float = setting(0.2, 0.001, 10)
+    """Once exposures are compensated, the map gets the keyframes' median exposure when they differ from it by this, as
+    a natural logarithm, and after the last frame in any case: a first frame of a camera that was still regulating
+    itself does not colour the map. A map made before keeps its exposure."""
     rate: float = setting(2e-3, 0, 1)
     """Learning rate of gains and offsets."""
     regularization: float = setting(1e-2, 0, 1e6)

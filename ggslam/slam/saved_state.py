@@ -26,6 +26,7 @@ from ggslam.mapping.class_numbers import ClassNumbers
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
+from ggslam.mapping.cpu.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cpu.neighbours import NeighbourIndex
 from ggslam.mapping.identity import IdentityTimes
@@ -272,8 +273,8 @@ RULES: Rules = {
         (Camera, CameraFixtures, Trail, Track, MoverSight, Patch, RigidTracker, DepthEdges, DepthNoise,
          ResidualNoise, StillCamera, SmallFrame, KeyframeKind,
          FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
-         KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers,
-         IdentityClassifier,
+         KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, KeyframeExposures, IdentityTimes, CpuClassTable,
+         ClassNumbers, IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
          ShutterTimes, RigClock, EarlierViews, EarlierView),

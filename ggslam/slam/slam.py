@@ -221,6 +221,7 @@ class Slam:
         try:
             if steps:
                 if not begin:
+                    self.mapper.use_typical_exposure(at_end=True)
                     self.color_poses.align_keyframes()
                     self.mapper.drop_hidden()
                 self.mapper.refine(steps, note, begin)
