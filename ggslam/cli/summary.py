@@ -50,7 +50,7 @@ def print_scores(metrics: MetricsRecord) -> None:
     columns = ["scores", *(title for title, *_ in _IMAGE_COLUMNS)]
     for name, scores in metrics.images.sets().items():
         if scores.psnr_exposed is not None:
-            text = f"{name.replace('_', ' ')}: PSNR {scores.psnr_exposed:.2f} of frames brought to the map's exposure"
+            text = f"{name.replace('_', ' ')}: PSNR {scores.psnr_exposed:.2f} of frames brought to the usual exposure"
             console.print(text, highlight=False)
     console.print(table("images; all but 'unmasked' over pixels with measured depth", columns, rows))
     if metrics.cameras:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +33,26 @@ def change_of(exposure: np.ndarray) -> float:
     return float(np.exp(np.log(np.maximum(exposure[:, 0], 1e-6)).mean()))
 
 
+def frame_weights(numbers: Sequence[int]) -> np.ndarray:
+    """Frames for which keyframes of these numbers stand, [n]: up to the next one, the last for as many as the one
+    before it; one at least."""
+    gaps = np.diff(np.asarray(numbers, np.float64))
+    return np.maximum(np.append(gaps, gaps[-1:] if len(gaps) else 1), 1)
+
+
+def typical_gain(gains: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
+    """Weighted median of gains against a map, [3] each, by channel; where half of the weight lies on either side the
+    nearer to the map's, which is 1."""
+    found = np.ones(3)
+    for channel in range(3):
+        values = np.maximum([gain[channel] for gain in gains], 1e-3)
+        order = np.argsort(values, kind="stable")
+        share = np.cumsum(weights[order]) / weights.sum()
+        low, high = (values[order[np.searchsorted(share, 0.5, side=side)]] for side in ("left", "right"))
+        found[channel] = np.clip(1.0, low, high)
+    return found
+
+
 @dataclass(frozen=True)
 class SeenAgain:
     """What a map shows where a camera looks.
@@ -48,7 +69,7 @@ class SeenAgain:
     rendered_depth: np.ndarray
     depth: np.ndarray
 
-    def known(self) -> np.ndarray:
+    def common_pixels(self) -> np.ndarray:
         """Which of every STEP-th row and column both see, bool [h, w]."""
         depth, rendered_depth = self.depth[_SOME], self.rendered_depth[_SOME]
         near = np.abs(rendered_depth - depth) < SAME_DEPTH * depth
@@ -68,7 +89,7 @@ def is_lit(color: np.ndarray) -> bool:
 def shows_otherwise(color: np.ndarray, seen: SeenAgain) -> bool:
     """Whether a map and an image uint8 [H, W, 3] that is not lit, or a map of such images and one that is, contradict
     each other; what is black or white in the scene is so in both."""
-    known = seen.known()
+    known = seen.common_pixels()
     if known.mean() < FEWEST_SHARE:
         return False
     grey = color[_SOME].astype(np.float32).mean(2) / 255
@@ -90,7 +111,7 @@ def measure_exposure(
         image: rendered colour [3, H, W].
         alpha, rendered_depth: of the rendering [H, W].
     """
-    known = SeenAgain(image, alpha, rendered_depth, depth).known()
+    known = SeenAgain(image, alpha, rendered_depth, depth).common_pixels()
     seen, exposure = color[_SOME][known], identity_exposure()
     for channel in range(3):
         x, y = image[channel][_SOME][known], seen[:, channel].astype(np.float32) / 255
@@ -99,6 +120,21 @@ def measure_exposure(
             return None
         exposure[channel, 0] = float(np.median(y[used] / x[used]))
     return exposure if (exposure[:, 0] > 0).all() else None
+
+
+def relative_sharpness(color: np.ndarray, seen: SeenAgain, exposure: np.ndarray) -> float:
+    """Contrast between neighbouring pixels (root mean square of the gradient of grey values) in an image uint8
+    [H, W, 3] as a share of what a map shows of it with the image's exposure [3, 2]; 1 where too little is seen by both.
+    """
+    known = np.zeros(seen.depth.shape, bool)
+    known[_SOME] = seen.common_pixels()
+    gains = exposure[:, 0].astype(np.float32)
+    image = color.astype(np.float32).mean(2) / 255
+    shown = np.tensordot(gains, seen.image.clip(0, 1), 1) / np.float32(3)
+    ours, theirs = (float(sum(np.square(d)[known].sum() for d in np.gradient(grey))) for grey in (image, shown))
+    if known.sum() < FEWEST_SHARE * known.size / STEP**2 or theirs <= 0:
+        return 1.0
+    return float(np.sqrt(ours / theirs))
 
 
 def without_exposure(color: np.ndarray, exposure: np.ndarray) -> np.ndarray:

@@ -40,6 +40,8 @@ from ggslam.system.atomic import make_folder, write_text
 
 PICTURES = 6
 """Comparison pictures written to renders/, spread over the recording."""
+DARK_IMAGES = 30
+"""Mean colour of 255 under which PSNR, whose range is from black to white, flatters."""
 LOOKED_AT = 48
 """Frames in which is looked for what is fixed to the camera, spread likewise, if there is anything."""
 
@@ -79,7 +81,7 @@ def _score(
     looked_at = _spread(poses, LOOKED_AT if rig is None else 0)
     fixtures = find_fixtures((sequence.frame(i) for i in looked_at), poses)
     surface = SurfaceScorer(folder)
-    images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures, surface)
+    images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures, surface, notes)
     metrics = MetricsRecord.of({
         "trajectory": _trajectory(sequence, poses) if rig is None else rig.trajectory(poses),
         "images": {name: images[name] for name in sets},
@@ -173,17 +175,20 @@ def _segmentation_notes(folder: RunFolder, scored: bool, masks: Path | None) -> 
 def _images(
     folder: RunFolder, record: KeyframesRecord, sequence: Sequence, sets: dict[str, set[int]],
     scorer: ObjectScorer | None, lpips: Lpips | None, observer: Observer, fixtures: CameraFixtures,
-    surface: SurfaceScorer,
+    surface: SurfaceScorer, notes: list[str],
 ) -> dict[str, Any]:  # fmt: skip
     poses = record.poses()
     keyframes, held_out = sets["keyframes"], sets["held_out"]
     pictured = set(_spread(poses, PICTURES))
     make_folder(folder.path / "renders")
-    show = _shower(folder, sequence, poses, pictured, scorer, any(k.is_exposed for k in record.keyframes))
+    typical = record.typical_exposure() if any(k.is_exposed for k in record.keyframes) else None
+    show = _shower(folder, sequence, poses, pictured, scorer, typical)
     rows: list[dict[str, Any]] = []
+    brightness: list[float] = []
     observer.begin("score", len(sequence))
 
     def note(frame: Frame, scores: ImageScores | None) -> None:
+        brightness.append(float(frame.color.mean()))
         observer.advance(frame.index + 1, len(sequence))
         if frame.index in poses:
             surface.add(frame, poses[frame.index])
@@ -196,6 +201,10 @@ def _images(
     means = score_images(show, map(fixtures.clean, frames), sets, lpips, note)
     observer.advance(len(sequence), len(sequence))
     _write_rows(folder, rows)
+    usual = float(np.median(brightness or [255]))
+    if usual < DARK_IMAGES:
+        notes.append(f"the images are dark (mean colour {usual:.0f} of 255), and every error is small against white: "
+                     "do not compare PSNR with that of other recordings")  # fmt: skip
     return {name: mean.to_dict() for name, mean in means.items()}
 
 
@@ -218,10 +227,10 @@ def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:
 
 def _shower(
     folder: RunFolder, sequence: Sequence, poses: dict[int, np.ndarray], pictured: set[int],
-    scorer: ObjectScorer | None, exposed: bool,
+    scorer: ObjectScorer | None, typical: np.ndarray | None,
 ) -> Callable[[Frame], RenderedView | None]:  # fmt: skip
     """A function that renders the map as a frame's camera sees it, and keeps some of the pictures. If the exposure
-    changed it measures that of each frame."""
+    changed, which is on the whole `typical` against the map's [3], it measures that of each frame."""
     parts = folder.map_in_parts() if scorer is None else scorer.map
     rasterizer = CpuRasterizer()
 
@@ -241,10 +250,11 @@ def _shower(
             picture = compare_pictures(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
             write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
         exposure = None
-        if exposed:
+        if typical is not None:
             measured = measure_exposure(frame.color, frame.depth, view.image.numpy(), view.alpha.numpy(), depth)
             exposure = identity_exposure() if measured is None else measured
-        return RenderedView(_picture(view), depth, by_3dgs, exposure)
+        usual = np.ones(3) if typical is None else typical
+        return RenderedView(_picture(view), depth, by_3dgs, exposure, usual)
 
     return show
 

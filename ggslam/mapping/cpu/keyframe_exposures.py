@@ -14,9 +14,12 @@ from ggslam.rendering.exposure import (
     BRIGHT,
     SeenAgain,
     change_of,
+    frame_weights,
     identity_exposure,
     is_lit,
+    relative_sharpness,
     shows_otherwise,
+    typical_gain,
     without_exposure,
 )
 
@@ -24,6 +27,9 @@ FEWEST_KEYFRAMES = 3
 """So many exposures have to be known before one of them is called typical."""
 OVEREXPOSED = 1.1
 """Where a keyframe is so much brighter than the map its saturated pixels are not compared: the map may be brighter."""
+BLURRED = 0.5
+"""A keyframe with less contrast from pixel to pixel than this share of the map's is out of focus; hands that shake
+leave 0.76 or more, a blur of four pixels 0.26."""
 
 
 class KeyframeExposures:
@@ -114,17 +120,21 @@ class KeyframeExposures:
         return without_exposure(keyframe.color, measured)
 
     def measure_again(self, keyframe: Keyframe, seen: SeenAgain) -> None:
-        """A keyframe of a map that has been trained since gets what is measured against it."""
-        found = None if self.blind[keyframe.index] else seen.measure(keyframe.color)
+        """A keyframe of a map that has been trained since gets what is measured against it, where exposures changed;
+        if the map is much sharper than its image it is blind."""
+        if self.blind[keyframe.index]:
+            return
+        found = seen.measure(keyframe.color) if self.changed else None
         if found is not None:
             self.known[keyframe.index] = True
             keyframe.exposure, self.optimizers[keyframe.index].anchor = found.copy(), found
+        self.blind[keyframe.index] = relative_sharpness(keyframe.color, seen, keyframe.exposure) < BLURRED
 
     def is_exposed(self, keyframe: Keyframe) -> bool:
         """Whether a keyframe has an exposure of its own."""
         return self.settings.enabled or self.optimizers[keyframe.index].is_anchored
 
-    def compared(self, keyframe: Keyframe) -> np.ndarray | None:
+    def usable_pixels(self, keyframe: Keyframe) -> np.ndarray | None:
         """Where the colours of a keyframe tell something, bool [H, W]; None: everywhere."""
         if self.blind[keyframe.index]:
             return np.zeros(keyframe.color.shape[:2], bool)
@@ -133,14 +143,15 @@ class KeyframeExposures:
         return None
 
     def typical(self, keyframes: Sequence[Keyframe]) -> np.ndarray | None:
-        """Median gain of the keyframes against the map, [3]; None if the exposure did not change, too little is known,
-        or the map was made before: what it has been trained with stays."""
+        """Median gain against the map, [3], over the frames that the keyframes stand for. None if the exposure did not
+        change, too little is known, or the map was made before: it keeps what it was trained with."""
         if not self.changed or any(keyframe.frame_index == ELSEWHERE for keyframe in keyframes):
             return None
-        gains = [k.exposure[:, 0] for k in keyframes if self.known[k.index] and not self.blind[k.index]]
-        if len(gains) < FEWEST_KEYFRAMES:
+        weights = frame_weights([keyframe.frame_index for keyframe in keyframes])
+        told = [k.index for k in keyframes if self.known[k.index] and not self.blind[k.index]]
+        if len(told) < FEWEST_KEYFRAMES:
             return None
-        return np.asarray(np.median(np.maximum(gains, 1e-3), axis=0))
+        return typical_gain([keyframes[number].exposure[:, 0] for number in told], weights[told])
 
     def follow(self, gain: np.ndarray, keyframes: Sequence[Keyframe]) -> None:
         """The map became `gain` [3] times as bright: every exposure is against that from here on."""

@@ -145,14 +145,14 @@ class CpuMapper(Mapper):
         self._exposures.follow(gain, self.keyframes)
 
     def _measure_exposures(self) -> None:
-        """Exposures of all keyframes but those of an earlier map are measured against the map as trained by now."""
-        if not self._exposures.changed:
+        """Keyframes but those of an earlier map are compared with the map as trained by now: exposures are measured
+        again, and keyframes that are much less sharp colour it no longer."""
+        if not self.settings.exposure.compensate:
             return
-        for numbers in self.stages():
-            for keyframe in (self.keyframes[number] for number in numbers):
-                if keyframe.frame_index != ELSEWHERE:
-                    view = self._render(keyframe, features=False)
-                    self._exposures.measure_again(keyframe, self._look(keyframe, view))
+        for keyframe in (self.keyframes[number] for number in self._trainable()):
+            if keyframe.frame_index != ELSEWHERE:
+                view = self._render(keyframe, features=False)
+                self._exposures.measure_again(keyframe, self._look(keyframe, view))
 
     @staticmethod
     def _look(keyframe: Keyframe, view: RenderBuffers) -> SeenAgain:
@@ -196,7 +196,7 @@ class CpuMapper(Mapper):
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CpuLossResult:
         exposure = keyframe.exposure if self._exposures.is_exposed(keyframe) else None
-        valid, compared = self.valid_of(keyframe), self._exposures.compared(keyframe)
+        valid, compared = self.valid_of(keyframe), self._exposures.usable_pixels(keyframe)
         if compared is not None:
             valid = compared if valid is None else valid & compared
         color, depth = grid.of(keyframe.color), grid.of(keyframe.depth)
