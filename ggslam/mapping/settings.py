@@ -49,7 +49,10 @@ class LearningRates:
     """
 
     means: float = setting(1.8e-3, 0, 10, "m")
-    """Of the means, at a Gaussian's first step."""
+    """Of the means, at a Gaussian's first step, at most."""
+    means_px: float = setting(0.5, 0, 1e3, "px")
+    """The same as it moves a Gaussian in the image, at the scene's median depth, at most: near scenes have small
+    pixels."""
     quaternions: float = setting(1.8e-2, 0, 10)
     """Of the quaternions, at a Gaussian's first step."""
     log_scales: float = setting(8e-2, 0, 10)

@@ -262,7 +262,7 @@ RULES: Rules = {
     ActiveKeyframes: _but("settings"),
     Revisits: _but("settings"),
     # mapping
-    CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_standard_adam"),
+    CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_adam_of_pixel"),
     GaussianMap: Rule(save=_save_map, take=_take_map),
     Keyframe: Rule(fixed=_names("color", "depth", "mask", "moving")),
     CpuIdentityLearner: _but("settings", "seed"),

@@ -315,6 +315,7 @@ class Slam:
         if self._noise is not None or not self.mapper.keyframes:  # a map made before keeps what it was trained with
             self.mapper.depth_sigma = noise.sigma(median_depth)
         if median_depth > 0:
+            self.mapper.pixel_m = median_depth / self.camera.fx
             self.mapper.depth_noise_px = noise.in_pixels(median_depth, self.camera.fx)
         self._noise = noise
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -222,7 +223,9 @@ class GicpTracker(Tracker):
         settings = self.settings.photometric
         if settings.mode != "auto":
             return settings.mode
-        return "always" if self._noise().sigma(median_depth) > settings.noisy_m else "degenerate"
+        shown = self.state.residuals.sigma  # smooth depth may be wrong: it is trusted once residuals have shown that
+        noise = math.inf if shown is None else max(shown, self._noise().sigma(median_depth))
+        return "always" if noise > settings.noisy_m else "degenerate"
 
     def _align(
         self, points: PointSource, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None,
