@@ -223,8 +223,10 @@ class GicpTracker(Tracker):
         settings = self.settings.photometric
         if settings.mode != "auto":
             return settings.mode
-        shown = self.state.residuals.sigma  # smooth depth may be wrong: it is trusted once residuals have shown that
-        noise = math.inf if shown is None else max(shown, self._noise().sigma(median_depth))
+        noise = self._noise().sigma(median_depth)
+        if self.settings.noise is None:  # smooth depth may be wrong: it is trusted once residuals have shown its error
+            shown = self.state.residuals.sigma
+            noise = math.inf if shown is None else max(shown, noise)
         return "always" if noise > settings.noisy_m else "degenerate"
 
     def _align(
