@@ -42,6 +42,8 @@ PICTURES = 6
 """Comparison pictures written to renders/, spread over the recording."""
 DARK_IMAGES = 30
 """Mean colour of 255 under which PSNR, whose range is from black to white, flatters."""
+ONE_OBJECT = 0.85
+"""Share of a map from which one object is named that holds it."""
 LOOKED_AT = 48
 """Frames in which is looked for what is fixed to the camera, spread likewise, if there is anything."""
 
@@ -115,6 +117,7 @@ def _score(
         notes.append(f"{reason}; no trajectory scores")
     if edits := folder.mark().edits:
         notes.append(f"the map was edited ({'; '.join(edits)}); the recording was not, so edits count as errors")
+    notes.extend(_one_object_notes(folder))
     notes.extend(_segmentation_notes(folder, metrics.segmentation is not None, masks))
     metrics = metrics.model_copy(update={"notes": notes})
     metrics.write(folder.path)
@@ -152,6 +155,20 @@ def _object_scorer(folder: RunFolder, sequence: Sequence, sets: dict[str, set[in
     if not folder.has_objects():
         return None
     return ObjectScorer(ObjectsInParts.of(folder), sets, sequence.instance_names)
+
+
+def _one_object_notes(folder: RunFolder) -> list[str]:
+    """Whether objects by geometry did not tell things from the ground they lie on."""
+    if not folder.has_objects():
+        return []
+    table = folder.object_table()
+    counts = {record.id: record.gaussians for record in table.objects}
+    largest = max(counts, key=counts.__getitem__, default=0)
+    share = counts.get(largest, 0) / max(1, sum(counts.values()) + table.unlabelled_gaussians)
+    if table.supervision != "geometry" or share <= ONE_OBJECT:
+        return []
+    return [f"object {largest} holds {share:.0%} of the map: geometry does not tell what lies flat from its ground; "
+            "masks of a segmentation model do (masks.model)"]  # fmt: skip
 
 
 def _segmentation_notes(folder: RunFolder, scored: bool, masks: Path | None) -> list[str]:
