@@ -265,8 +265,9 @@ class GicpTracker(Tracker):
 
     def _is_vouched(self, found: AlignmentResult) -> bool:
         """Whether features, if they were asked, vouch for a pose."""
-        usable = found.status is not AlignmentStatus.LOST and self._features is not None
-        return usable and self._features.vouch(found.T_world_camera)
+        if found.status is AlignmentStatus.LOST or self._features is None:
+            return False
+        return self._features.vouch(found.T_world_camera)
 
     def _explains_greys(self, found: AlignmentResult) -> bool:
         """Whether the images agree at the pose found; true if none were compared."""
