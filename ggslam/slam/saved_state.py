@@ -236,7 +236,7 @@ RULES: Rules = {
     CoarseView: Rule(fixed=_names("depth", "near", "far", "whole", "smooth")),
     ObjectMasks: _but("settings", "_segment"),
     # tracking
-    GicpTracker: _but("_given_engine", "_features"),
+    GicpTracker: _but("_given_engine"),
     FeatureTracker: _but("features", "_extractor"),
     TrackerState: _but("camera", "context", "target"),
     CameraMotion: _but("reference"),
