@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.features.orb import FeatureSettings, FeatureView, ViewMatches
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import fit_similarity, inverse, se3_exp, separation
+from ggslam.scene.poses import inverse, se3_exp, separation
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import Config
 from ggslam.slam.slam import Slam
@@ -37,11 +38,10 @@ def track(folder: Path) -> tuple[list[str], float, int]:
     for frame in sequence.stream():
         slam.step(frame)
     known = [i for i, frame in enumerate(slam.frames) if frame.status != "lost"]
-    found = np.stack([slam.pose_of(slam.frames[i])[:3, 3] for i in known])
-    truth = np.stack([sequence.ground_truth[i][:3, 3] for i in known])
-    T = fit_similarity(found[None], truth[None])[0][0]
-    error = found @ T[:3, :3].T + T[:3, 3] - truth
-    return [f.status for f in slam.frames], float(100 * np.sqrt((error**2).sum(1).mean())), len(slam.movers.pixels)
+    assert sequence.ground_truth is not None
+    found = np.stack([slam.pose_of(slam.frames[i]) for i in known])
+    scores = score_trajectory(found, np.stack([sequence.ground_truth[i] for i in known]))
+    return [f.status for f in slam.frames], 100 * scores.ate_rmse_m, len(slam.movers.pixels)
 
 
 @pytest.mark.long("a walk is drawn and tracked")
