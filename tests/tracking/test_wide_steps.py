@@ -99,22 +99,25 @@ def test_only_weak_directions_follow_the_features() -> None:
     np.testing.assert_allclose(follow_weakly(alignment(found, np.eye(6)[:0]), other, spread), found, atol=1e-12)
 
 
-def shared_of(pixels: np.ndarray) -> SharedFeatures:
+def shared_of(pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> SharedFeatures:
     """Matches seen by the identity at these pixels, 2 m away."""
     view = FeatureView(np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32), np.eye(4))
-    shared = SharedFeatures(view, [], CAMERA, FeatureSettings())
     rays = (pixels - (CAMERA.cx, CAMERA.cy)) / (CAMERA.fx, CAMERA.fy)
-    shared.matches = [ViewMatches(2 * np.column_stack([rays, np.ones(len(pixels))]), pixels, np.eye(4))]
-    return shared
+    matches = ViewMatches(2 * np.column_stack([rays, np.ones(len(pixels))]), pixels, np.eye(4))
+    monkeypatch.setattr("ggslam.tracking.shared_features.match_views", lambda *_: matches)
+    return SharedFeatures(view, [view], CAMERA, FeatureSettings())
 
 
-def test_features_all_over_the_image_vouch_for_a_pose_and_those_on_one_thing_do_not() -> None:
+def test_features_all_over_the_image_vouch_for_a_pose_and_those_on_one_thing_do_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     pixels = np.random.default_rng(0).uniform((5, 5), (315, 235), (80, 2))
     aside = se3_exp(np.array([0.1, 0, 0, 0, 0, 0]))
-    everywhere = shared_of(pixels)
+    everywhere = shared_of(pixels, monkeypatch)
     assert everywhere.vouch(np.eye(4)) and not everywhere.vouch(aside)
-    assert not shared_of(pixels[:30]).vouch(np.eye(4))  # too few
-    assert not shared_of(pixels * 0.2 + 10).vouch(np.eye(4))  # all in one part of the image
+    assert everywhere.keeps(np.eye(4), np.eye(4), 0.8) and not everywhere.keeps(aside, np.eye(4), 0.8)
+    assert not shared_of(pixels[:30], monkeypatch).vouch(np.eye(4))  # too few
+    assert not shared_of(pixels * 0.2 + 10, monkeypatch).vouch(np.eye(4))  # all in one part of the image
 
 
 def test_the_share_that_was_seen_before() -> None:
