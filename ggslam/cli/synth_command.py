@@ -74,18 +74,27 @@ MoversOption = Annotated[
         "frame. The same seed and frames without it: the same, with nothing that moves.",
     ),
 ]
+RigOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CAMERAS",
+        help="Record with several cameras fixed to one another: some of front,left,back,right, or degrees to the "
+        "right, like 0,45,-30.",
+    ),
+]
+SceneOption = Annotated[
+    SceneName,
+    typer.Option(
+        help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first; "
+        "corridor: a walk along a furnished corridor, longer with more frames, without a loop; bare: the same "
+        "without furniture."
+    ),
+]
 
 
 def synth(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write the recording to.")],
-    scene: Annotated[
-        SceneName,
-        typer.Option(
-            help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first; "
-            "corridor: a walk along a furnished corridor, longer with more frames, without a loop; bare: the same "
-            "without furniture."
-        ),
-    ] = SceneName.room,
+    scene: SceneOption = SceneName.room,
     frames: Annotated[
         int | None,
         typer.Option(help="Number of frames; default: room 60, with movers 120, loop 480, corridors 720.", min=2),
@@ -113,14 +122,7 @@ def synth(
         typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, for the loop 0.3."),
     ] = None,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Add depth noise like a Kinect's.")] = True,
-    rig: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CAMERAS",
-            help="Record with several cameras fixed to one another: some of front,left,back,right, or degrees to the "
-            "right, like 0,45,-30.",
-        ),
-    ] = None,
+    rig: RigOption = None,
     rig_delay: Annotated[
         float, typer.Option(help="Seconds by which each camera of a rig is later than the one before it.", min=0)
     ] = 0.0,

@@ -161,7 +161,7 @@ class GicpTracker(Tracker):
         if photometric is not None and not judge.explains_greys(found) and not found.degenerate:
             # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
             found = self._align(points, target, guess, None, coarse)
-            if judge.shared.contradict(found.T_world_camera):
+            if judge.features.contradict(found.T_world_camera):
                 return self._retry(judge, points, target, found, photometric)
         if photometric is None and found.degenerate and mode != "never":
             photometric = self._photometric_part(judge.view)
@@ -235,7 +235,7 @@ class GicpTracker(Tracker):
             best = self._align(points, target, self.state.motion.predict(), photometric)
         for name, guess, coarse in judge.other_starts():
             candidate = self._align(points, target, guess, photometric, coarse)
-            vouched = not coarse and judge.shared.vouch(guess)
+            vouched = not coarse and judge.features.vouch(guess)
             if vouched:
                 candidate = judge.hold(candidate, guess, points, self._noise())
             if judge.is_better(candidate, best):
@@ -244,7 +244,7 @@ class GicpTracker(Tracker):
                 break  # there is no better start
         if best.photometric_share > 0 and not judge.explains_greys(best) and not best.degenerate:
             plain = self._align(points, target, best.T_world_camera, None, coarse=False)
-            best = best if judge.shared.prefer(best.T_world_camera, plain.T_world_camera) else plain
+            best = best if judge.features.prefer(best.T_world_camera, plain.T_world_camera) else plain
         return best, reason
 
     def _give_up(self, points: PointSource, found: AlignmentResult) -> TrackingResult:

@@ -48,14 +48,14 @@ class PoseJudge:
     depth_m: float | None
 
     @cached_property
-    def shared(self) -> SharedFeatures:
+    def features(self) -> SharedFeatures:
         """Features that the frame shares with the last located ones."""
         return SharedFeatures(self.view, self.motion.views, self.camera, self.settings.features)
 
     @property
     def has_matched(self) -> bool:
         """Whether features were asked for."""
-        return "shared" in self.__dict__
+        return "features" in self.__dict__
 
     # --- starts ------------------------------------------------------------------------------------------------------
 
@@ -64,8 +64,8 @@ class PoseJudge:
         image far, at what the features vouch for."""
         guess = self.motion.predict()
         if self.is_wide(guess):
-            for _, pose in self.shared.starts():
-                if self.shared.vouch(pose):
+            for _, pose in self.features.starts():
+                if self.features.vouch(pose):
                     return pose, False
         return guess, True
 
@@ -73,7 +73,7 @@ class PoseJudge:
         """Other starts than constant velocity, the likeliest first: a name, a pose [4, 4], and whether it is coarse.
         Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall."""
         tried, turned = [self.motion.predict()], self.motion.T_world_camera @ self.motion.turned
-        starts = [(name, pose, False) for name, pose in self.shared.starts()]
+        starts = [(name, pose, False) for name, pose in self.features.starts()]
         starts.append(("last pose", self.motion.T_world_camera, True))
         if self.is_wide(turned):
             starts.append(("shift of the image", turned, True))
@@ -105,15 +105,15 @@ class PoseJudge:
         """Whether features, if they were asked, vouch for a pose."""
         if found.status is AlignmentStatus.LOST or not self.has_matched:
             return False
-        return self.shared.vouch(found.T_world_camera)
+        return self.features.vouch(found.T_world_camera)
 
     def is_far_off(self, found: AlignmentResult) -> bool:
         """Whether a pose after a wide step, where alignments have several minima, is not where features have it."""
         if not self.is_wide(found.T_world_camera):
             return False
-        if found.degenerate and self.shared.could_vouch:
-            return not self.shared.vouch(found.T_world_camera)
-        return bool(self.shared.contradict(found.T_world_camera))
+        if found.degenerate and self.features.could_vouch:
+            return not self.features.vouch(found.T_world_camera)
+        return bool(self.features.contradict(found.T_world_camera))
 
     def is_acceptable(self, found: AlignmentResult, points: PointSource) -> bool:
         """Whether to believe a pose at all. Some overlap can be had anywhere (a floor is a floor), so that a pose short
@@ -132,7 +132,7 @@ class PoseJudge:
 
     def jump(self, T_world_camera: np.ndarray) -> str:
         """Why the path jumps at a pose [4, 4], as far as features were asked; empty if it does not."""
-        return self.shared.contradict(T_world_camera, JUMP_SLACK) if self.has_matched else ""
+        return self.features.contradict(T_world_camera, JUMP_SLACK) if self.has_matched else ""
 
     def _matches_what_was_seen(self, found: AlignmentResult, points: PointSource) -> bool:
         """Whether the overlap is convincing for so much as the last views show of the frame: a fast turn leaves
@@ -155,7 +155,7 @@ class PoseJudge:
         self, found: AlignmentResult, T_start: np.ndarray, points: PointSource, noise: DepthNoise
     ) -> AlignmentResult:
         """See `hold_to_features`."""
-        return hold_to_features(found, T_start, self.shared, points, noise, self.settings.convincing_overlap)
+        return hold_to_features(found, T_start, self.features, points, noise, self.settings.convincing_overlap)
 
     def is_better(self, candidate: AlignmentResult, best: AlignmentResult) -> bool:
         """Whether an alignment of the same points beats another.
@@ -166,7 +166,7 @@ class PoseJudge:
         """
         if candidate.status is AlignmentStatus.LOST or best.status is AlignmentStatus.LOST:
             return candidate.status is not AlignmentStatus.LOST
-        preferred = self.shared.prefer(candidate.T_world_camera, best.T_world_camera)
+        preferred = self.features.prefer(candidate.T_world_camera, best.T_world_camera)
         if preferred is not None:
             return preferred
         if candidate.photometric_share > 0 and best.photometric_share > 0:

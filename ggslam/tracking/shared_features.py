@@ -96,7 +96,7 @@ class SharedFeatures:
         return bool(self._earlier) and len(self._match(0)) >= VOUCHED_TIMES * self._settings.min_inliers
 
     def _vouches(self, shared: ViewMatches, T_world_camera: np.ndarray) -> bool:
-        explained = shared.explained(T_world_camera, self._camera, self._settings)
+        explained = shared.which_agree(T_world_camera, self._camera, self._settings)
         needed = max(VOUCHED_TIMES * self._settings.min_inliers, VOUCHED_SHARE * len(shared))
         if explained.sum() < needed:
             return False
