@@ -29,6 +29,10 @@ class InputError(GgslamError, ValueError):
     """An argument of a Python call has a type, a shape or a value that cannot be."""
 
 
+class VoxelError(InputError):
+    """Voxels are too small for the depth that a view shows."""
+
+
 class FormatError(GgslamError):
     """A file (PLY, trajectory, run folder...) does not follow its format."""
 

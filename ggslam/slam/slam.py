@@ -21,6 +21,7 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
+from ggslam.geometry.scene_size import scene_scale
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.camera import Camera
@@ -46,7 +47,7 @@ from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
 from ggslam.tracking.keyframes import KeyframePolicy
-from ggslam.tracking.scale import scale_settings, scene_scale
+from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.still_camera import still_notes
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
@@ -91,7 +92,7 @@ class Slam:
         self.mapper.extra_loss = extra_loss
         self.policy = KeyframePolicy(self.config.keyframes)
         self.scale = 1.0
-        """Size of the scene against a room's, see `tracking.scale`."""
+        """Size of the scene against a room's, see `geometry.scene_size`."""
         self.poses = FramePoses()
         self.dropped_frames: list[int] = []
         self.refine_iterations = 0
