@@ -8,6 +8,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
+from ggslam.sequences.json_files import camera_of
 from ggslam.sequences.orientation import QUARTER_TURNS, orientation_of
 from ggslam.sequences.orientation import WORDS as ORIENTATIONS
 from ggslam.sequences.recording import FrameFiles, ImageFile, Recording
@@ -74,7 +75,7 @@ class ImageGeometry:
         if recording.depth_camera is not None:
             self.native_camera = self._register(recording, depth_size, files)
         elif recording.depth_calibration is not None:
-            self.native_camera = Camera(*depth_size, *recording.depth_calibration)
+            self.native_camera = camera_of(recording.path, *depth_size, *recording.depth_calibration)
             self._align_color(color_camera.resize(*depth_size))
         else:
             self.finer = color_size[0] >= FINER * depth_size[0]
@@ -242,11 +243,17 @@ def rays_of_depth(recording: Recording, files: FrameFiles, color_size: Size, dep
     return undistorted_rays(camera, recording.distortion, recording.fisheye)
 
 
+def _source(recording: Recording) -> str:
+    """Where the intrinsics come from, for errors."""
+    source = recording.camera_source
+    return source if source.startswith("`") else f"{recording.path}, {source}" if source else str(recording.path)
+
+
 def _color_camera(recording: Recording, color_size: Size, color_file: ImageFile) -> Camera:
     if recording.camera is None:
         if recording.calibration is None:
             raise SequenceError(f"{recording.path}: no intrinsics")
-        return Camera(*color_size, *recording.calibration)
+        return camera_of(_source(recording), *color_size, *recording.calibration)
     stated = (recording.camera.width, recording.camera.height)
     if not same_aspect(stated, color_size):
         raise SequenceError(

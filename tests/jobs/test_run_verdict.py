@@ -14,6 +14,7 @@ import pytest
 from command_line import ggslam
 
 from ggslam.jobs.report.pages import write_report
+from ggslam.jobs.run.evaluate_run import evaluate_run
 from ggslam.jobs.run.grades import (
     BAD_AGREEMENT,
     BAD_STRUCTURE,
@@ -27,7 +28,7 @@ from ggslam.jobs.run.grades import (
 )
 from ggslam.jobs.run.map_fit import MapFit, measure_fit
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
-from ggslam.jobs.run.run_verdict import judge_result, overall
+from ggslam.jobs.run.run_verdict import judge_result, judge_scores, overall
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.movers.found import FoundMover, MoverSight
 from ggslam.runs.folder import RunFolder
@@ -78,6 +79,42 @@ def test_it_is_kept_and_begins_the_report(sound: RunOutcome, tmp_path: Path) -> 
     page = write_report(copy).read_text()
     place = page.index("Verdict: <b>bad</b>")
     assert place < page.index('class="tiles"') and "To try: `depth_scale` 5000" in page[place:]
+
+
+def test_scoring_grades_anew_what_scores_decide(sound: RunOutcome, tmp_path: Path) -> None:
+    """The same scores give the same verdict; others another; and back. The rest stays as the run measured it."""
+    folder = RunFolder(Path(shutil.copytree(sound.folder.path, tmp_path / "run")))
+    before, metrics, table = folder.verdict(), folder.metrics(), folder.object_table()
+    assert before is not None and metrics is not None and before.fit is not None
+    assert MapFit(**vars(before.fit)) == fit_of(sound)
+    evaluate_run(folder, lpips=False)
+    after = folder.verdict()
+    assert after == before and folder.mark().files is not None
+    images = metrics.images.model_copy(update={
+        "keyframes": metrics.images.keyframes.model_copy(update={"psnr_affine": 45.0}),
+        "held_out": metrics.images.held_out.model_copy(update={"psnr_affine": 20.0}),
+    })  # fmt: skip
+    overfit = judge_scores(before, table, metrics.model_copy(update={"images": images}))
+    assert (overfit.grade, overfit.sharp.grade, overfit.next) == ("doubtful", "doubtful", "`refine` 3000")
+    assert "held-out frames are 25.0 dB worse" in overfit.sharp.text and overfit.tracked == before.tracked
+    unlike = metrics.model_copy(update={"segmentation": None})
+    assert "as the masks are" not in judge_scores(before, table, unlike).objects.text
+    assert judge_scores(overfit, table, metrics) == before
+
+
+def test_an_edited_run_has_no_verdict_of_another_map(sound: RunOutcome, tmp_path: Path) -> None:
+    folder = sound.folder.path
+    number = sound.folder.object_table().objects[0].id
+    assert ggslam("edit", folder, "--rename", f"{number}", "thing", "--out", tmp_path / "named").returncode == 0
+    assert RunFolder.open(tmp_path / "named").verdict() == sound.verdict
+    copy = Path(shutil.copytree(folder, tmp_path / "in_place"))
+    for target in (["--in-place"], ["--out", tmp_path / "other"]):
+        source = copy if len(target) == 1 else folder
+        assert ggslam("edit", source, "--remove", number, *target).returncode == 0
+        edited = RunFolder.open(copy if len(target) == 1 else tmp_path / "other")
+        assert edited.verdict() is None and "Verdict:" not in write_report(edited).read_text()
+        evaluate_run(edited, lpips=False, every=4)
+        assert edited.verdict() is None
 
 
 def test_depth_that_is_elsewhere_is_measured(sound: RunOutcome) -> None:

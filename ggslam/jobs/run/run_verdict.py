@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 
 from ggslam.jobs.run.grades import (
@@ -20,7 +22,7 @@ from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.objects.table import ObjectTable
 from ggslam.rendering.exposure import change_of
 from ggslam.runs.records.metrics import MetricsRecord
-from ggslam.runs.records.verdict import AspectRecord, Grade, RunVerdict, worst
+from ggslam.runs.records.verdict import AspectRecord, FitRecord, Grade, RunVerdict, worst
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.tracking.tracker import TrackingStatus
@@ -28,6 +30,7 @@ from ggslam.tracking.tracker import TrackingStatus
 _CAUSES = ("depth_scale", "intrinsics", "poses", "alignment", "step", "time", "textureless", "degenerate")
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 _SAME_GAIN = 1.3
+_REFINE, _WITH_MASKS = "`refine` 3000", "`masks` FOLDER, with masks of a segmenter"
 
 
 def judge_result(
@@ -56,7 +59,35 @@ def judge_result(
         aspects = {name: aspect if name == "tracked" else rest for name, aspect in aspects.items()}
     grade = overall(aspects)
     advice = "" if grade == "good" else _advice(aspects, result, found, fit, recording)
-    return RunVerdict.of({"grade": grade, **aspects, "failure": failure, "next": advice})
+    kept = None if fit is None else FitRecord(**asdict(fit))
+    return RunVerdict.of({"grade": grade, **aspects, "failure": failure, "next": advice, "fit": kept})
+
+
+def judge_scores(verdict: RunVerdict, table: ObjectTable | None, metrics: MetricsRecord) -> RunVerdict:
+    """A verdict with the grades that scores decide upon, made anew from others. That of a run that is no result, or
+    whose fit is not known, stays as it is.
+
+    Args:
+        verdict: on the run.
+        table: its objects; None: it has none.
+        metrics: its new scores.
+    """
+    if verdict.failure or verdict.fit is None:
+        return verdict
+    scored, fit = _figures_of_scores(metrics), MapFit(**vars(verdict.fit))
+    aspects = {**verdict.aspects(), "sharp": grade_sharp(fit, scored), "objects": grade_objects(table, scored)}
+    grade = overall(aspects)
+    weak = [name for name, aspect in aspects.items() if aspect.grade == grade]
+    before = [name for name, aspect in verdict.aspects().items() if aspect.grade == verdict.grade]
+    advice = "" if grade == "good" else verdict.next if weak == before else _usual_advice(weak, verdict.next)
+    return RunVerdict.of({**vars(verdict), "grade": grade, **aspects, "next": advice})
+
+
+def _usual_advice(weak: list[str], former: str) -> str:
+    """What helps where scores alone tell what is weak; else what was said before."""
+    if set(weak) <= {"objects"}:
+        return _WITH_MASKS
+    return _REFINE if set(weak) <= {"sharp", "objects"} else former
 
 
 def overall(aspects: dict[str, AspectRecord]) -> Grade:
@@ -102,8 +133,8 @@ def _advice(
         if "sharp" in weak and grade == "bad":
             return f"{look} (do depth and colour belong to one frame and one camera?)"
         if "sharp" in weak:
-            return "`refine` 3000"
-    return "`masks` FOLDER, with masks of a segmenter"  # only the objects are left
+            return _REFINE
+    return _WITH_MASKS  # only the objects are left
 
 
 def _slower(result: SlamResult, look: str) -> str:

@@ -15,7 +15,7 @@ from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_g
 from ggslam.mapping.cpu.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.identity import MIN_WEIGHT, TERMS
-from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, ELSEWHERE, Keyframe, PoseAdam, make_keyframe
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
@@ -201,7 +201,7 @@ class CpuMapper(Mapper):
             valid = compared if valid is None else valid & compared
         color, depth = grid.of(keyframe.color), grid.of(keyframe.depth)
         shown = None if valid is None else grid.of(valid)
-        target = LossTarget(color, depth, 1 / DEPTH_UNITS_PER_METRE, exposure, shown)
+        target = LossTarget(color, depth, keyframe.depth_unit, exposure, shown)
         return self._loss.evaluate(view, target, self.settings.loss)
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:

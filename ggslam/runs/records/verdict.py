@@ -37,6 +37,18 @@ class AspectRecord(Record):
         return self.grade in grades
 
 
+class FitRecord(Record):
+    """How well the map shows its keyframes; see `jobs.run.map_fit.MapFit`."""
+
+    views: int
+    psnr: float
+    structure: float
+    brightness: float
+    agreeing: float
+    covered: float
+    depth_error: float
+
+
 class RunVerdict(RecordFile):
     """How good a run is. No ground truth is used.
 
@@ -49,6 +61,7 @@ class RunVerdict(RecordFile):
         movers: whether what was found to move can have moved.
         failure: why it is no result at all, as a sentence; empty: it is one.
         next: what to try, as a command or an option; empty: nothing.
+        fit: what `sharp` and `geometry` stand on, with which scores made later are judged; None: not measured.
     """
 
     FILE: ClassVar[str] = "verdict.json"
@@ -60,6 +73,7 @@ class RunVerdict(RecordFile):
     movers: AspectRecord = AspectRecord()
     failure: str = ""
     next: str = ""
+    fit: FitRecord | None = None
 
     def aspects(self) -> dict[str, AspectRecord]:
         """All of them by name, in order."""
