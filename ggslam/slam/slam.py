@@ -24,6 +24,7 @@ from ggslam.errors import ConfigError
 from ggslam.geometry.scene_size import scene_scale
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.scale import scale_settings as scale_mapping
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
@@ -321,8 +322,9 @@ class Slam:
         self._noise = noise
 
     def use_scale(self, scale: float) -> None:
-        """Fits the tracker to a scene of this size; before the first keyframe."""
+        """Fits tracker and mapper to a scene of this size; before the first keyframe."""
         self.scale, self.tracker.settings = scale, scale_settings(self.config.tracking, scale)
+        self.mapper.settings = scale_mapping(self.config.mapping, scale)
         self.surface.settings = self.tracker.settings.target
 
     def _follow_moves(self) -> None:
