@@ -10,8 +10,8 @@ from ggslam.mapping.settings import MapperSettings
 
 
 def scale_settings(settings: MapperSettings, scale: float) -> MapperSettings:
-    """The settings with lengths times `voxel_times(scale)`, and the weight of depth over it, so that a scene is mapped as
-    a room of its shape; in rooms the same. Lengths that follow the depth noise are left alone.
+    """The settings with lengths times `voxel_times(scale)`, and the weight of depth over it, so that a scene is mapped
+    as a room of its shape; in rooms the same. Lengths that follow the depth noise are left alone.
 
     Args:
         settings: as configured.

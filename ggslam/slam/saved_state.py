@@ -201,6 +201,11 @@ def _go_on(times: SlamTimes) -> None:
     times._started = time.perf_counter() - times.wall if times.wall > 0 else None
 
 
+def _fit_to_scene(slam: Slam) -> None:
+    """Settings of the parts, which are not saved, follow the scene again."""
+    slam.use_scale(slam.scale)
+
+
 def _settings_classes(kind: type) -> set[type]:
     """A settings class and those of its groups."""
     found = {kind}
@@ -221,8 +226,10 @@ def _names(*names: str) -> frozenset[str]:
 
 RULES: Rules = {
     **dict.fromkeys(_settings_classes(Config) - {Config}, Rule(checked=True)),
-    Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device"),
-    RigSlam: _but("camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine"),
+    Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device", after=_fit_to_scene),
+    RigSlam: _but(
+        "camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine", after=_fit_to_scene
+    ),
     SlamTimes: _but("_started", growing=_names("tracking_by_frame"), after=_go_on),
     ColorPoses: _but("mapper", "poses", "state", growing=_names("images")),
     FramePoses: Rule(growing=_names("frames")),
