@@ -44,7 +44,9 @@ Out = Annotated[
     Path | None,
     typer.Option(help="Folder for the results; default RUN/volumes, STORE/volumes, or volumes/NAME of a recording."),
 ]
-Voxel = Annotated[float | None, typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02).")]
+Voxel = Annotated[
+    float | None, typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02, larger in large scenes).")
+]
 Esdf = Annotated[bool, typer.Option("--esdf", help="Also make a distance field, with a slice and a ROS map.")]
 Occupancy = Annotated[
     float | None, typer.Option(metavar="VOXEL", help="Also make an occupancy map (.bt, .ot), voxels of so many metres.")
