@@ -24,6 +24,7 @@ from ggslam.jobs.run.grades import (
     grade_objects,
     grade_sharp,
     grade_tracked,
+    jumps_of,
     path_jumps,
 )
 from ggslam.jobs.run.map_fit import MapFit, measure_fit
@@ -36,6 +37,7 @@ from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.verdict import AspectRecord, RunVerdict
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
+from ggslam.sequences import open_sequence
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult, TrackedFrame
 
@@ -194,6 +196,20 @@ def moved_from(frames: list[TrackedFrame], first: int, metres: float) -> Iterato
         T = frame.T_keyframe_camera.copy()
         T[:3, 3] += [metres if frame.frame_index >= first else 0, 0, 0]
         yield replace(frame, T_keyframe_camera=T)
+
+
+@pytest.mark.parametrize("name", ["hololens_walk", "redkitchen", "livingroom", "phone_scan"])
+def test_true_paths_do_not_jump(shared_data: Path, name: str) -> None:
+    """Nor where somebody turns the head at once; a step of half a metre in the middle of them is one."""
+    if not (shared_data / name).is_dir():
+        pytest.skip(f"no recording at {shared_data / name}")
+    truth = open_sequence(shared_data / name).ground_truth
+    assert truth is not None
+    places, index = truth[:, :3, 3].copy(), np.arange(len(truth))
+    assert jumps_of(places, index) == []
+    middle = len(places) // 2
+    places[middle:, 0] += 0.5
+    assert middle in jumps_of(places, index) and len(jumps_of(places, index)) == 2
 
 
 def test_a_jump_of_the_path_is_found_where_it_is(sound: RunOutcome) -> None:

@@ -28,9 +28,9 @@ BADLY_LOST = 0.3
 against their depth lose or doubt 60 to 75 %."""
 MUCH_SEARCHED = 0.5
 """Of the frames located by another start than constant velocity: the motion is at the limit of what is followed."""
-JUMP_MEDIAN, JUMP_P90, JUMP_M = 8.0, 3.0, 0.05
+JUMP_MEDIAN, JUMP_P90, JUMP_M = 15.0, 7.5, 0.05
 """A change of step from frame to frame of so many usual ones, of so many 90th percentiles and of so many metres is a
-jump of the path: sound walks reach 5.3 medians and 2.4 percentiles."""
+jump of the path: true paths of whole walks reach 12 medians and 6.2 percentiles (Kinect), 8.1 and 4.0 (HoloLens)."""
 BAD_STRUCTURE, DOUBTFUL_STRUCTURE = 0.9, 0.95
 """SSIM at 160 pixels of width over what image noise allows there: sound runs have 0.93 to 1, the lowest of them an
 iPhone's with smoothed depth; depth one frame off has 0.87, of another kind or place 0.78 to 0.86, mirrored images 0.68.
@@ -98,7 +98,11 @@ def path_jumps(result: SlamResult) -> list[int]:
     """Frames at which the path leaves its own course, by index. None of a rig, whose frames are of several cameras."""
     if any(keyframe.camera_number for keyframe in result.keyframes):
         return []
-    places, index = result.trajectory()[:, :3, 3], np.array([frame.frame_index for frame in result.frames])
+    return jumps_of(result.trajectory()[:, :3, 3], np.array([frame.frame_index for frame in result.frames]))
+
+
+def jumps_of(places: np.ndarray, index: np.ndarray) -> list[int]:
+    """As `path_jumps`, of places [n, 3] in metres, NaN where unknown, and their frames' indices [n]."""
     if len(places) < 5:
         return []
     changes = np.linalg.norm(places[2:] - 2 * places[1:-1] + places[:-2], axis=1)
