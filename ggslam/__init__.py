@@ -42,9 +42,9 @@ if _TYPE_CHECKING:
     from ggslam.jobs.edit.edits import edit_run as edit_run
     from ggslam.jobs.export.export_run import export_run as export_run
     from ggslam.jobs.render.render_run import render_run as render_run
+    from ggslam.jobs.run.evaluate_run import evaluate_run as evaluate_run
     from ggslam.jobs.run.pipeline import RunOutcome as RunOutcome
     from ggslam.jobs.run.run_recording import run_recording as run_recording
-    from ggslam.jobs.score.evaluate_run import evaluate_run as evaluate_run
     from ggslam.objects.lookup import objects_at as objects_at
     from ggslam.objects.table import ObjectTable as ObjectTable
     from ggslam.rendering import GaussianModel as GaussianModel
@@ -110,7 +110,7 @@ _HOMES = {
     "ggslam.jobs.render.render_run": ("render_run",),
     "ggslam.jobs.run.pipeline": ("RunOutcome",),
     "ggslam.jobs.run.run_recording": ("run_recording",),
-    "ggslam.jobs.score.evaluate_run": ("evaluate_run",),
+    "ggslam.jobs.run.evaluate_run": ("evaluate_run",),
     "ggslam.objects.lookup": ("objects_at",),
     "ggslam.objects.table": ("ObjectTable",),
     "ggslam.rendering": (

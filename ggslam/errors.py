@@ -8,7 +8,7 @@ class GgslamError(Exception):
     """Base of every error that ggslam raises on purpose. The command line prints it and exits with `exit_code`."""
 
     exit_code = 2
-    """2: the user's input is at fault; 1: ggslam or the machine is."""
+    """2: the user's input is at fault; 1: ggslam or the machine is, or most frames were lost."""
 
 
 class SequenceError(GgslamError):
@@ -19,8 +19,18 @@ class ConfigError(GgslamError):
     """A setting is unknown or has an impossible value."""
 
 
+class TrackingLostError(GgslamError):
+    """Most frames of a recording have no pose: the run was saved, but is no result."""
+
+    exit_code = 1
+
+
 class InputError(GgslamError, ValueError):
     """An argument of a Python call has a type, a shape or a value that cannot be."""
+
+
+class VoxelError(InputError):
+    """Voxels are too small for the depth that a view shows."""
 
 
 class FormatError(GgslamError):

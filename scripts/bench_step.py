@@ -23,7 +23,7 @@ import torch
 from bench_low_pass import views_of
 
 from ggslam.mapping.cpu.losses import CpuImageLoss
-from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, make_keyframe
+from ggslam.mapping.keyframe import make_keyframe
 from ggslam.mapping.losses import LossTarget
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import AdamSettings
@@ -56,7 +56,7 @@ def measure(
                 gaussians, keyframe.camera, keyframe.T_camera_world, features=False, close_below=mapping.close_below
             )
             laps.append(clock())
-            target = LossTarget(keyframe.color, keyframe.depth, 1 / DEPTH_UNITS_PER_METRE)
+            target = LossTarget(keyframe.color, keyframe.depth, keyframe.depth_unit)
             found = loss.evaluate(view, target, mapping.loss)
             laps.append(clock())
             rasterizer.backward_step(gaussians, found.d_image, found.d_depth, found.d_alpha, optimizer=still)

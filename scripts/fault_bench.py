@@ -43,11 +43,12 @@ class Ended:
         proposal of what to do next."""
         lines = [line.strip("│╭╰─╮╯ \t") for line in self.text.replace("\r", "\n").splitlines()]
         lines = [line for line in lines if line not in ("", "Error")]
-        for words in (("error",), ("interrupted", "stopped"), ("wrong:",), ("warning", "doubtful:", "note")):
+        for words in (("error",), ("interrupted", "stopped"), ("wrong:",), ("warning", "doubtful:"), ("note",)):
             found = [line for line in lines if line.lower().startswith(tuple(word.lower() for word in words))]
             if found:
                 return found[-1 if words[0] == "error" else 0]
-        told = lines[: next((k for k, line in enumerate(lines) if line.startswith("next:")), len(lines))]
+        ends = (k for k, line in enumerate(lines) if line.startswith(("verdict:", "next:")))
+        told = lines[: next(ends, len(lines))]
         return told[-1] if told else ""
 
 

@@ -53,6 +53,11 @@ def replace(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
+def noise(image: np.ndarray) -> np.ndarray:
+    """An image of the same shape and type that shows nothing."""
+    return np.random.default_rng(0).integers(0, np.iinfo(image.dtype).max, image.shape, image.dtype)
+
+
 def edit_line(path: Path, number: int, change: Callable[[list[str]], list[str]]) -> None:
     lines = path.read_text().splitlines()
     lines[number] = " ".join(change(lines[number].split()))
@@ -144,6 +149,7 @@ RECORDINGS: dict[str, Damage] = {
     "frames are missing in the middle": lambda r: [p.unlink() for k in ("rgb", "depth", "masks") for p in
                                                    sorted((r / k).iterdir())[4:9]],
     "the lens is covered for four frames": covered,
+    "all but two frames show something else": lambda r: [images(r, kind, noise, 2) for kind in ("rgb", "depth")],
     "there is no depth at all": lambda r: images(r, "depth", np.zeros_like),
     "a wall without texture": lambda r: (images(r, "rgb", lambda i: np.full_like(i, 128)),
                                          images(r, "depth", lambda i: np.full_like(i, 10000))),

@@ -38,8 +38,9 @@ HEAD = """# Faults
 
 What goes wrong, what ggslam says (the line that matters), and what is kept of your work; written by
 `python scripts/fault_table.py --markdown docs/faults.md`, which lets each happen in a folder of its own, here `.`.
-Exit codes: 0 done (3 with `--strict` where something seems wrong), 2 the input's fault, 1 the machine's or ours,
-128 + n after signal n, -9 after a kill. After a kill the line is that of the command that goes on.
+Exit codes: 0 done (3 with `--strict` where the verdict is bad or something seems wrong), 2 the input's fault, 1 the
+machine's or ours, or most frames lost, 128 + n after signal n, -9 after a kill.
+After a kill the line is that of the command that goes on.
 """
 
 

@@ -30,7 +30,8 @@ resize images, `--set NAME=VALUE` overrides a [setting](settings.md), `--config`
 file.
 
 Exit codes: 0 done, 2 something in the input is wrong (one line says what and where), 1 ggslam or the machine is at
-fault, 130 interrupted. Where output is no terminal, long commands print a line of progress every 10 seconds.
+fault, or a run lost most of its frames, 3 a run that `--strict` finds bad, 130 interrupted. Where output is no
+terminal, long commands print a line of progress every 10 seconds.
 """
 _GROUPS = {
     "Make a map": ("run", "inspect", "synth", "doctor"),

@@ -6,7 +6,8 @@ from __future__ import annotations
 import re
 
 _OPTIONS = {
-    "inpainting": "--inpaint", "latency": "--driving", "on_bad_frame": "--skip-bad-frames", "overrides": "--set",
+    "check": "--no-check", "inpainting": "--inpaint",
+    "latency": "--driving", "on_bad_frame": "--skip-bad-frames", "overrides": "--set",
     "recording": "--sequence", "rotation": "--rotate", "slice_height": "--slice", "topics": "--topic",
 }  # fmt: skip
 """Options that are not called as their argument is."""

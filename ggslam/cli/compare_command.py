@@ -135,7 +135,9 @@ def _print(c: Comparison, max_distance: float) -> None:
         f"{100 * s.completeness_m:.2f} cm (median {100 * s.completeness_median_m:.2f})", highlight=False
     )  # fmt: skip
     console.print(_trajectory_line(c), highlight=False)
-    rows = _metric_rows(c.a.metrics, c.b.metrics)
+    verdicts = [side.verdict for side in (c.a, c.b)]
+    rows = [["verdict", *("-" if v is None else v.summary() for v in verdicts)]] if any(verdicts) else []
+    rows += _metric_rows(c.a.metrics, c.b.metrics)
     if rows:
         console.print(table("scores", ["", "A", "B"], rows))
 

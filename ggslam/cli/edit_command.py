@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -102,6 +103,9 @@ def edit(
     in_place: Annotated[bool, typer.Option("--in-place", help="Change the run itself.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already at --out.")] = False,
     sequence: options.MovedSequence = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Remove more than half of the map without asking.")
+    ] = False,
 ) -> None:  # fmt: skip
     """Edit a run's map: remove, keep, move, duplicate, recolour, merge and rename objects."""
     from ggslam.jobs.edit.edits import edit_run
@@ -111,8 +115,9 @@ def edit(
     if in_place and out is not None:
         raise ConfigError("--in-place and --out contradict each other")
     outcome = edit_run(
-        open_map(run), edits, out, in_place=in_place, overwrite=overwrite, inpainting=inpaint, sequence=sequence
-    )
+        open_map(run), edits, out, in_place=in_place, overwrite=overwrite, inpainting=inpaint, sequence=sequence,
+        confirm=None if yes else _confirm,
+    )  # fmt: skip
     lines = list(outcome.changes)
     if outcome.filling is not None:
         added = f"inpainted: {outcome.filling.added} Gaussians added, " if outcome.inpainted else ""
@@ -124,6 +129,17 @@ def edit(
         lines.append(f"wrote {outcome.folder.path}")
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _confirm(what: str) -> bool:
+    """Asks whether to remove so much.
+
+    Raises:
+        ConfigError: nobody can be asked.
+    """
+    if not sys.stdin.isatty():
+        raise ConfigError(f"{what}: this needs --yes; nothing was changed")
+    return typer.confirm(f"{what}. Remove it?")
 
 
 def _edits(words: list[tuple[str, list[str]]]) -> list[Edit]:

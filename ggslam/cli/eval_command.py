@@ -35,14 +35,14 @@ def evaluate(
 ) -> None:
     """Score a run against its recording: trajectory, images and objects of keyframes, held-out and all frames."""
     from ggslam.jobs.report.pages import write_report
-    from ggslam.jobs.score.run import score_run
+    from ggslam.jobs.run.evaluate_run import evaluate_folder
     from ggslam.runs.folder import RunFolder
     from ggslam.runs.recordings import open_recording_of
 
     folder = RunFolder.open(run)
     recording = open_recording_of(folder, sequence, masks)
     with progress_bar() as bar:
-        metrics = score_run(folder, recording, ProgressObserver(bar), lpips=lpips, every=every, masks=masks)
+        metrics = evaluate_folder(folder, recording, ProgressObserver(bar), lpips, every, masks)
     print_scores(metrics)
     for path in (folder.path / "metrics.json", write_report(folder, recording)):
         console.print(f"wrote {path}", highlight=False, markup=False)

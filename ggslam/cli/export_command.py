@@ -66,7 +66,7 @@ FormatName = Annotated[
 Voxel = Annotated[
     float | None,
     typer.Option(help="Metres between points (points, pcd, colmap, nerfstudio; default 0.01), or the edge of a mesh's "
-                 "voxels (default: volumes.tsdf.voxel of the run, 0.02)."),
+                 "voxels (default: volumes.tsdf.voxel of the run, 0.02); defaults are larger in large scenes."),
 ]  # fmt: skip
 MinOpacity = Annotated[
     float, typer.Option(help="Leave out fainter Gaussians (not for trajectory, mesh; points, pcd: with --discs).")

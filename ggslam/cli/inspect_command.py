@@ -50,9 +50,14 @@ def inspect(
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
+    depth_kind: options.DepthKind = None,
+    depth_delay: options.DepthDelay = None,
+    upright: options.Upright = False,
+    void_id: options.VoidId = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
     formats: Annotated[bool, typer.Option("--formats", help="List the formats that ggslam reads.")] = False,
+    skip_bad_frames: options.SkipBadFrames = False,
     samples: int = typer.Option(8, help="Number of frames to read and check.", min=1),
 ) -> None:
     """Print what was recognised in a recording, and likely mistakes; of a coded file, what is in it and its bytes."""
@@ -78,6 +83,8 @@ def inspect(
         sequence, format=format_name, start=start, stop=stop, stride=stride, scale=scale, masks=masks,
         depth_scale=depth_scale, depth_camera=depth_camera, min_confidence=min_confidence, topics=topics or (),
         pose_convention=pose_convention, camera=camera, intrinsics=intrinsics,
+        depth_kind=depth_kind, depth_delay=depth_delay, upright=upright, void_id=void_id,
+        on_bad_frame="skip" if skip_bad_frames else "error",
     )  # fmt: skip
     if isinstance(recording, RigSequence):
         _print_rig(inspect_rig(recording, samples=samples, clocks=True))
@@ -187,11 +194,17 @@ def _images(r: SequenceReport) -> str:
     return "; ".join(words)
 
 
-def _lines(r: SequenceReport) -> list[tuple[str, str]]:
+def _times(r: SequenceReport) -> str:
+    if r.time_source.startswith("nominal"):
+        return f"{r.frames}, without times ({r.time_source} assumed)"
     rate = f" at {r.rate_hz:.1f} Hz" if r.rate_hz > 0 else ""  # NaN: a single frame, or all of one time
+    return f"{r.frames}, {r.duration_s:.1f} s{rate} ({r.time_source})"
+
+
+def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     lines = [
         ("recording", f"{r.name} ({r.format})"),
-        ("frames", f"{r.frames}, {r.duration_s:.1f} s{rate} ({r.time_source})"),
+        ("frames", _times(r)),
         ("camera", _camera(r.camera) + (f" ({r.camera_source})" if r.camera_source else "")),
         ("depth", f"{r.depth_m[0]:.2f} to {r.depth_m[2]:.2f} m, median {r.depth_m[1]:.2f} m; {r.valid_share:.0%} of "
                   f"pixels; {r.depth_scale:g} units a metre"),

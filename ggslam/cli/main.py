@@ -105,9 +105,9 @@ for _name, (_function, _epilog) in _COMMANDS.items():
 
 
 def main() -> None:
-    """Entry point. Exit codes: 0 done, 3 done but something seems wrong (`run --strict`), 2 the user's input is at
-    fault, 1 ggslam or the machine is, 130 Ctrl-C, 128 + the number of another signal that ended it (143 SIGTERM, 129
-    SIGHUP)."""
+    """Entry point. Exit codes: 0 done, 3 done but bad (`run --strict`), 2 the user's input is at fault, 1 ggslam or the
+    machine is, or most frames of a run were lost, 130 Ctrl-C, 128 + the number of another signal that ended it (143
+    SIGTERM, 129 SIGHUP)."""
     errors = PlainConsole(stderr=True)
     try:
         app()

@@ -43,8 +43,8 @@ Stop = Annotated[int | None, typer.Option(help="Stop before this frame.", min=1)
 Stride = Annotated[int, typer.Option(help="Use only every n-th frame.", min=1)]
 Scale = Annotated[
     float | None,
-    typer.Option(help="Resize the images by this factor, e.g. 0.5; default: 1, or of colour much finer than depth "
-                 "(phones) what leaves 640x480 pixels."),
+    typer.Option(help="Resize the images by this factor, e.g. 0.5. 1 is the stored size, but of colour much finer than "
+                 "depth (phones) 640x480 pixels."),
 ]  # fmt: skip
 Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.", min=1, max=1024)]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
@@ -70,6 +70,24 @@ Intrinsics = Annotated[
 ]  # fmt: skip
 MinConfidence = Annotated[
     int | None, typer.Option(help="Drop depth of lower confidence (0, 1, 2; default 1), where the recording stores it.")
+]
+DepthKind = Annotated[
+    str | None,
+    typer.Option(metavar="KIND", help="What depth images hold: z (along the optical axis; default), ray (along the "
+                 "pixel's ray), inverse or inverse:N (z = N / stored); also mirrored, flipped, none:CODE (CODE means "
+                 "nothing measured); with commas between."),
+]  # fmt: skip
+DepthDelay = Annotated[
+    str | None,
+    typer.Option(metavar="DELAY", help="How much later depth was taken than the colour that it is stored beside: 1f "
+                 "(frame), -1f, or 33ms; colour is paired with the depth of its own time."),
+]  # fmt: skip
+Upright = Annotated[
+    bool, typer.Option("--upright", help="Turn colour images as their orientation tag (EXIF) says.")
+]
+VoidId = Annotated[
+    int | None,
+    typer.Option(help="Id of masks that means unlabelled besides 0: 255 of VOC, DAVIS.", min=1, max=2**24 - 1),
 ]
 Topics = Annotated[
     list[str] | None,

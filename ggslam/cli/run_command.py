@@ -18,8 +18,8 @@ from rich.markup import escape
 from ggslam.cli import options, settings_help
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
-from ggslam.cli.summary import print_scores
-from ggslam.errors import ConfigError
+from ggslam.cli.summary import print_scores, print_verdict
+from ggslam.errors import ConfigError, TrackingLostError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.jobs.run.pipeline import RunOutcome, RunRequest
@@ -54,7 +54,7 @@ _WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host",
 
 
 STRICT_EXIT_CODE = 3
-"""Of runs that came to an end, but with verdicts, under --strict."""
+"""Of runs that came to an end, but are bad or of a recording that seems wrong, under --strict."""
 
 
 class DeviceName(str, Enum):
@@ -106,6 +106,9 @@ Log = Annotated[
 ]
 ShowPage = Annotated[bool, typer.Option("--view", help="Show the map in a browser while it grows, and afterwards.")]
 Evaluate = Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")]
+Check = Annotated[
+    bool, typer.Option("--check/--no-check", help="Look at depth first, and refuse it where it is certainly wrong.")
+]
 Resume = Annotated[
     Path | None,
     typer.Option(metavar="RUN", help="Go on with a run that was cut off. Settings and recording are those it had."),
@@ -118,7 +121,7 @@ CheckpointEvery = Annotated[
     ),
 ]
 Strict = Annotated[
-    bool, typer.Option("--strict", help="Exit with code 3 if something seems wrong with the recording or the run.")
+    bool, typer.Option("--strict", help="Exit with code 3 if the verdict is bad or something seems wrong.")
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in the output folder.")]
 
@@ -129,9 +132,7 @@ def run(
     out: Out = None,
     config: options.ConfigName = None,
     settings: options.Settings = None,
-    start: options.Start = 0,
-    stop: options.Stop = None,
-    stride: options.Stride = 1,
+    start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
     scale: options.Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
@@ -139,6 +140,8 @@ def run(
     masks: options.Masks = None,
     camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
+    depth_kind: options.DepthKind = None, depth_delay: options.DepthDelay = None,
+    upright: options.Upright = False, void_id: options.VoidId = None,
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
     record: Record = None,
@@ -152,7 +155,7 @@ def run(
     loops: Loops = None,
     threads: Threads = None,
     seed: Seed = None,
-    skip_bad_frames: options.SkipBadFrames = False,
+    skip_bad_frames: options.SkipBadFrames = False, check: Check = True,
     log: Log = None,
     view: ShowPage = False,
     host: options.Host = "127.0.0.1", port: options.Port = 8080,
@@ -173,7 +176,7 @@ def run(
     reading = SequenceRequest(
         _recording(sequence), format_name, start, stop, stride, scale, masks, depth_scale,
         "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
-        camera, intrinsics,
+        camera, intrinsics, depth_kind, depth_delay, upright, void_id,
     )  # fmt: skip
     given = _overrides(settings, {
         "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
@@ -181,7 +184,7 @@ def run(
     })  # fmt: skip
     request = replace(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
-        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every,
+        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check,
     )  # fmt: skip
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
 
@@ -270,18 +273,29 @@ def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) 
             wait_for_interrupt(lambda: console.print(text, highlight=False, markup=False))
     if outcome.error is not None:
         raise outcome.error
-    if watched.strict and outcome.verdicts:
+    if failure := _failure(outcome):
+        raise TrackingLostError(f"{failure}; what there is was saved to {outcome.folder.path}")
+    if watched.strict and (outcome.verdicts or (outcome.verdict is not None and outcome.verdict.grade == "bad")):
         raise typer.Exit(STRICT_EXIT_CODE)
 
 
 def _print(outcome: RunOutcome) -> None:
     console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
-    if outcome.metrics is not None:
+    if outcome.metrics is not None and not _failure(outcome):  # scores of the few frames that were located mislead
         print_scores(outcome.metrics)
     for verdict in outcome.verdicts:
         console.print(f"[yellow]{verdict.severity}:[/] {escape(verdict.text)}", highlight=False)
+    if outcome.verdict is not None:
+        print_verdict(outcome.verdict)
+    if _failure(outcome):
+        return
     for hint in next_commands(outcome.folder.path) if outcome.error is None else go_on_command(outcome.folder.path):
         console.print(hint, highlight=False, markup=False, soft_wrap=True)  # commands are copied: no line breaks
+
+
+def _failure(outcome: RunOutcome) -> str:
+    """Why the run is no result, as a sentence; "": it is one."""
+    return "" if outcome.verdict is None else outcome.verdict.failure
 
 
 def go_on_command(run: Path) -> list[str]:

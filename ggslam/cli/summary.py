@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rich.markup import escape
+
 from ggslam.cli.console import console, table
 
 if TYPE_CHECKING:
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
         TrajectoryScoresRecord,
     )
     from ggslam.runs.records.record import Record
+    from ggslam.runs.records.verdict import RunVerdict
 
 _IMAGE_COLUMNS = [
     ("frames", "frames", 1.0, ".0f"), ("PSNR", "psnr", 1.0, ".2f"), ("PSNR unmasked", "psnr_unmasked", 1.0, ".2f"),
@@ -47,7 +50,7 @@ def print_scores(metrics: MetricsRecord) -> None:
     columns = ["scores", *(title for title, *_ in _IMAGE_COLUMNS)]
     for name, scores in metrics.images.sets().items():
         if scores.psnr_exposed is not None:
-            text = f"{name.replace('_', ' ')}: PSNR {scores.psnr_exposed:.2f} of frames brought to the map's exposure"
+            text = f"{name.replace('_', ' ')}: PSNR {scores.psnr_exposed:.2f} of frames brought to the usual exposure"
             console.print(text, highlight=False)
     console.print(table("images; all but 'unmasked' over pixels with measured depth", columns, rows))
     if metrics.cameras:
@@ -60,6 +63,21 @@ def print_scores(metrics: MetricsRecord) -> None:
     console.print(_speed_line(metrics), highlight=False)
     for note in metrics.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
+
+
+GRADE_COLORS = {"good": "green", "doubtful": "yellow", "bad": "bold red"}
+
+
+def print_verdict(verdict: RunVerdict) -> None:
+    """The grade of a run, a line for each aspect, and what to try next."""
+    color = GRADE_COLORS[verdict.grade]
+    console.print(f"verdict: [{color}]{verdict.grade}[/]", highlight=False)
+    for name, aspect in verdict.aspects().items():
+        grade = aspect.grade or "-"
+        shown = f"[{GRADE_COLORS[grade]}]{grade:<8}[/]" if aspect.grade else f"{grade:<8}"
+        console.print(f"  {name:<8}  {shown}  {escape(aspect.text)}", highlight=False)
+    if verdict.next:
+        console.print(f"  try:      {escape(verdict.next)}", highlight=False, soft_wrap=True)
 
 
 def _print_cameras(cameras: dict[str, CameraScoresRecord]) -> None:

@@ -58,16 +58,43 @@ class PathName(str, Enum):
     walk = "walk"
 
 
+PathOption = Annotated[
+    PathName | None,
+    typer.Option(
+        help="loop: around the room and back; round: around it, seeing all of it; pan: turning on the spot; turns: "
+        "looking quickly from side to side; still: a tripod; route, walk: along a loop's or a corridor's way. "
+        "Default: loop in the room, else the scene's way."
+    ),
+]
+MoversOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAMES",
+        help="What moves while the room is recorded: some of walker,mug,door; movers.json tells where it is in each "
+        "frame. The same seed and frames without it: the same, with nothing that moves.",
+    ),
+]
+RigOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CAMERAS",
+        help="Record with several cameras fixed to one another: some of front,left,back,right, or degrees to the "
+        "right, like 0,45,-30.",
+    ),
+]
+SceneOption = Annotated[
+    SceneName,
+    typer.Option(
+        help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first; "
+        "corridor: a walk along a furnished corridor, longer with more frames, without a loop; bare: the same "
+        "without furniture."
+    ),
+]
+
+
 def synth(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write the recording to.")],
-    scene: Annotated[
-        SceneName,
-        typer.Option(
-            help="room: one furnished room; loop: a walk through four rooms and four corridors, back into the first; "
-            "corridor: a walk along a furnished corridor, longer with more frames, without a loop; bare: the same "
-            "without furniture."
-        ),
-    ] = SceneName.room,
+    scene: SceneOption = SceneName.room,
     frames: Annotated[
         int | None,
         typer.Option(help="Number of frames; default: room 60, with movers 120, loop 480, corridors 720.", min=2),
@@ -75,14 +102,7 @@ def synth(
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
     seed: Annotated[int, typer.Option(help="Seed of textures, camera path and noise.", min=0)] = 0,
-    path: Annotated[
-        PathName | None,
-        typer.Option(
-            help="loop: around the room and back; round: around it, seeing all of it; pan: turning on the spot; turns: "
-            "looking quickly from side to side; still: a tripod; route, walk: along a loop's or a corridor's way. "
-            "Default: loop in the room, else the scene's way."
-        ),
-    ] = None,
+    path: PathOption = None,
     speed: Annotated[
         int, typer.Option(help="How many times as far as usual the camera moves between two frames.", min=1)
     ] = 1,
@@ -102,14 +122,7 @@ def synth(
         typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, for the loop 0.3."),
     ] = None,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Add depth noise like a Kinect's.")] = True,
-    rig: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CAMERAS",
-            help="Record with several cameras fixed to one another: some of front,left,back,right, or degrees to the "
-            "right, like 0,45,-30.",
-        ),
-    ] = None,
+    rig: RigOption = None,
     rig_delay: Annotated[
         float, typer.Option(help="Seconds by which each camera of a rig is later than the one before it.", min=0)
     ] = 0.0,
@@ -118,14 +131,7 @@ def synth(
         typer.Option(help="Things of the room that differ between two visits; the second one's are in changes.json."),
     ] = None,
     visit: Annotated[int, typer.Option(help="Which of the two visits to record.", min=1, max=2)] = 1,
-    movers: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAMES",
-            help="What moves while the room is recorded: some of walker,mug,door; movers.json tells where it is "
-            "in each frame. The same seed and frames without it: the same, with nothing that moves.",
-        ),
-    ] = None,
+    movers: MoversOption = None,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
     from ggslam.synthetic import FRAMES_WITH_MOVERS, SCENES, Shutter

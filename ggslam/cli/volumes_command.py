@@ -44,7 +44,9 @@ Out = Annotated[
     Path | None,
     typer.Option(help="Folder for the results; default RUN/volumes, STORE/volumes, or volumes/NAME of a recording."),
 ]
-Voxel = Annotated[float | None, typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02).")]
+Voxel = Annotated[
+    float | None, typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02, larger in large scenes).")
+]
 Esdf = Annotated[bool, typer.Option("--esdf", help="Also make a distance field, with a slice and a ROS map.")]
 Occupancy = Annotated[
     float | None, typer.Option(metavar="VOXEL", help="Also make an occupancy map (.bt, .ot), voxels of so many metres.")
@@ -115,16 +117,14 @@ def volumes(
     network_ms: NetworkMs = 0.0,
     config: options.ConfigName = None,
     settings: options.Settings = None,
-    start: options.Start = 0,
-    stop: options.Stop = None,
-    stride: options.Stride = 1,
+    start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
     scale: Scale = None,
     format_name: options.Format = None,
     depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
-    camera: options.OwnCamera = None,
-    intrinsics: options.Intrinsics = None,
+    camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
+    depth_kind: options.DepthKind = None, depth_delay: options.DepthDelay = None, upright: options.Upright = False,
     sequence: options.MovedSequence = None,
     skip_bad_frames: options.SkipBadFrames = False,
     device: Device = None,
@@ -132,7 +132,7 @@ def volumes(
     engine: options.CellEngine = options.EngineName.local,
     workers: options.CellWorkers = None,
     address: options.CellAddress = None,
-) -> None:
+) -> None:  # fmt: skip
     """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
     from ggslam.jobs.submaps.stores import is_store
     from ggslam.jobs.volumes.fuse import VolumesRequest
@@ -142,7 +142,8 @@ def volumes(
     reading = SequenceRequest(
         source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
-        camera=camera, intrinsics=intrinsics, depth_camera=depth_camera,
+        camera=camera, intrinsics=intrinsics, depth_camera=depth_camera, depth_kind=depth_kind,
+            depth_delay=depth_delay, upright=upright,
     )  # fmt: skip
     request = VolumesRequest(
         source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,

@@ -23,20 +23,24 @@ class RenderedView:
         depth: [H, W] metres or None.
         color_3dgs: the colour by the rules of 3D Gaussian Splatting, [H, W, 3], or None.
         exposure: gain and offset of each channel that the frame's exposure has against the map's, [3, 2], or None.
+        typical: gain of each channel that the recording's typical exposure has against the map's, [3].
     """
 
     color: np.ndarray
     depth: np.ndarray | None = None
     color_3dgs: np.ndarray | None = None
     exposure: np.ndarray | None = None
+    typical: np.ndarray = field(default_factory=lambda: np.ones(3))
 
     def score(self, frame: Frame, lpips: Lpips | None = None) -> ImageScores:
         """Scores the view against the recorded frame."""
         scores = score_image(self.color, self.depth, frame.color, frame.depth, lpips)
         valid = np.isfinite(frame.depth) & (frame.depth > 0)
         if self.exposure is not None:
-            brought = unit_range((unit_range(frame.color) - self.exposure[:, 1]) / self.exposure[:, 0])
-            scores = replace(scores, psnr_exposed=psnr(unit_range(self.color), brought, valid))
+            gain = self.exposure[:, 0] / self.typical  # in the map's own range all errors of a dark map are small
+            brought = unit_range((unit_range(frame.color) - self.exposure[:, 1]) / gain)
+            shown = unit_range(unit_range(self.color) * self.typical)
+            scores = replace(scores, psnr_exposed=psnr(shown, brought, valid))
         if self.color_3dgs is None:
             return scores
         return replace(scores, psnr_3dgs=psnr(unit_range(self.color_3dgs), unit_range(frame.color), valid))

@@ -32,9 +32,9 @@ class ImageScores:
         psnr_unmasked: dB over all pixels.
         psnr_3dgs: dB over pixels with measured depth, of the map as 3D Gaussian Splatting and viewers that follow it
             draw it.
-        psnr_exposed: dB over pixels with measured depth, of the recorded frame brought to the map's exposure by one
-            gain for each colour channel (see `rendering.exposure`), so that errors of dark frames count as those of
-            bright ones do; only of runs in which the exposure changed.
+        psnr_exposed: dB over pixels with measured depth, of the recorded frame and the rendering, both brought to the
+            recording's typical exposure by one gain for each colour channel (see `rendering.exposure`), so that errors
+            of dark frames count as those of bright ones do; only of runs in which the exposure changed.
         psnr_affine: dB over pixels with measured depth after the best gain and offset of each colour channel of the
             rendering: what remains when exposure and white balance are forgiven.
         ssim: mean over pixels with measured depth of the SSIM map, which is computed on the unaltered images.

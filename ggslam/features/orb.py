@@ -128,7 +128,7 @@ class ViewMatches:
     def __len__(self) -> int:
         return len(self.points)
 
-    def explained(
+    def which_agree(
         self, T_world_camera: np.ndarray, camera: Camera, settings: FeatureSettings, slack: float = 1.0
     ) -> np.ndarray:
         """Which of them the view sees where they have to be if it is at a pose [4, 4], bool [m]; `slack` widens the
@@ -144,8 +144,8 @@ class ViewMatches:
     def count_explained(
         self, T_world_camera: np.ndarray, camera: Camera, settings: FeatureSettings, slack: float = 1.0
     ) -> int:
-        """How many are `explained`."""
-        return int(self.explained(T_world_camera, camera, settings, slack).sum())
+        """How many are `which_agree`."""
+        return int(self.which_agree(T_world_camera, camera, settings, slack).sum())
 
     def pose(self, camera: Camera, settings: FeatureSettings) -> FeaturePose | None:
         """The pose most of them agree on; None without enough of them. The same matches give the same pose."""

@@ -14,8 +14,12 @@ from ggslam.scene.poses import inverse, se3_exp
 
 ELSEWHERE = -1
 """Frame index of keyframes that are of another recording than the run's: of the map that it began with."""
-DEPTH_UNITS_PER_METRE = 5000.0
-"""Depth of keyframes is kept as uint16 in units of 0.2 mm (range 13.1 m), the resolution of the TUM recordings."""
+DEPTH_UNIT = 1 / 5000.0
+"""Metres. Depth of keyframes is kept as uint16 in units of 0.2 mm (range 13.1 m), the resolution of the TUM recordings;
+of keyframes that see farther in units so many times as large, see `depth_unit_for`."""
+FAR_SHARE = 0.02
+"""Of the pixels with depth: as few beyond the range of `DEPTH_UNIT` are taken for errors of a room's sensor."""
+_MOST_UNITS = 65535
 _IMAGES = ("color", "depth", "mask", "moving")
 
 
@@ -27,7 +31,7 @@ class Keyframe:
         index: number of the keyframe (0, 1, 2, ...).
         frame_index: index of the frame it was made from, or `ELSEWHERE`.
         color: uint8 [H, W, 3].
-        depth: uint16 [H, W], units of 1 / DEPTH_UNITS_PER_METRE metres, 0 = none.
+        depth: uint16 [H, W], units of `depth_unit`, 0 = none.
         T_camera_world: float64 [4, 4], the pose as refined so far.
         exposure: float64 [3, 2], gain and offset per channel applied to the rendered colour.
         mask: uint16 [H, W] or None.
@@ -50,6 +54,8 @@ class Keyframe:
     instant: int | None = None
     """Of a rig, see `Frame`."""
     moving: np.ndarray | None = field(default_factory=lambda: None)
+    depth_unit: float = DEPTH_UNIT
+    """Metres."""
 
     def put_away(self, archive: ArrayArchive) -> None:
         """Hands the images to an archive, which keeps them in memory or not. They must not be changed any more."""
@@ -76,18 +82,29 @@ class Keyframe:
 
     def depth_m(self) -> np.ndarray:
         """Depth in metres, float32 [H, W]."""
-        return self.depth.astype(np.float32) / np.float32(DEPTH_UNITS_PER_METRE)
+        return self.depth.astype(np.float32) / np.float32(1 / self.depth_unit)
 
 
 def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
     """The keyframe of a frame seen from `T_world_camera`."""
-    units = np.clip(frame.depth * DEPTH_UNITS_PER_METRE + 0.5, 0, 65535).astype(np.uint16)
-    units[frame.depth * DEPTH_UNITS_PER_METRE > 65535] = 0
+    unit = depth_unit_for(frame.depth)
+    scaled = frame.depth * np.float32(1 / unit)
+    units = np.clip(scaled + 0.5, 0, _MOST_UNITS).astype(np.uint16)
+    units[scaled > _MOST_UNITS] = 0
     return Keyframe(
         index, frame.index, frame.timestamp, frame.camera, np.ascontiguousarray(frame.color), units,
         inverse(T_world_camera), frame.mask, camera_number=frame.camera_number, instant=frame.instant,
-        moving=frame.moving,
+        moving=frame.moving, depth_unit=unit,
     )  # fmt: skip
+
+
+def depth_unit_for(depth: np.ndarray) -> float:
+    """Metres: `DEPTH_UNIT`, doubled until at most `FAR_SHARE` of the pixels with depth, float [H, W], are beyond its
+    range."""
+    known, unit = depth[depth > 0], DEPTH_UNIT
+    while len(known) and np.mean(known > _MOST_UNITS * unit) > FAR_SHARE:
+        unit *= 2
+    return unit
 
 
 class PoseAdam:

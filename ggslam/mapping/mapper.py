@@ -135,6 +135,8 @@ class Mapper(ABC):
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.depth_noise_px = 0.0
         """The same as it moves a point in the image, pixels; see `MapperSettings.sparse_noise`."""
+        self.pixel_m = 0.0
+        """Metres that a pixel of the images is wide at the scene's median depth; 0: not known."""
         self.is_live = False
         """Whether frames come at a camera's pace: keyframes do not wait then while one looks for what surfaces hide."""
         self.residency: Residency | None = None
@@ -146,7 +148,7 @@ class Mapper(ABC):
         """A loss of the user's own, added to the mapper's; on the CPU only."""
         self._rasterizer: TrainingRasterizer
         self._mean = MeanMap()
-        self._standard_adam = self._adam(1.0)
+        self._adam_of_pixel: tuple[float, AdamSettings] | None = None
         self._sampler = KeyframeSampler(float(np.random.default_rng(seed).random()))
 
     @property
@@ -188,6 +190,7 @@ class Mapper(ABC):
         keyframe = self._new_keyframe(frame, T_world_camera)
         self._insert(keyframe, T_world_camera, labeller)
         self.keyframes.append(keyframe)
+        self.use_typical_exposure()
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
             prune(self.map, self.settings.pruning)
         if self._is_noisy and not self.is_live and is_look_due(len(self.keyframes)):
@@ -199,6 +202,14 @@ class Mapper(ABC):
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         """Goes on with a map made before. Keyframes without images keep their Gaussians but are never trained on."""
         self.map, self.keyframes = gaussians, keyframes
+
+    def use_typical_exposure(self, at_end: bool = False) -> None:  # noqa: B027
+        """If exposures are compensated and most keyframes are brighter or darker than the map, the map gets the
+        exposure that is typical of them; on the CPU.
+
+        Args:
+            at_end: before the final refinement: exposures are measured again first, and every difference counts.
+        """
 
     def move_keyframes(self, T_new_old: np.ndarray) -> None:
         """Moves keyframes, and with each the Gaussians that it inserted.
@@ -378,7 +389,7 @@ class Mapper(ABC):
             times.loss += watch.lap()
         step = self._rasterizer.backward_step(
             self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,
-            optimizer=self._standard_adam if rate_factor == 1 else self._adam(rate_factor),
+            optimizer=self._standard_adam() if rate_factor == 1 else self._adam(rate_factor),
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
         share = 1 if grid.is_whole else 1 / STEPS  # fewer pixels tell less of where the camera was
@@ -505,11 +516,19 @@ class Mapper(ABC):
         for _ in range(steps):
             self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
 
+    def _standard_adam(self) -> AdamSettings:
+        """Made once: every step asks for it."""
+        if self._adam_of_pixel is None or self._adam_of_pixel[0] != self.pixel_m:
+            self._adam_of_pixel = self.pixel_m, self._adam(1.0)
+        return self._adam_of_pixel[1]
+
     def _adam(self, rate_factor: float) -> AdamSettings:
         r = self.settings.rates
         young = r.young_factor
         decay = (1 / young) ** (1 / max(1, r.young_updates)) if young > 1 else 1.0
         rates = {name: rate_factor * getattr(r, name) * (young if name in _YOUNG else 1) for name in ADAM_GROUPS}
+        if self.pixel_m > 0:
+            rates["means"] = min(rates["means"], rate_factor * r.means_px * self.pixel_m)
         if self.identity is not None:
             rates["features"] = self.identity.settings.rate
         return AdamSettings(

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Protocol
 
+import numpy as np
+
 
 class Residency(Protocol):
     """Knows which keyframes see nothing but Gaussians that are in memory."""
@@ -15,3 +17,6 @@ class Residency(Protocol):
 
     def stages(self) -> Iterator[Sequence[int]]:
         """All keyframes, some after the others: while numbers are handed out, these are trainable."""
+
+    def scale_colors(self, gain: np.ndarray) -> None:
+        """Gaussians on disk get another exposure, as those in memory did: a gain for each channel [3]."""

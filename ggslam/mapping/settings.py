@@ -49,7 +49,10 @@ class LearningRates:
     """
 
     means: float = setting(1.8e-3, 0, 10, "m")
-    """Of the means, at a Gaussian's first step."""
+    """Of the means, at a Gaussian's first step, at most."""
+    means_px: float = setting(0.5, 0, 1e3, "px")
+    """The same as it moves a Gaussian in the image, at the scene's median depth, at most: near scenes have small
+    pixels."""
     quaternions: float = setting(1.8e-2, 0, 10)
     """Of the quaternions, at a Gaussian's first step."""
     log_scales: float = setting(8e-2, 0, 10)
@@ -126,6 +129,10 @@ class ExposureSettings:
     that regulate themselves a little stay below."""
     least: float = setting(0.1, 0.001, 10)
     """Change of a gain, as a natural logarithm, from which a keyframe is then given an exposure of its own."""
+    typical: float = setting(0.2, 0.001, 10)
+    """Once exposures are compensated, the map gets the keyframes' median exposure when they differ from it by this, as
+    a natural logarithm, and after the last frame in any case: a first frame of a camera that was still regulating
+    itself does not colour the map. A map made before keeps its exposure."""
     rate: float = setting(2e-3, 0, 1)
     """Learning rate of gains and offsets."""
     regularization: float = setting(1e-2, 0, 1e6)

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 OPAQUE, SAME_DEPTH = 0.9, 0.05
@@ -13,6 +16,11 @@ FEWEST_SHARE = 0.02
 """Of the pixels have to be left."""
 STEP = 2
 """Every so many rows and columns are looked at."""
+LIT_SHARE = 0.3
+"""Of an image's pixels have to be neither dark nor bright for it to show colours."""
+CONTRADICTION = 0.15
+"""Median difference of grey values in [0, 1] between an image and a map that cannot both be of the same scene."""
+_SOME = (slice(None, None, STEP), slice(None, None, STEP))
 
 
 def identity_exposure() -> np.ndarray:
@@ -23,6 +31,69 @@ def identity_exposure() -> np.ndarray:
 def change_of(exposure: np.ndarray) -> float:
     """How bright an exposure [3, 2] is against the map: the geometric mean of its gains."""
     return float(np.exp(np.log(np.maximum(exposure[:, 0], 1e-6)).mean()))
+
+
+def frame_weights(numbers: Sequence[int]) -> np.ndarray:
+    """Frames for which keyframes of these numbers stand, [n]: up to the next one, the last for as many as the one
+    before it; one at least."""
+    gaps = np.diff(np.asarray(numbers, np.float64))
+    return np.maximum(np.append(gaps, gaps[-1:] if len(gaps) else 1), 1)
+
+
+def typical_gain(gains: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
+    """Weighted median of gains against a map, [3] each, by channel; where half of the weight lies on either side the
+    nearer to the map's, which is 1."""
+    found = np.ones(3)
+    for channel in range(3):
+        values = np.maximum([gain[channel] for gain in gains], 1e-3)
+        order = np.argsort(values, kind="stable")
+        share = np.cumsum(weights[order]) / weights.sum()
+        low, high = (values[order[np.searchsorted(share, 0.5, side=side)]] for side in ("left", "right"))
+        found[channel] = np.clip(1.0, low, high)
+    return found
+
+
+@dataclass(frozen=True)
+class SeenAgain:
+    """What a map shows where a camera looks.
+
+    Attributes:
+        image: rendered colour [3, H, W].
+        alpha: of the rendering [H, W].
+        rendered_depth: metres [H, W].
+        depth: what the camera measured [H, W], metres, 0 = none.
+    """
+
+    image: np.ndarray
+    alpha: np.ndarray
+    rendered_depth: np.ndarray
+    depth: np.ndarray
+
+    def common_pixels(self) -> np.ndarray:
+        """Which of every STEP-th row and column both see, bool [h, w]."""
+        depth, rendered_depth = self.depth[_SOME], self.rendered_depth[_SOME]
+        near = np.abs(rendered_depth - depth) < SAME_DEPTH * depth
+        return np.asarray((depth > 0) & (self.alpha[_SOME] > OPAQUE) & near)
+
+    def measure(self, color: np.ndarray) -> np.ndarray | None:
+        """`measure_exposure` of what the camera saw, uint8 [H, W, 3]."""
+        return measure_exposure(color, self.depth, self.image, self.alpha, self.rendered_depth)
+
+
+def is_lit(color: np.ndarray) -> bool:
+    """Whether an image uint8 [H, W, 3] shows colours: it is neither nearly black nor saturated nearly everywhere."""
+    grey = color[_SOME].astype(np.float32).mean(2) / 255
+    return bool(((grey > DARK) & (grey < BRIGHT)).mean() >= LIT_SHARE)
+
+
+def shows_otherwise(color: np.ndarray, seen: SeenAgain) -> bool:
+    """Whether a map and an image uint8 [H, W, 3] that is not lit, or a map of such images and one that is, contradict
+    each other; what is black or white in the scene is so in both."""
+    known = seen.common_pixels()
+    if known.mean() < FEWEST_SHARE:
+        return False
+    grey = color[_SOME].astype(np.float32).mean(2) / 255
+    return bool(np.median(np.abs(grey - seen.image.mean(0)[_SOME])[known]) > CONTRADICTION)
 
 
 def measure_exposure(
@@ -40,18 +111,30 @@ def measure_exposure(
         image: rendered colour [3, H, W].
         alpha, rendered_depth: of the rendering [H, W].
     """
-    some = (slice(None, None, STEP), slice(None, None, STEP))
-    depth, rendered_depth = depth[some], rendered_depth[some]
-    near = np.abs(rendered_depth - depth) < SAME_DEPTH * depth
-    known = (depth > 0) & (alpha[some] > OPAQUE) & near
-    seen, exposure = color[some][known], identity_exposure()
+    known = SeenAgain(image, alpha, rendered_depth, depth).common_pixels()
+    seen, exposure = color[_SOME][known], identity_exposure()
     for channel in range(3):
-        x, y = image[channel][some][known], seen[:, channel].astype(np.float32) / 255
+        x, y = image[channel][_SOME][known], seen[:, channel].astype(np.float32) / 255
         used = (x > DARK) & (x < BRIGHT) & (y < BRIGHT)
         if used.sum() < FEWEST_SHARE * known.size:
             return None
         exposure[channel, 0] = float(np.median(y[used] / x[used]))
     return exposure if (exposure[:, 0] > 0).all() else None
+
+
+def relative_sharpness(color: np.ndarray, seen: SeenAgain, exposure: np.ndarray) -> float:
+    """Contrast between neighbouring pixels (root mean square of the gradient of grey values) in an image uint8
+    [H, W, 3] as a share of what a map shows of it with the image's exposure [3, 2]; 1 where too little is seen by both.
+    """
+    known = np.zeros(seen.depth.shape, bool)
+    known[_SOME] = seen.common_pixels()
+    gains = exposure[:, 0].astype(np.float32)
+    image = color.astype(np.float32).mean(2) / 255
+    shown = np.tensordot(gains, seen.image.clip(0, 1), 1) / np.float32(3)
+    ours, theirs = (float(sum(np.square(d)[known].sum() for d in np.gradient(grey))) for grey in (image, shown))
+    if known.sum() < FEWEST_SHARE * known.size / STEP**2 or theirs <= 0:
+        return 1.0
+    return float(np.sqrt(ours / theirs))
 
 
 def without_exposure(color: np.ndarray, exposure: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@
     config.yaml      all settings; sequence.json: where the recording was and how it was read
     timing.json      seconds by part; steps.csv: the same, memory, Gaussians and losses step by step
     metrics.json     scores; renders/: pictures; report.html: all of it to look at; ground_truth.txt: true poses for it
+    verdict.json     how good the run is, told by its own figures
     volumes/         by `ggslam volumes`; plots/: by `ggslam report --plots`
 of a run with objects, whose map.ply also holds each Gaussian's object id and identity vector:
     objects.json     the objects: ids, names, boxes, ...; there if and only if the other files of the objects are whole
@@ -45,6 +46,7 @@ from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoversRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
+from ggslam.runs.records.verdict import RunVerdict
 from ggslam.runs.writing import RUN_FILES, RunToWrite
 from ggslam.scene.arrays import read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
@@ -266,6 +268,10 @@ class RunFolder:
     def metrics(self) -> MetricsRecord | None:
         """metrics.json: the scores; None if the run was not scored."""
         return MetricsRecord.read_if_there(self.path)
+
+    def verdict(self) -> RunVerdict | None:
+        """verdict.json: how good the run is; None of one that was edited, merged or made by an older version."""
+        return RunVerdict.read_if_there(self.path)
 
     def config(self) -> Config:
         """The settings of the run."""

@@ -31,6 +31,7 @@ from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoversRecord
 from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
+from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
@@ -158,6 +159,10 @@ class MapFile(RunFolder):
 
     def metrics(self) -> MetricsRecord | None:
         """None: it was not scored."""
+        return None
+
+    def verdict(self) -> RunVerdict | None:
+        """None: nothing is known of the run that it is of."""
         return None
 
     def trajectory(self) -> Trajectory:

@@ -26,7 +26,7 @@ def map_points(
 
     Args:
         folder: of the run, whether it is complete yet or not.
-        voxel_size: metres; None: as goes with the map.
+        voxel_size: metres; None: as goes with the size of what the keyframes see.
         discs: take discs...
         min_opacity: ...of Gaussians that are at least this opaque.
 

@@ -15,15 +15,16 @@ from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.rendered_views import RenderedViews
 
 
-def surface_points(run: str | Path | RunFolder, voxel_size: float = 0.01) -> VoxelCloud:
+def surface_points(run: str | Path | RunFolder, voxel_size: float | None = 0.01) -> VoxelCloud:
     """The surface that a run's keyframes see of its map: one coloured point for each voxel that it crosses, with object
     ids if there are any. Nothing but the run's folder is needed.
 
     Args:
         run: the run, or its folder; or a file of Gaussians, which gives discs unless it tells where it was seen from.
-        voxel_size: metres, 0.001 to 1.
+        voxel_size: metres, 0.001 to 1; None: 0.01, or more in scenes larger than rooms.
 
     Raises:
+        VoxelError: voxels too small for what a keyframe sees.
         InputError: an impossible voxel size.
         RunFolderError, FormatError: a file is missing or damaged.
     """

@@ -41,6 +41,10 @@ class SequenceRequest:
     pose_convention: str | None = None
     camera: Path | None = None
     intrinsics: str | None = None
+    depth_kind: str | None = None
+    depth_delay: str | None = None
+    upright: bool = False
+    void_id: int | None = None
 
     def open(self, truth: bool = True) -> Sequence:
         """Opens the recording; `truth`: with its true poses.
@@ -54,6 +58,7 @@ class SequenceRequest:
             masks=self.masks, depth_scale=self.depth_scale, on_bad_frame=self.on_bad_frame,  # type: ignore[arg-type]
             depth_camera=self.depth_camera, min_confidence=self.min_confidence, topics=self.topics,
             pose_convention=self.pose_convention, camera=self.camera, intrinsics=self.intrinsics, truth=truth,
+            depth_kind=self.depth_kind, depth_delay=self.depth_delay, upright=self.upright, void_id=self.void_id,
         )  # fmt: skip
 
 
@@ -213,11 +218,15 @@ def _open_as(
     if is_live(request.path):
         raise RunFolderError(f"{run}: was run live ({request.path}), and its frames were not kept (`record`)")
     sequence = replace(request, scale=request.scale if scale is None else scale).open()
+    if sequence.finer and scale is None and sequence.camera.width != record.camera.width:  # of an older version
+        own = sequence.scale * record.camera.width / sequence.camera.width
+        sequence = replace(request, scale=own).open()
     if isinstance(sequence, RigSequence):
         found = {name: value for name, value in describe_rig(sequence).items() if name != "cameras" or scale is None}
         expected = {} if record.rig is None else {name: record.rig.values().get(name) for name in found}
     else:
-        found = {"frames": len(sequence), "camera": asdict(sequence.native_camera.scale(record.open.scale))}
+        camera = sequence.camera if scale is None else sequence.default_camera(record.open.scale)
+        found = {"frames": len(sequence), "camera": asdict(camera)}
         expected = {"frames": record.frames, "camera": asdict(record.camera)}
     found = json_ready(found)
     if found != expected:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from ggslam.errors import InputError
 from ggslam.formats.point_sampling import USUAL_VOXEL
 from ggslam.formats.voxel_cloud import VoxelCloud
+from ggslam.geometry.scene_size import scale_of_depth, voxel_times
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.segmented_map import SegmentedMap
@@ -38,8 +38,8 @@ _COARSE = 0.25
 """Size of views that only tell how far they reach."""
 _FINEST = 4.0
 """Views are rendered at most at so many times the training views' size, for voxels small against their pixels."""
-_ROOM = 6.0
-"""Metres: up to such a usual depth points are a centimetre apart."""
+LARGEST_VOXEL = 1.0
+"""Metres."""
 _PIXELS_A_VOXEL = 1.5
 """A pixel spans no more voxels than this at the usual depth."""
 
@@ -131,8 +131,12 @@ class RenderedViews:
     def usual_voxel(self) -> float:
         """Edge of voxels that suits the map, a whole number of centimetres: 1 in rooms, more where most of what is seen
         is farther away, in halls or where depth has a wrong unit."""
+        return min(USUAL_VOXEL * self._times(), LARGEST_VOXEL)
+
+    def _times(self) -> int:
+        """Size of the scene against a room's, see `geometry.scene_size.voxel_times`."""
         depths = [depth for depth, _ in self._usual_depths()]
-        return USUAL_VOXEL * max(1, math.ceil(float(np.median(depths)) / _ROOM)) if depths else USUAL_VOXEL
+        return voxel_times(scale_of_depth(float(np.median(depths)))) if depths else 1
 
     def zoom_for(self, voxel_size: float) -> float:
         """How many times larger than the keyframes' images views have to be for voxels of this size, metres."""
@@ -154,20 +158,17 @@ class RenderedViews:
         `volumes.surface_points.surface_points`.
 
         Raises:
+            VoxelError: voxels too small for what a view shows.
             InputError: an impossible voxel size.
         """
-        if not 1e-3 <= voxel_size <= 1:
-            raise InputError(f"voxel size: expected 0.001 to 1 m, found {voxel_size:g}")
+        if not 1e-3 <= voxel_size <= LARGEST_VOXEL:
+            raise InputError(f"voxel size: expected 0.001 to {LARGEST_VOXEL:g} m, found {voxel_size:g}")
         views = self.in_order()
-        zoom = views.zoom_for(voxel_size)
+        zoom, times = views.zoom_for(voxel_size), views._times()
 
         def look(number: int, coarse: bool) -> PosedView:
             return views.view(number, _COARSE if coarse else zoom, only_depth=coarse)
 
-        try:
-            yield from surface_points(look, len(views), voxel_size, self.segmented is not None, most_blocks)
-        except InputError as error:
-            if "blocks" not in str(error):
-                raise
-            raise InputError(f"voxel size {voxel_size:g} m: too small for what a view shows ({error})") from None
+        with_ids = self.segmented is not None
+        yield from surface_points(look, len(views), voxel_size, with_ids, most_blocks, times=times)
 

@@ -24,6 +24,7 @@ from ggslam.runs.records.mark import RunRecord, VerdictRecord
 from ggslam.runs.records.movers import MOVER_FILES, MoversRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
+from ggslam.runs.records.verdict import RunVerdict
 from ggslam.runs.saving_parts import save_map_in_parts, save_points
 from ggslam.scene.arrays import arrays_to_bytes
 from ggslam.sequences.moving_pixels import MOVERS_FILE
@@ -46,9 +47,8 @@ TRAJECTORIES = "trajectories"
 """Folder with a trajectory of each camera of a rig; trajectory.txt is that of the rig."""
 RUN_FILES = (
     *OBJECT_FILES, "map.ply", MAP_INDEX, "trajectory.txt", KeyframesRecord.FILE, LoopsRecord.FILE, SequenceRecord.FILE,
-    TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", *POINTS, PLACES_FILE, STEPS_FILE, TRUTH_FILE,
-    *MOVER_FILES, REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES,
-    CHANGES_FOLDER,
+    TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", RunVerdict.FILE, *POINTS, PLACES_FILE, STEPS_FILE,
+    TRUTH_FILE, *MOVER_FILES, REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES, CHANGES_FOLDER,
 )  # fmt: skip
 """Files and folders that a run may have besides run.json."""
 

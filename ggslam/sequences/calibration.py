@@ -29,7 +29,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose
 from ggslam.sequences.camera_files.lens_models import distortion_of
 from ggslam.sequences.camera_files.reading import read_entries
-from ggslam.sequences.json_files import camera_of
+from ggslam.sequences.json_files import camera_of, check_intrinsics
 from ggslam.sequences.recording import Calibration, DepthCamera, Recording
 
 _LARGEST_NUMBER = 1e300
@@ -63,10 +63,7 @@ def camera_entry(path: Path, settings: dict[str, Any]) -> Camera:
     )
     if abs(cx) > FARTHEST_CENTRE * abs(width) or abs(cy) > FARTHEST_CENTRE * abs(height):
         raise SequenceError(f"{path}: impossible principal point {cx:g}, {cy:g} of an image of {width:g}x{height:g}")
-    try:
-        return Camera(int(width), int(height), fx, fy, cx, cy)
-    except ValueError as error:
-        raise SequenceError(f"{path}: {error}") from None
+    return camera_of(path, width, height, fx, fy, cx, cy)
 
 
 def camera_or_calibration(path: Path, settings: dict[str, Any]) -> tuple[Camera | None, Calibration | None]:
@@ -78,7 +75,7 @@ def camera_or_calibration(path: Path, settings: dict[str, Any]) -> tuple[Camera 
     if "width" in settings or "height" in settings or not {"fx", "fy", "cx", "cy"} <= settings.keys():
         return camera_entry(path, settings), None
     fx, fy, cx, cy = (number_entry(path, settings, key) for key in ("fx", "fy", "cx", "cy"))
-    camera_of(path, 1, 1, fx, fy, cx, cy)
+    check_intrinsics(path, fx, fy, cx, cy)
     return None, (fx, fy, cx, cy)
 
 

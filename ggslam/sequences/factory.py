@@ -11,6 +11,8 @@ from pathlib import Path
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.calibration import use_depth_camera
+from ggslam.sequences.depth_delay import delay_depth
+from ggslam.sequences.depth_kind import PLAIN, DepthKind, read_depth_kind
 from ggslam.sequences.formats.folder import FolderFormat, SyntheticFormat
 from ggslam.sequences.formats.icl_nuim import IclNuimFormat
 from ggslam.sequences.formats.polycam import PolycamFormat
@@ -64,6 +66,16 @@ SMALLEST_SCALE = 1e-6
 """Units of depth images a metre, and one over it the largest: nobody counts in others, and float32 bears them."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Stored:
+    """How images are stored, as a user says; see the arguments of `open_sequence` of these names."""
+
+    depth_kind: DepthKind = PLAIN
+    depth_delay: str | None = None
+    upright: bool = False
+    void_id: int | None = None
+
+
 def open_sequence(
     path: str | Path,
     *,
@@ -82,6 +94,10 @@ def open_sequence(
     camera: str | Path | None = None,
     intrinsics: str | None = None,
     truth: bool = True,
+    depth_kind: str | None = None,
+    depth_delay: str | None = None,
+    upright: bool = False,
+    void_id: int | None = None,
 ) -> Sequence:
     """Opens an RGB-D recording.
 
@@ -90,8 +106,8 @@ def open_sequence(
         format: name of a format in `FORMATS`, or "rig"; None: recognised from the folder or file.
         start, stop, stride: frames start, start + stride, ... below stop (None: to the end). A stop past the end means
             the end.
-        scale: size of the delivered images, in (0, 1]; None: 1, but of colour much finer than depth (phones) what
-            leaves 640x480 pixels.
+        scale: of the delivered images to those that come by default: the stored ones, or of colour much finer than
+            depth (phones) 640x480 pixels of it; above 0, and at most what gives the stored size.
         masks: folder of instance masks to use instead of the recording's own; see `masks.find_masks`.
         depth_scale: depth units per metre, instead of the recording's own.
         on_bad_frame: "error": a damaged frame or mask raises; "skip": `stream` skips the frame and lists it in
@@ -106,6 +122,11 @@ def open_sequence(
             `camera_files`).
         intrinsics: the same as "fx fy cx cy", then up to 8 coefficients of distortion, of colour images as stored.
         truth: whether the recording's true poses are read. They are never needed: what is wrong with them is a warning.
+        depth_kind: what the numbers of depth images mean: words of `depth_kind.WORDS` with commas between; None: z.
+        depth_delay: by how much depth was taken after the colour that it is stored beside, as "1f" (frames), "-1f" or
+            "33ms": pairs colour with the depth of its own time; see `depth_delay`.
+        upright: turn colour images as their orientation tag (EXIF) says; the calibration is that of the turned images.
+        void_id: id of masks that means "unlabelled", besides 0.
 
     Raises:
         MissingDependency: a package is needed to read the recording.
@@ -117,6 +138,7 @@ def open_sequence(
         of_cameras = {
             "masks": masks, "depth_scale": depth_scale, "depth_camera": depth_camera, "min_confidence": min_confidence,
             "topics": topics or None, "pose_convention": pose_convention, "camera": camera, "intrinsics": intrinsics,
+            "depth_kind": depth_kind, "depth_delay": depth_delay, "upright": upright or None, "void_id": void_id,
         }  # fmt: skip
         return _open_rig(given_path(path), rig, (start, stop, stride), scale, on_bad_frame, truth, of_cameras)
     if format == RIG:
@@ -126,6 +148,7 @@ def open_sequence(
         dataclasses.replace(
             _options(depth_camera, min_confidence, topics, camera, intrinsics, depth_scale), truth=truth
         ), pose_convention,
+        Stored(read_depth_kind(depth_kind), depth_delay, upright, void_id),
     )  # fmt: skip
     recording = read()
     selection = select(recording.path, len(recording.files), start, stop, stride)
@@ -136,6 +159,7 @@ def open_sequence(
         "on_bad_frame": on_bad_frame, "depth_camera": None if depth_camera is None else given_path(depth_camera),
         "min_confidence": min_confidence, "topics": topics, "pose_convention": pose_convention,
         "camera": None if camera is None else given_path(camera), "intrinsics": intrinsics,
+        "depth_kind": depth_kind, "depth_delay": depth_delay, "upright": upright, "void_id": void_id,
     }  # fmt: skip
     return sequence
 
@@ -159,6 +183,7 @@ def _open_rig(
 
 def _read_recording(
     folder: Path, format: str | None, masks: Path | None, options: ReadOptions, pose_convention: str | None,
+    stored: Stored,
 ) -> Recording:  # fmt: skip
     """Reads a recording's description and applies the user's options; arguments and errors as in `open_sequence`."""
     _check_kind(folder)
@@ -187,6 +212,10 @@ def _read_recording(
             recording.poses = convert_poses(recording.poses, pose_convention)
         elif options.truth and not recording.pose_problem:
             raise SequenceError(f"{folder}: tells no poses, so there are none to convert from {pose_convention}")
+    recording.depth_kind, recording.upright = stored.depth_kind, stored.upright
+    recording.void_id = stored.void_id
+    if stored.depth_delay is not None:
+        delay_depth(recording, stored.depth_delay)
     if not SMALLEST_SCALE <= recording.depth_scale <= 1 / SMALLEST_SCALE:
         found_scale = f"found {recording.depth_scale}"
         raise SequenceError(f"{folder}: depth scale must be a positive number of usual size, {found_scale}")

@@ -8,6 +8,7 @@ first: every PNG chunk by its length and checksum, a JPEG by its end marker.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -21,35 +22,34 @@ from ggslam.system.opencv import opencv_errors
 
 MAX_PIXELS = 100_000_000
 """Of one image: more than any camera of a recording has, and 300 MB in memory."""
+LARGEST_CODE = 65535
+"""Of 16-bit depth images: "nothing measured", or cut off there."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
-def read_color(file: ImageFile) -> np.ndarray:
-    """Colour image, uint8 [H, W, 3] RGB (grey images are spread over the three channels); may be read-only.
+def read_color(file: ImageFile, upright: bool = False) -> np.ndarray:
+    """Colour image, uint8 [H, W, 3] RGB (grey images are spread over the three channels); may be read-only. `upright`:
+    turned as the orientation tag of a photograph says.
 
     Raises:
         SequenceError: missing, truncated, or not an image.
     """
-    return decode_color(file, read_content(file)) if isinstance(file, Path) else _read_source(file)
+    return decode_color(file, read_content(file), upright) if isinstance(file, Path) else _read_source(file)
 
 
-def decode_color(name: object, content: bytes) -> np.ndarray:
+def decode_color(name: object, content: bytes, upright: bool = False) -> np.ndarray:
     """Colour image uint8 [H, W, 3] RGB of the bytes of a PNG or JPEG file (`name` is for errors)."""
-    # The orientation tag is ignored: depth and calibration refer to the pixels as stored.
-    image = decode(name, content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    # The orientation tag is ignored unless asked for: depth and calibration mostly refer to the pixels as stored.
+    orientation = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
+    image = decode(name, content, cv2.IMREAD_COLOR | orientation)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def read_depth(file: ImageFile, depth_scale: float, invalid: int | None = None) -> np.ndarray:
-    """Depth image, float32 [H, W], metres, 0 where nothing was measured; may be read-only.
-
-    Args:
-        file: single-channel 16-bit PNG, or .npy of uint16 or floating-point numbers, or a source of either.
-        depth_scale: units per metre.
-        invalid: raw value that means "nothing measured" beside 0; negative numbers and NaN do so always.
+def read_stored_depth(file: ImageFile) -> np.ndarray:
+    """Depth image as stored: uint16 or floating-point [H, W], in the recording's units; may be read-only.
 
     Raises:
-        SequenceError: missing, truncated, not an image, or not 16-bit or floating-point with one channel.
+        SequenceError: as `read_depth`.
     """
     if not isinstance(file, Path):
         raw = _read_source(file)
@@ -59,11 +59,30 @@ def read_depth(file: ImageFile, depth_scale: float, invalid: int | None = None) 
         raw = decode(file, read_content(file), cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or (raw.dtype != np.uint16 and raw.dtype.kind != "f"):
         raise SequenceError(f"{file}: expected a 16-bit depth image with one channel, found {describe_channels(raw)}")
+    return raw
+
+
+def read_depth(file: ImageFile, depth_scale: float, none: Iterable[float] = ()) -> np.ndarray:
+    """Depth image, float32 [H, W], metres, 0 where nothing was measured; may be read-only.
+
+    Nothing was measured where 0 is stored, the largest number that 16 bits hold, a negative number, or none at all.
+
+    Args:
+        file: single-channel 16-bit PNG, or .npy of uint16 or floating-point numbers, or a source of either.
+        depth_scale: units per metre.
+        none: further stored numbers that mean "nothing measured".
+
+    Raises:
+        SequenceError: missing, truncated, not an image, or not 16-bit or floating-point with one channel.
+    """
+    raw = read_stored_depth(file)
     depth = raw.astype(np.float32) / np.float32(depth_scale)
     if raw.dtype.kind == "f":
         depth[~((depth > 0) & np.isfinite(depth))] = 0
-    if invalid is not None:
-        depth[raw == invalid] = 0
+    else:
+        depth[raw == LARGEST_CODE] = 0
+    for code in none:
+        depth[np.isclose(raw, code, rtol=1e-6, atol=0)] = 0
     return depth
 
 

@@ -13,6 +13,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.alignment import Alignment, measure_alignment
 from ggslam.sequences.clock_offset import ClockOffset, measure_clock_offset
+from ggslam.sequences.depth_doubts import DepthDoubts
 from ggslam.sequences.focal_doubts import doubt_focal_length
 from ggslam.sequences.pose_conventions import CONVENTIONS, OURS
 from ggslam.sequences.pose_doubts import PoseDoubt, doubt_poses, pairs_apart
@@ -28,7 +29,15 @@ from ggslam.sequences.verdicts import (
     judge_scale_signs,
     judge_times,
 )
+from ggslam.sequences.void_ids import has_void_id
 
+LARGEST_RATIO, SCALE_TOLERANCE = 1.25, 0.05
+"""Factor between depth and true poses from which the depth scale is doubted, and how exactly (natural logarithm) it is
+known."""
+VOID_TEXT = (
+    "id 255 stands in most masks and is far from all other ids: it seems to mean that nobody decided what is there; "
+    "`void_id` 255 leaves it out"
+)
 APART = 12
 """Frames from one to the other of those that are compared where no true pose tells how far the camera moved."""
 
@@ -68,6 +77,7 @@ class SequenceReport:
         named_ids: how many ids have names.
         clocks: by how much time depth and colour are apart; None when it cannot be told, or was not asked for.
         damaged: reasons of sampled frames that could not be read.
+        scale_known: whether true poses tell the depth scale: then only they are heard.
         verdicts: what seems wrong by the numbers.
         warnings: everything that looks wrong or needs to be known, the texts of the verdicts among it.
     """
@@ -101,8 +111,13 @@ class SequenceReport:
     camera_source: str = ""
     clocks: ClockOffset | None = None
     damaged: list[str] = field(default_factory=list)
+    scale_known: bool = False
     verdicts: list[Verdict] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+
+    def has_verdict(self, code: str) -> bool:
+        """Whether there is a verdict of this kind."""
+        return any(verdict.code == code for verdict in self.verdicts)
 
     def judge(self, verdicts: list[Verdict]) -> None:
         """Takes verdicts in."""
@@ -111,10 +126,11 @@ class SequenceReport:
 
 
 def inspect_sequence(
-    sequence: Sequence, samples: int = 8, masks: bool = True, clocks: bool = False
+    sequence: Sequence, samples: int = 8, masks: bool = True, clocks: bool = False, depth: list[Verdict] | None = None
 ) -> SequenceReport:
     """Reads `samples` frames spread over the sequence, with or without their masks, and reports what they hold; with
-    `clocks` also by how much time depth and colour are apart, for which it reads some 50 frames more."""
+    `clocks` also by how much time depth and colour are apart, for which it reads some 50 frames more. `depth`:
+    what `DepthDoubts` said before; None: it is asked."""
     times = sequence.timestamps
     intervals = np.diff(times)
     report = SequenceReport(
@@ -130,21 +146,36 @@ def inspect_sequence(
         report.mask_kinds = dict(sequence.mask_kinds()) if masks else {}
     except SequenceError as error:
         report.warnings.append(str(error))
+    doubts = DepthDoubts(sequence, frames)
+    report.judge(depth if depth is not None else doubts.judge() if frames else [])
+    certain = any(verdict.severity == "wrong" for verdict in report.verdicts)
+    report.judge(judge_intrinsics(report.camera))
+    if masks and has_void_id(sequence):
+        report.judge([Verdict("void_id", "doubtful", VOID_TEXT)])
     pairs = _pairs(report, sequence, frames)
     if sequence.ground_truth is not None:
         report.posed_frames = int(np.isfinite(sequence.ground_truth).all((1, 2)).sum())
         report.motion = _motion(sequence.ground_truth)
-        _check_poses(report, doubt_poses(pairs))
+        _check_poses(report, doubt_poses(pairs), doubts)
     report.alignment = measure_alignment(frames)
-    _check_alignment(report)
-    _check_camera(report, pairs)
-    _check_steps(report, sequence)
+    if not certain:  # or it would be blamed on others
+        _check_alignment(report)
+        _check_camera(report, pairs)
+        _check_steps(report, sequence)
     report.clocks = measure_clock_offset(sequence) if clocks else None
     _warn(report, times, frames)
-    if not report.posed_frames and not any(verdict.code == "depth_scale" for verdict in report.verdicts):
+    _check_scale(report, sequence, frames, certain)
+    return report
+
+
+def _check_scale(report: SequenceReport, sequence: Sequence, frames: list[Frame], certain: bool) -> None:
+    """Judges the depth scale by the size of what is seen, where no pose tells more and depth is depth."""
+    if certain or report.has_verdict("depth_scale") or not report.valid_share or report.scale_known:
+        return
+    report.judge(judge_depth_scale(report.depth_scale, report.depth_m[1]))
+    if not report.posed_frames and not report.has_verdict("depth_scale"):
         signs = measure_scale_signs(sequence, frames)
         report.judge([] if signs is None else judge_scale_signs(report.depth_scale, signs))
-    return report
 
 
 def _try(sequence: Sequence, index: int, report: SequenceReport, masks: bool) -> Frame | None:
@@ -191,11 +222,23 @@ def _motion(poses: np.ndarray) -> Motion | None:
     return Motion(summary(distance), summary(turn), float(distance.sum()))
 
 
-def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
-    """Tells what depth images of neighbouring frames say about poses and depth scale."""
+def _check_poses(report: SequenceReport, doubt: PoseDoubt | None, doubts: DepthDoubts) -> None:
+    """Tells what depth images of neighbouring frames, and points triangulated, say about poses and depth scale."""
+    if doubt is not None:
+        report.pose_depth_error = doubt.error
+    if report.verdicts and any(verdict.severity == "wrong" for verdict in report.verdicts):
+        return  # depth or intrinsics would be blamed on the poses
+    points = doubts.points
+    misread = doubt is not None and doubt.wrong_convention
+    if points.tell and not misread:
+        report.scale_known = True
+        factor = points.factor("z")
+        if abs(np.log(factor)) > np.log(LARGEST_RATIO) and points.agree("z"):
+            how = f"points triangulated by the true poses are {1 / factor:.3g} times as far as depth has them"
+            report.judge(judge_scale_by(report.depth_scale, factor, how, SCALE_TOLERANCE))
+            return
     if doubt is None:
         return
-    report.pose_depth_error = doubt.error
     if doubt.wrong_convention:
         text = (
             f"the true poses look like {CONVENTIONS[doubt.convention].description}: read so, neighbouring depth images "
@@ -203,12 +246,12 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None) -> None:
             f"try `pose_convention` {doubt.convention}"
         )
         report.judge([Verdict("poses", "wrong", text)])
-    elif doubt.wrong_scale:
+    elif doubt.wrong_scale and not report.scale_known:
         how = f"with another one neighbouring depth images agree with the poses to {doubt.best:.2%}, with this one "
         report.judge(judge_scale_by(report.depth_scale, 1 / doubt.ratio, f"{how}only to {doubt.error:.2%}"))
     elif doubt.error > 0.05:
-        causes = "wrong intrinsics, depth scale or poses, or little seen twice"
-        text = f"true poses and depth disagree by {doubt.error:.0%}: {causes}"
+        causes = "intrinsics or poses" if report.scale_known else "intrinsics, depth scale or poses"
+        text = f"true poses and depth disagree by {doubt.error:.0%}: wrong {causes}, or little seen twice"
         report.judge([Verdict("poses", "doubtful", text)])
 
 
@@ -222,10 +265,8 @@ def _pairs(report: SequenceReport, sequence: Sequence, frames: list[Frame]) -> l
 
 
 def _check_camera(report: SequenceReport, pairs: list[tuple[Frame, Frame]]) -> None:
-    """Judges intrinsics by themselves, else by pairs of frames."""
-    found = judge_intrinsics(report.camera)
-    report.judge(found)
-    doubt = None if found else doubt_focal_length(pairs)
+    """Judges intrinsics by pairs of frames, unless they are implausible by themselves."""
+    doubt = None if report.has_verdict("intrinsics") else doubt_focal_length(pairs)
     if doubt is not None and doubt.wrong:
         text = (
             f"intrinsics are suspicious: with fx {report.native_camera.fx * doubt.factor:.0f} instead of "
@@ -245,7 +286,8 @@ def _check_steps(report: SequenceReport, sequence: Sequence) -> None:
     side = "before" if doubt.behind > 0 else "after"
     text = (
         f"colour and depth are out of step: depth fits the colour of {count} {side} it better (strength of edges "
-        f"{doubt.best:.2f}, not {doubt.strength:.2f}); pair images of the same time"
+        f"{doubt.best:.2f}, not {doubt.strength:.2f}); pair images of the same time, perhaps with `depth_delay` "
+        f"{-doubt.behind}f"
     )
     report.judge([Verdict("step", "wrong", text)])
 
@@ -267,16 +309,13 @@ def _check_alignment(report: SequenceReport) -> None:
 
 def _warn(report: SequenceReport, times: np.ndarray, frames: list[Frame]) -> None:
     add = report.warnings.append
-    median = report.depth_m[1]
     if report.damaged:
         add(f"{len(report.damaged)} of the sampled frames are damaged; the first: {report.damaged[0]}")
     if frames and not report.valid_share:
         add("no depth at all in the sampled frames")
-    elif not any(verdict.code == "depth_scale" for verdict in report.verdicts):  # the poses tell more
-        report.judge(judge_depth_scale(report.depth_scale, median))
     if frames and 0 < report.valid_share < 0.2:
         add(f"only {report.valid_share:.0%} of the pixels have depth")
-    report.judge(judge_times(times))
+    report.judge(judge_times(times, report.time_source.startswith("nominal")))
     if report.motion is not None and (report.motion.step_m[1] > 0.2 or report.motion.turn_deg[1] > 15):
         add(
             f"large motion between frames (90th percentile {report.motion.step_m[1]:.2f} m, "

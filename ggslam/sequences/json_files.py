@@ -16,6 +16,10 @@ from ggslam.sequences.recording import read_text
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns a camera frame with y up and z backwards (OpenGL, Blender, ARKit) into one with y down and z forward."""
 
+SHORTEST_FOCAL, LONGEST_FOCAL = 0.05, 100.0
+"""Of the longer side of the image: it would see to 84 degrees from the axis, or half a degree in all. Shorter ones are
+in units of the image's width or in millimetres, longer ones in other units of length."""
+
 
 def read_object(path: Path) -> dict[str, Any]:
     """The JSON object of a file. Raises SequenceError if it is missing or none."""
@@ -58,6 +62,21 @@ def number_of(name: object, values: dict[str, Any], key: str) -> float:
 def camera_of(name: object, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
     """A camera; raises SequenceError, naming `name`, for impossible numbers."""
     try:
-        return Camera(int(width), int(height), fx, fy, cx, cy)
+        camera = Camera(int(width), int(height), fx, fy, cx, cy)
+    except ValueError as error:
+        raise SequenceError(f"{name}: {error}") from None
+    side = max(camera.width, camera.height)
+    if not SHORTEST_FOCAL * side <= min(fx, fy) <= max(fx, fy) <= LONGEST_FOCAL * side:
+        raise SequenceError(
+            f"{name}: impossible focal lengths fx {fx:g}, fy {fy:g} of an image of {camera.width}x{camera.height}: "
+            f"expected pixels, {SHORTEST_FOCAL * side:g} to {LONGEST_FOCAL * side:g}"
+        )
+    return camera
+
+
+def check_intrinsics(name: object, fx: float, fy: float, cx: float, cy: float) -> None:
+    """Raises SequenceError, naming `name`, for numbers that are those of no camera, whatever its image's size."""
+    try:
+        Camera(1, 1, fx, fy, cx, cy)
     except ValueError as error:
         raise SequenceError(f"{name}: {error}") from None

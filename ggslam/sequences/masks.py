@@ -13,7 +13,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.mask_ids import InstanceCodes, read_id_table
-from ggslam.sequences.mask_images import mask_kind, read_mask_image
+from ggslam.sequences.mask_images import EQUAL_CHANNELS, MaskImage, mask_kind, read_mask_image
 from ggslam.sequences.pixel_grid import Size, same_aspect
 from ggslam.sequences.recording import ImageFile, image_files, last_number
 
@@ -80,8 +80,9 @@ class MaskReader:
     May be used from several threads.
     """
 
-    def __init__(self, files: Iterable[Path | None]) -> None:
-        """Takes the mask files of all frames of the recording; none is opened yet."""
+    def __init__(self, files: Iterable[Path | None], void_id: int | None = None) -> None:
+        """Takes the mask files of all frames of the recording; none is opened yet. `void_id`: means "unlabelled"."""
+        self._void = void_id
         self._files = [path for path in files if path is not None]
         self._lock = threading.Lock()
         self._prepared = False
@@ -132,15 +133,25 @@ class MaskReader:
         height, width = image.codes.shape
         if expected and (width, height) not in expected:
             self._check_aspect(path, (width, height), expected[0])
+        void = self._void_pixels(image)
         if self._table is None:
-            return image.codes.astype(np.uint16)
+            return np.where(void, 0, image.codes).astype(np.uint16)
         ids, unlisted = self._table.ids(image)
+        ids[void] = 0
+        unlisted &= ~void
         if unlisted.any():
             if not ids.any():
                 raise SequenceError(f"{path}: not one of its ids is listed in {self._table.source}")
             message = "%s and perhaps others: ids that %s does not list count as unlabelled"
             self._warn("unlisted", message, path, self._table.source)
         return ids
+
+    def _void_pixels(self, image: MaskImage) -> np.ndarray:
+        """Where a mask says that nobody knows what is there, bool [H, W]."""
+        if self._void is None:
+            return np.zeros(image.codes.shape, bool)
+        stored = self._void * EQUAL_CHANNELS if image.equal_channels else self._void
+        return np.asarray(image.codes == stored)
 
     def _check_aspect(self, path: Path, found: Size, expected: Size) -> None:
         if not same_aspect(found, expected):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.calibration import camera_or_calibration, distortion_entry, number_entry, read_calibration
-from ggslam.sequences.json_files import camera_of
+from ggslam.sequences.json_files import check_intrinsics
 from ggslam.sequences.recording import Calibration, OwnCamera, Recording
 
 COUNTS = (0, 4, 5, 8)
@@ -61,7 +61,7 @@ def _numbers_of(intrinsics: str) -> tuple[Calibration, np.ndarray | None]:
         wanted = "4 numbers 'fx fy cx cy', or these and up to 8 of distortion"
         raise SequenceError(f"`intrinsics`: expected {wanted}, found '{intrinsics[:80]}'")
     fx, fy, cx, cy, *coefficients = numbers
-    camera_of("`intrinsics`", 1, 1, fx, fy, cx, cy)
+    check_intrinsics("`intrinsics`", fx, fy, cx, cy)
     count = next(count for count in COUNTS if count >= len(coefficients))
     padded = np.array(coefficients + [0.0] * (count - len(coefficients)))
     return (fx, fy, cx, cy), padded if count else None

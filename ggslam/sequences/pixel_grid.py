@@ -8,8 +8,11 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
+from ggslam.sequences.json_files import camera_of
+from ggslam.sequences.orientation import QUARTER_TURNS, orientation_of
+from ggslam.sequences.orientation import WORDS as ORIENTATIONS
 from ggslam.sequences.recording import FrameFiles, ImageFile, Recording
-from ggslam.sequences.registration import DepthRegistration
+from ggslam.sequences.registration import DepthRegistration, undistorted_rays
 from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
 from ggslam.sequences.upsampling import upsample_depth
 from ggslam.sequences.valid_pixels import within_source
@@ -50,7 +53,8 @@ class ImageGeometry:
     Attributes:
         camera: intrinsics of the images that come out.
         native_camera: the same before scaling.
-        scale: of one to the other; None was given: 1, of much finer colour what leaves `USUAL_PIXELS`.
+        usual: scale of one to the other that is usual: 1, of much finer colour what leaves `USUAL_PIXELS`.
+        scale: of `camera` to that of usual size.
         finer: whether depth is brought to finer colour.
         valid: bool [H, W], where images of `camera` show something; None: everywhere.
         color_size, depth_size: sizes (width, height) that every stored image must have.
@@ -60,11 +64,8 @@ class ImageGeometry:
         self, recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size, scale: float | None
     ) -> None:
         if recording.depth_camera is None and not same_aspect(color_size, depth_size):
-            raise SequenceError(
-                f"{files.depth}: depth is {_text(depth_size)}, but colour {files.color.name} is {_text(color_size)}: "
-                "not the same view at another resolution (the calibration of a depth camera beside the colour camera "
-                "would tell how they belong together)"
-            )
+            found = f"{files.depth}: depth is {_text(depth_size)}, but colour {files.color.name} is {_text(color_size)}"
+            raise SequenceError(f"{found}: {_why_other_aspect(recording, files, color_size, depth_size)}")
         self.color_size, self.depth_size = color_size, depth_size
         self._common = color_camera = _color_camera(recording, color_size, files.color)
         self._warp: np.ndarray | None = None
@@ -74,17 +75,18 @@ class ImageGeometry:
         if recording.depth_camera is not None:
             self.native_camera = self._register(recording, depth_size, files)
         elif recording.depth_calibration is not None:
-            self.native_camera = Camera(*depth_size, *recording.depth_calibration)
+            self.native_camera = camera_of(recording.path, *depth_size, *recording.depth_calibration)
             self._align_color(color_camera.resize(*depth_size))
         else:
             self.finer = color_size[0] >= FINER * depth_size[0]
             size = color_size if self.finer else min(color_size, depth_size, key=lambda s: s[0] * s[1])
             self.native_camera = color_camera.resize(*size)
-        if scale is None:
-            most = USUAL_PIXELS / (self.native_camera.width * self.native_camera.height)
-            scale = min(1.0, most**0.5) if self.finer else 1.0
-        self.scale: float = scale
-        self.camera = self.native_camera.scale(scale)
+        most = USUAL_PIXELS / (self.native_camera.width * self.native_camera.height)
+        self.usual: float = min(1.0, most**0.5) if self.finer else 1.0
+        self.scale: float = 1.0 if scale is None else scale
+        if self.scale * self.usual > 1 + 1e-6:
+            raise SequenceError(f"`scale`: expected a number above 0 and at most {1 / self.usual:g}, found {scale}")
+        self.camera = self.native_camera.scale(self.scale * self.usual)
         # Finer colour is brought to its last size first: it may have many times as many pixels.
         self._work = self.camera if self.finer else self.native_camera
         self._maps = _undistortion(self._work, recording.distortion, recording.fisheye)
@@ -216,11 +218,42 @@ class ImageGeometry:
         return resize_mask(mask, self.camera.width, self.camera.height, shared)
 
 
+def _why_other_aspect(recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size) -> str:
+    """What may be the matter with colour and depth of such sizes, and what to do about it."""
+    if same_aspect(color_size, (depth_size[1], depth_size[0])):
+        tag = orientation_of(files.color)
+        if tag in QUARTER_TURNS and not recording.upright:
+            return f"colour is stored {ORIENTATIONS[tag]} (orientation tag {tag}); try `upright`"
+        return "one of them is stored turned by 90 degrees; turn it back, so that both show the same view"
+    return (
+        "not the same view at another resolution (the calibration of a depth camera beside the colour camera would "
+        "tell how they belong together)"
+    )
+
+
+def rays_of_depth(recording: Recording, files: FrameFiles, color_size: Size, depth_size: Size) -> np.ndarray:
+    """Viewing rays with z = 1 of the depth image of a frame as stored, float32 [H, W, 3]."""
+    beside = recording.depth_camera
+    if beside is not None:
+        return undistorted_rays(beside.camera.resize(*depth_size), beside.distortion, beside.fisheye)
+    if recording.depth_calibration is not None:
+        camera = Camera(*depth_size, *recording.depth_calibration)
+    else:
+        camera = (files.camera or _color_camera(recording, color_size, files.color)).resize(*depth_size)
+    return undistorted_rays(camera, recording.distortion, recording.fisheye)
+
+
+def _source(recording: Recording) -> str:
+    """Where the intrinsics come from, for errors."""
+    source = recording.camera_source
+    return source if source.startswith("`") else f"{recording.path}, {source}" if source else str(recording.path)
+
+
 def _color_camera(recording: Recording, color_size: Size, color_file: ImageFile) -> Camera:
     if recording.camera is None:
         if recording.calibration is None:
             raise SequenceError(f"{recording.path}: no intrinsics")
-        return Camera(*color_size, *recording.calibration)
+        return camera_of(_source(recording), *color_size, *recording.calibration)
     stated = (recording.camera.width, recording.camera.height)
     if not same_aspect(stated, color_size):
         raise SequenceError(

@@ -14,6 +14,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
+from ggslam.sequences.depth_kind import PLAIN, DepthKind
 from ggslam.system.foreign import read_foreign_text
 
 T = TypeVar("T")
@@ -218,7 +219,9 @@ class Recording:
         calibration: (fx, fy, cx, cy) for the size of the colour image; only when `camera` is None.
         depth_calibration: (fx, fy, cx, cy) for the size of the depth image when it is another camera's.
         depth_scale: depth units per metre.
-        invalid_depth: raw depth value that means "nothing measured" beside 0, or None.
+        depth_kind: what the numbers of depth images mean.
+        upright: whether colour images are turned as their orientation tag says.
+        void_id: id of masks that means "unlabelled", besides 0; None: none does.
         depth_camera: of depth images that are to be registered to the colour images, or None.
         distortion: OpenCV coefficients (k1, k2, p1, p2, k3[, k4, k5, k6]) of both images (of the colour image alone
             when there is a `depth_camera`), or None.
@@ -243,7 +246,9 @@ class Recording:
     camera: Camera | None = None
     calibration: Calibration | None = None
     depth_calibration: Calibration | None = None
-    invalid_depth: int | None = None
+    depth_kind: DepthKind = PLAIN
+    upright: bool = False
+    void_id: int | None = None
     depth_camera: DepthCamera | None = None
     distortion: np.ndarray | None = None
     fisheye: bool = False

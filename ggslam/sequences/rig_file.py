@@ -14,8 +14,8 @@
         intrinsics: [fx, fy, cx, cy]      or camera: FILE; else the recording's own
     tolerance: 0.02                       seconds between images that count as taken together; optional
 
-An entry also takes `format`, `masks`, `depth_scale`, `depth_camera`, `min_confidence` and `pose_convention`, which mean
-what the arguments of `open_sequence` of these names do.
+An entry also takes `format`, `masks`, `depth_scale`, `depth_camera`, `min_confidence`, `pose_convention`, `depth_kind`,
+`depth_delay`, `upright` and `void_id`, which mean what the arguments of `open_sequence` of these names do.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from ggslam.system.plain_yaml import PlainYamlError, parse_yaml, repeated_key
 FILE = "rig.yaml"
 """The file of a rig in a folder of its own."""
 _PATHS = ("masks", "depth_camera", "camera")
-_TEXTS = ("format", "pose_convention")
+_TEXTS = ("format", "pose_convention", "depth_kind", "depth_delay")
 _KEYS = (
     "name", "recording", "T_rig_camera", "time_offset", "scale", "intrinsics", "topics", "depth_scale",
-    "min_confidence", *_PATHS, *_TEXTS,
+    "min_confidence", "upright", "void_id", *_PATHS, *_TEXTS,
 )  # fmt: skip
 _LARGEST_TOLERANCE = 10.0
 _LARGEST_OFFSET = 1e12
@@ -166,6 +166,12 @@ def _options(path: Path, place: str, entry: dict[str, Any]) -> dict[str, Any]:
             options[key] = path.parent / given_path(entry[key]) if key in _PATHS else entry[key]
     if "depth_scale" in entry:
         options["depth_scale"] = _number(place, entry, "depth_scale", 0.0, np.inf)
+    if "upright" in entry:
+        if not isinstance(entry["upright"], bool):
+            raise SequenceError(f"{place}: expected 'upright' to be true or false, found '{entry['upright']}'")
+        options["upright"] = entry["upright"]
+    if "void_id" in entry:
+        options["void_id"] = int(_number(place, entry, "void_id", 1, 2**24 - 1) or 0)
     if "min_confidence" in entry:
         options["min_confidence"] = entry["min_confidence"]
     if "topics" in entry:

@@ -20,10 +20,11 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.sequences.depth_kind import PLAIN, DepthKind
 from ggslam.sequences.images import read_color, read_confidence, read_depth
 from ggslam.sequences.masks import MaskReader
 from ggslam.sequences.moving_pixels import MovingPixels
-from ggslam.sequences.pixel_grid import ImageGeometry, image_size
+from ggslam.sequences.pixel_grid import ImageGeometry, image_size, rays_of_depth
 from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
 from ggslam.sequences.valid_pixels import common_fill, fill_of
@@ -64,11 +65,14 @@ class Sequence:
         format: name of the format.
         path: folder or file of the recording.
         camera: intrinsics of the delivered images.
-        native_camera: the same before `scale`.
-        scale: of the delivered images to the native ones.
+        native_camera: of images as stored.
+        scale: of the delivered images to those that come by default, see `default_camera`.
         finer: whether colour is much finer than depth, which is brought to colour.
         valid: bool [H, W], where delivered images show something; None: everywhere.
         depth_scale: units per metre of the stored depth images.
+        depth_kind: what the numbers of depth images mean.
+        upright: whether colour images are turned as their orientation tag says.
+        void_id: id of stored masks that means "unlabelled" besides 0, or None.
         color_size, depth_size: (width, height) of the stored images.
         lens: distortion that is undone and intrinsics that change, in words; "" for a pinhole camera that stays one.
         min_confidence: depth less sure than this is dropped; None: the recording has no confidence images.
@@ -97,11 +101,11 @@ class Sequence:
 
         Raises:
             SequenceError: the first frame is damaged (with on_bad_frame="skip": every frame is), files are missing, or
-                `scale` is not in (0, 1] or leaves hardly an image.
+                `scale` leaves hardly an image, or more than is stored.
         """
         if on_bad_frame not in ("error", "skip"):
             raise SequenceError(f"`on_bad_frame`: expected 'error' or 'skip', found '{on_bad_frame}'")
-        if scale is not None and not (math.isfinite(scale) and 0 < scale <= 1):
+        if scale is not None and not (math.isfinite(scale) and scale > 0):
             raise SequenceError(f"`scale`: expected a number above 0 and at most 1, found {scale}")
         self.min_confidence: int | None = None
         if any(entry.confidence is not None for entry in recording.files):
@@ -115,13 +119,16 @@ class Sequence:
         self.name: str = recording.path.stem if recording.path.is_file() else recording.path.name
         self.format: str = recording.format
         self.depth_scale: float = recording.depth_scale
+        self.depth_kind: DepthKind = recording.depth_kind
+        self.upright: bool = recording.upright
+        self.void_id: int | None = recording.void_id
         self.instance_names: dict[int, str] = dict(recording.instance_names)
         self.pose_source: str = recording.pose_source
         self.pose_problem = recording.pose_problem
         self.time_source: str = recording.time_source
         self.camera_source: str = recording.camera_source
         self.warnings: list[str] = list(recording.warnings)
-        self._masks = MaskReader(entry.mask for entry in recording.files)
+        self._masks = _mask_reader(recording)
         masked = self._select(selection)
         if masked < len(self) and any(entry.mask is not None for entry in recording.files):
             self.warnings.append(f"{len(self) - masked} of {len(self)} frames have no mask")
@@ -209,7 +216,11 @@ class Sequence:
         self._process = os.getpid()
         if self._reopen is not None:
             self._recording = self._reopen()
-            self._masks = MaskReader(entry.mask for entry in self._recording.files)
+            self._masks = _mask_reader(self._recording)
+
+    def default_camera(self, scale: float = 1.0) -> Camera:
+        """The camera of images that come with `scale`; 1: by default."""
+        return self.native_camera.scale(scale * self._geometry.usual)
 
     @property
     def selection(self) -> range:
@@ -335,14 +346,19 @@ class Sequence:
 
     def _read(self, source: int) -> tuple[np.ndarray, np.ndarray]:
         files = self._recording.files[source]
-        depth = read_depth(files.depth, self._recording.depth_scale, self._recording.invalid_depth)
+        recording = self._recording
+        depth = read_depth(files.depth, recording.depth_scale, recording.depth_kind.none)
         if files.confidence is not None:
             confidence = read_confidence(files.confidence)
             if confidence.shape != depth.shape:
                 found, expected = (f"{a.shape[1]}x{a.shape[0]}" for a in (confidence, depth))
                 raise SequenceError(f"{files.confidence}: expected confidence of {expected} like depth, found {found}")
-            depth = np.where(confidence < self._recording.min_confidence, np.float32(0), depth)
-        return read_color(files.color), depth
+            depth = np.where(confidence < recording.min_confidence, np.float32(0), depth)
+        color = read_color(files.color, recording.upright)
+        if recording.depth_kind != PLAIN:
+            rays = rays_of_depth(recording, files, image_size(color), image_size(depth))
+            depth = recording.depth_kind.to_z(depth, rays, recording.depth_scale)
+        return color, depth
 
     def _look_for_fill(self, geometry: ImageGeometry, color: np.ndarray) -> None:
         """Leaves out what is of one colour from a corner on in all images, if it is so in the first one."""
@@ -352,7 +368,7 @@ class Sequence:
         others = []
         for source in self._selection[:: max(1, len(self._selection) // FILL_LOOKS)][1 : FILL_LOOKS + 1]:
             try:
-                others.append(read_color(self._recording.files[source].color))
+                others.append(read_color(self._recording.files[source].color, self._recording.upright))
             except SequenceError:
                 continue
         found = common_fill(color, fill, others)
@@ -385,6 +401,10 @@ def _scale_note(stated: Camera, size: tuple[int, int]) -> str:
     """That intrinsics are brought to the size of the images, in words; "" where they are of that size."""
     own = (stated.width, stated.height)
     return "" if own == size else f", scaled from {own[0]}x{own[1]} to images of {size[0]}x{size[1]}"
+
+
+def _mask_reader(recording: Recording) -> MaskReader:
+    return MaskReader((entry.mask for entry in recording.files), recording.void_id)
 
 
 def _lens(recording: Recording) -> str:

@@ -16,7 +16,9 @@ from ggslam.scene.camera import Camera
 Severity = Literal["doubtful", "wrong"]
 
 SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 6.0
-"""Metres; a median depth outside suggests a wrong depth scale: RGB-D cameras see rooms."""
+"""Metres; a median depth outside suggests a wrong depth scale in rooms."""
+FARTHEST = 60.0
+"""Metres, beyond the median depth of what is seen outdoors."""
 USUAL_MEDIAN_DEPTH = 1.8
 """Metres; of rooms."""
 MILLIMETRES = 1000.0
@@ -53,11 +55,12 @@ class Verdict:
     text: str
 
 
-def usual_scale(scale: float) -> float:
-    """The depth scale in use that is nearest to one, or the power of ten, or that itself if none is near."""
+def usual_scale(scale: float, tolerance: float = 0.15) -> float:
+    """The depth scale in use that is nearest to one, or the power of ten, or that itself if none is so near (natural
+    logarithm)."""
     power = float(10.0 ** round(np.log10(scale)))
     nearest = min((*USUAL_SCALES, power), key=lambda known: abs(np.log(known / scale)))
-    return nearest if abs(np.log(nearest / scale)) < 0.15 else float(f"{scale:.3g}")
+    return nearest if abs(np.log(nearest / scale)) < tolerance else float(f"{scale:.3g}")
 
 
 def judge_depth_scale(scale: float, median_m: float) -> list[Verdict]:
@@ -66,9 +69,25 @@ def judge_depth_scale(scale: float, median_m: float) -> list[Verdict]:
         return []
     candidates = {*USUAL_SCALES, *(scale * 10.0**power for power in range(-4, 5)), *(scale * f for f in (5, 1 / 5))}
     likely = min(candidates, key=lambda known: abs(np.log(median_m * scale / known / USUAL_MEDIAN_DEPTH)))
-    text = f"depth scale {scale:g} is suspicious: the median depth is {median_m:.3g} m"
     found = median_m * scale / likely
-    return [Verdict("depth_scale", "wrong", f"{text}; try `depth_scale` {likely:g}, with which it is {found:.2g} m")]
+    remedy = f"try `depth_scale` {likely:g}, with which it is {found:.2g} m"
+    if LARGEST_MEDIAN_DEPTH < median_m <= FARTHEST:
+        text = f"depth scale {scale:g} is doubtful if this is a room: the median depth is {median_m:.3g} m"
+        return [Verdict("depth_scale", "doubtful", f"{text}; outdoors it may be right, indoors {remedy}")]
+    text = f"depth scale {scale:g} is suspicious: the median depth is {median_m:.3g} m"
+    return [Verdict("depth_scale", "wrong", f"{text}; {remedy}")]
+
+
+def judge_inverse_scale(scale: float, median_m: float) -> list[Verdict]:
+    """Whether a depth scale is metres per unit instead of units per metre."""
+    read_so = median_m * scale * scale
+    if not (scale < 1 and median_m > FARTHEST and SMALLEST_MEDIAN_DEPTH <= read_so <= FARTHEST):
+        return []
+    text = (
+        f"depth scale {scale:g} looks like metres per unit, with units per metre expected: the median depth is "
+        f"{median_m:.3g} m; try `depth_scale` {1 / scale:.6g} (1 / {scale:g}), with which it is {read_so:.2g} m"
+    )
+    return [Verdict("depth_scale", "wrong", text)]
 
 
 @dataclass(frozen=True)
@@ -112,9 +131,10 @@ def judge_scale_signs(scale: float, signs: ScaleSigns) -> list[Verdict]:
     return [Verdict("depth_scale", "doubtful", text)]
 
 
-def judge_scale_by(scale: float, ratio: float, how: str) -> list[Verdict]:
-    """That lengths come out `ratio` times too large with `scale` units per metre, as `how` says."""
-    likely = usual_scale(scale * ratio)
+def judge_scale_by(scale: float, ratio: float, how: str, tolerance: float = 0.15) -> list[Verdict]:
+    """That lengths come out `ratio` times too large with `scale` units per metre, as `how` says; the ratio is known to
+    `tolerance` (natural logarithm)."""
+    likely = usual_scale(scale * ratio, tolerance)
     text = f"depth scale {scale:g} is suspicious: {how}; try `depth_scale` {likely:g}"
     return [Verdict("depth_scale", "wrong", text)]
 
@@ -136,8 +156,9 @@ def judge_intrinsics(camera: Camera) -> list[Verdict]:
     return []
 
 
-def judge_times(timestamps: np.ndarray) -> list[Verdict]:
-    """What timestamps [n] in seconds, in the order of the frames, say."""
+def judge_times(timestamps: np.ndarray, nominal: bool = False) -> list[Verdict]:
+    """What timestamps [n] in seconds, in the order of the frames, say. `nominal`: they only count frames, by the
+    numbers in the images' names."""
     intervals = np.diff(timestamps)
     verdicts = []
     back = np.flatnonzero(intervals <= 0)
@@ -152,7 +173,9 @@ def judge_times(timestamps: np.ndarray) -> list[Verdict]:
     if len(gaps):
         missing, longest = int(np.rint(intervals[gaps] / usual - 1).sum()), gaps[intervals[gaps].argmax()]
         if missing > MISSING_SHARE * len(timestamps) or intervals[longest] > max(MISSING_S, 6 * usual):
-            text = f"about {missing} frames are missing in {len(gaps)} gaps of the timestamps"
-            text += f" (the longest: {intervals[longest]:.2f} s before frame {longest + 1})"
+            place = "numbers of the images" if nominal else "timestamps"
+            length = f"{round(intervals[longest] / usual) - 1} frames" if nominal else f"{intervals[longest]:.2f} s"
+            text = f"about {missing} frames are missing in {len(gaps)} gaps of the {place}"
+            text += f" (the longest: {length} before frame {longest + 1})"
             verdicts.append(Verdict("frames_missing", "doubtful", f"{text}; record to a faster disk, or fewer pixels"))
     return verdicts

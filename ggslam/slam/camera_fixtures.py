@@ -26,6 +26,9 @@ FEWEST, STILL_SHARE, AGAINST = 6, 0.3, 3
 be of the world."""
 SEEDS, SEED_SHARE = 2, 0.05
 """So many look through where something would be in the world, at this share of its pixels."""
+FARTHEST_M = 5.0
+"""A tool, a bonnet, a wing reach no farther; what is still in the image beyond is depth that a network guessed alike in
+frame after frame."""
 LEAST_SHARE = 0.005
 """Of the image: less is left alone."""
 NEARER, NEARER_THAN_SCENE = 1.5, 0.5
@@ -109,6 +112,7 @@ class CameraFixtures:
         assert self.counts is not None
         fixed, still, world = self.counts
         candidates = (still >= max(FEWEST, STILL_SHARE * self.comparisons)) & (still >= AGAINST * world)
+        candidates &= depth < FARTHEST_M
         found = parts_with_seeds(candidates & (fixed >= SEEDS), candidates, SEED_SHARE)
         if found.mean() < LEAST_SHARE:
             return

@@ -73,6 +73,8 @@ class ColorPoses:
         it."""
         if found.status in (TrackingStatus.LOST, TrackingStatus.FIRST) or not self.active or self.live:
             return found
+        if found.still:
+            return found
         if not self._is_due or not self.mapper.keyframes:
             return found
         # The map is where its keyframes are by now, the tracker's surface where they were when they came.
@@ -86,7 +88,7 @@ class ColorPoses:
     def note(self, frame: Frame, found: TrackingResult) -> None:
         """Keeps the image of the frame that `poses` took last, and that is no keyframe, if it is to be aligned at the
         end and there is memory for it."""
-        if not self.active or found.status in (TrackingStatus.LOST, TrackingStatus.FIRST):
+        if not self.active or found.still or found.status in (TrackingStatus.LOST, TrackingStatus.FIRST):
             return
         number, depth = len(self.poses.frames) - 1, found.median_depth_m
         if not self._tells_more(depth) and number >= UNDECIDED:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.movers.evidence import CoarseView
 from ggslam.movers.outdated import (
     EarlierView,
@@ -122,7 +122,7 @@ class EarlierViews:
             rows = np.linspace(0, keyframe.depth.shape[0] - 1, SAMPLES).astype(int)
             columns = np.linspace(0, keyframe.depth.shape[1] - 1, SAMPLES).astype(int)
             grid = np.ix_(rows, columns)
-            depth = keyframe.depth[grid].astype(np.float32) / DEPTH_UNITS_PER_METRE
+            depth = keyframe.depth[grid].astype(np.float32) * keyframe.depth_unit
             points = (keyframe.camera.rays()[grid] * depth[..., None]).reshape(-1, 3).astype(float)
             points = points[points[:, 2] > 0]
             seen = newest.camera.project(transform_points(points, T_newest_world @ keyframe.T_world_camera))[2]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ggslam.mapping.color_changes import scale_colors
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.votes import vote_labels
@@ -170,6 +171,12 @@ class GaussianPager:
         moved = np.flatnonzero(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0).tolist()
         with delay_interrupts():
             self.cells.change(lambda gaussians: move_with_keyframes(gaussians, T_new_old), moved)
+
+    def scale_colors(self, gain: np.ndarray) -> None:
+        """Gaussians on disk get another exposure: a gain for each channel [3]."""
+        if self.cells is not None:
+            with delay_interrupts():
+                self.cells.change(lambda gaussians: scale_colors(gaussians, gain))
 
     def vote_sizes(self) -> np.ndarray:
         """Gaussians on disk by the object with the most votes, int64 [65536]."""

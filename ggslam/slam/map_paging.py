@@ -142,6 +142,10 @@ class MapPager:
             left = [number for number in left if number not in set(stage)]
         self._trainable = None
 
+    def scale_colors(self, gain: np.ndarray) -> None:
+        """See `Residency`."""
+        self._gaussians.scale_colors(gain)
+
     # --- loops -------------------------------------------------------------------------------------------------------
 
     def move_keyframes(self, T_new_old: np.ndarray) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import torch
@@ -170,8 +170,5 @@ def _stretches(numbers: Sequence[int]) -> list[tuple[int, int]]:
 
 def _numbered(keyframe: Keyframe, number: int) -> Keyframe:
     """A keyframe with another number, in the host's memory."""
-    k = keyframe
-    return Keyframe(
-        number, k.frame_index, k.timestamp, k.camera, k.color, k.depth, k.T_camera_world, k.mask, k.exposure,
-        k.iterations, None, k.camera_number, k.instant, k.moving,
-    )  # fmt: skip
+    values = {of.name: getattr(keyframe, of.name) for of in fields(Keyframe)}
+    return Keyframe(**{**values, "index": number, "archive": None})

@@ -11,6 +11,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError
 from ggslam.features.orb import FeatureView
+from ggslam.geometry.scene_size import scene_scale
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
@@ -28,7 +29,6 @@ from ggslam.system.process_memory import trim
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.rig_engine import RigTrackingEngine, RigView
-from ggslam.tracking.scale import scene_scale
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 

@@ -27,6 +27,7 @@ from ggslam.mapping.class_numbers import ClassNumbers
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
+from ggslam.mapping.cpu.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cpu.neighbours import NeighbourIndex
 from ggslam.mapping.identity import IdentityTimes
@@ -86,6 +87,7 @@ from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.residual_noise import ResidualNoise
 from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.still_camera import SmallFrame, StillCamera
 from ggslam.tracking.surface import MeasuredSurface, _Part
 from ggslam.tracking.tracker import TrackerState
 
@@ -208,6 +210,11 @@ def _go_on(times: SlamTimes) -> None:
     times._started = time.perf_counter() - times.wall if times.wall > 0 else None
 
 
+def _fit_to_scene(slam: Slam) -> None:
+    """Settings of the parts, which are not saved, follow the scene again."""
+    slam.use_scale(slam.scale)
+
+
 def _settings_classes(kind: type) -> set[type]:
     """A settings class and those of its groups."""
     found = {kind}
@@ -228,8 +235,10 @@ def _names(*names: str) -> frozenset[str]:
 
 RULES: Rules = {
     **dict.fromkeys(_settings_classes(Config) - {Config}, Rule(checked=True)),
-    Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device"),
-    RigSlam: _but("camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine"),
+    Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device", after=_fit_to_scene),
+    RigSlam: _but(
+        "camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine", after=_fit_to_scene
+    ),
     SlamTimes: _but("_started", growing=_names("tracking_by_frame"), after=_go_on),
     ColorPoses: _but("mapper", "poses", "state", growing=_names("images")),
     FramePoses: Rule(growing=_names("frames")),
@@ -244,7 +253,7 @@ RULES: Rules = {
     CoarseView: Rule(fixed=_names("depth", "near", "far", "whole", "smooth")),
     ObjectMasks: _but("settings", "_segment"),
     # tracking
-    GicpTracker: _but("_given_engine", "_features"),
+    GicpTracker: _but("_given_engine"),
     FeatureTracker: _but("features", "_extractor"),
     TrackerState: _but("camera", "context", "target"),
     CameraMotion: _but("reference"),
@@ -272,7 +281,7 @@ RULES: Rules = {
     ActiveKeyframes: _but("settings"),
     Revisits: _but("settings"),
     # mapping
-    CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_standard_adam"),
+    CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_adam_of_pixel"),
     GaussianMap: Rule(save=_save_map, take=_take_map),
     Keyframe: Rule(fixed=_names("color", "depth", "mask", "moving")),
     CpuIdentityLearner: _but("settings", "seed"),
@@ -281,10 +290,10 @@ RULES: Rules = {
     # plain values
     **dict.fromkeys(
         (Camera, CameraFixtures, Trail, Track, MoverSight, Patch, RigidTracker, DepthEdges, DepthNoise,
-         ResidualNoise, KeyframeKind,
+         ResidualNoise, StillCamera, SmallFrame, KeyframeKind,
          FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
-         KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, IdentityTimes, CpuClassTable, ClassNumbers,
-         IdentityClassifier,
+         KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, KeyframeExposures, IdentityTimes, CpuClassTable,
+         ClassNumbers, IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
          ShutterTimes, RigClock, EarlierViews, EarlierView, KeyframeParts, FramePoints,

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop: frames in, trajectory and map out.
 
-    sequence = open_sequence("recording", scale=0.5)
-    slam = Slam(sequence.camera)
-    for frame in sequence.stream():
-        slam.step(frame)
-    result = slam.finish()
+sequence = open_sequence("recording", scale=0.5)
+slam = Slam(sequence.camera)
+for frame in sequence.stream():
+    slam.step(frame)
+result = slam.finish()
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ import numpy as np
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
 from ggslam.features.orb import FeatureView
+from ggslam.geometry.scene_size import scene_scale
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.scale import scale_settings as scale_mapping
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
@@ -50,8 +52,9 @@ from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
 from ggslam.tracking.keyframes import KeyframePolicy
-from ggslam.tracking.scale import scale_settings, scene_scale
+from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.still_camera import still_notes
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 TRIM_EVERY = 8
@@ -94,7 +97,7 @@ class Slam:
         self.mapper.extra_loss = extra_loss
         self.policy = KeyframePolicy(self.config.keyframes)
         self.scale = 1.0
-        """Size of the scene against a room's, see `tracking.scale`."""
+        """Size of the scene against a room's, see `geometry.scene_size`."""
         self.poses = FramePoses()
         self.dropped_frames: list[int] = []
         self.refine_iterations = 0
@@ -232,6 +235,7 @@ class Slam:
         try:
             if steps:
                 if not begin:
+                    self.mapper.use_typical_exposure(at_end=True)
                     self.color_poses.align_keyframes()
                     self.mapper.drop_hidden()
                 self.mapper.refine(steps, note, begin)
@@ -253,7 +257,8 @@ class Slam:
             gaussians, self._parts.keyframes(), self._parts.frames(), self.times, self.mapper.times,
             self.dropped_frames, self.refine_iterations, objects, self._parts.events(),
             self._places(gaussians, cells), cells, None if self.pager is None else self.pager.report(),
-            [*self._notes, *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
+            [*self._notes, *still_notes(self.tracker.state.still.frames, len(self.frames)),
+             *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
              *self.earlier_views.notes(),
              *([] if self.pager is None else self.pager.budget.notes)],
             None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
@@ -378,12 +383,14 @@ class Slam:
         if self._noise is not None or not self.mapper.keyframes:  # a map made before keeps what it was trained with
             self.mapper.depth_sigma = noise.sigma(median_depth)
         if median_depth > 0:
+            self.mapper.pixel_m = median_depth / self.camera.fx
             self.mapper.depth_noise_px = noise.in_pixels(median_depth, self.camera.fx)
         self._noise = noise
 
     def use_scale(self, scale: float) -> None:
-        """Fits the tracker to a scene of this size; before the first keyframe."""
+        """Fits tracker and mapper to a scene of this size; before the first keyframe."""
         self.scale, self.tracker.settings = scale, scale_settings(self.config.tracking, scale)
+        self.mapper.settings = scale_mapping(self.config.mapping, scale)
         self.surface.settings = self.tracker.settings.target
 
     def _follow_moves(self) -> None:

@@ -51,11 +51,11 @@ class Shutter:
         """Colour uint8 [H, W, 3] of a frame; `poses` T_world_camera [n, 4, 4] of all frames."""
         moments = self.blur * np.linspace(-0.5, 0.5, MOMENTS if self.blur else 1)
 
-        def exposed(part: Camera, offset: float) -> np.ndarray:
+        def expose(part: Camera, offset: float) -> np.ndarray:
             views = [view(part, pose) for pose in poses_at(poses, frame, offset + moments)]
             return np.rint(np.mean(views, 0, np.float32)).astype(np.uint8)
 
-        return self._roll(exposed, camera, 0.0)
+        return self._roll(expose, camera, 0.0)
 
     def depth(self, view: View, camera: Camera, poses: np.ndarray, frame: int) -> np.ndarray:
         """Depth float32 [H, W], metres, of a frame."""
@@ -66,10 +66,10 @@ class Shutter:
         return self._sharp(view, camera, poses, frame, 0.0)
 
     def _sharp(self, view: View, camera: Camera, poses: np.ndarray, frame: int, delay: float) -> np.ndarray:
-        def seen(part: Camera, offset: float) -> np.ndarray:
+        def look(part: Camera, offset: float) -> np.ndarray:
             return view(part, poses_at(poses, frame, np.array([offset]))[0])
 
-        return self._roll(seen, camera, delay)
+        return self._roll(look, camera, delay)
 
     def _roll(self, image: Callable[[Camera, float], np.ndarray], camera: Camera, offset: float) -> np.ndarray:
         """Bands of rows one below the other, each of its own moment about `offset`."""

@@ -35,12 +35,11 @@ def hold_to_features(
     """
     if found.overlap >= enough_overlap and not found.degenerate:
         return found  # geometry is finer than features, which blur and a late shutter shift
-    needed = KEPT * shared.count_explained(T_start)
-    if shared.count_explained(found.T_world_camera) >= needed:
+    if shared.keeps(found.T_world_camera, T_start, KEPT):
         return found
     if found.degenerate:
         T = follow_weakly(found, T_start, PointSpread.of(points.read(), noise))
-        if shared.count_explained(T) >= needed:
+        if shared.keeps(T, T_start, KEPT):
             return replace(found, T_world_camera=T)
     return found if found.overlap >= enough_overlap else replace(found, T_world_camera=T_start.copy())
 

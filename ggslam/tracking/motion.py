@@ -54,7 +54,9 @@ class CameraMotion:
     def watch(self, color: np.ndarray, camera: Camera) -> None:
         """Sees the next frame's colour uint8 [H, W, 3]: `turned`."""
         before, self.small = self.small, small_image(color)
-        step = np.eye(4) if before is None else image_turn(before, self.small, camera)
+        step = (
+            np.eye(4) if before is None or before.shape != self.small.shape else image_turn(before, self.small, camera)
+        )
         self.turned = self.turned @ step if self.lost else step
 
     def predict(self) -> np.ndarray:

@@ -22,6 +22,8 @@ DISHONEST = 2.5
 """The noise is taken to be larger when residuals are this many times as large as it, and as the surface's own."""
 SURFACE_SIGMA = 1e-3
 """Metres by which points of an exact camera miss a surface gathered in voxels."""
+ROOM_DEPTH = 1.25
+"""Metres; voxels of nearer scenes are smaller, and so is what they cost."""
 _MEDIAN_OF_NORMAL = 0.6745
 
 
@@ -39,6 +41,11 @@ class ResidualNoise:
     residuals: list[tuple[float, float]] = field(default_factory=list)
     frames: int = 0
     hidden: float = 1.0
+
+    @property
+    def sigma(self) -> float | None:
+        """Robust standard deviation in metres of the distances in the latest looks; None: too few so far."""
+        return float(np.median([sigma for _, sigma in self.residuals])) if len(self.residuals) >= FEWEST else None
 
     def due(self) -> bool:
         """Whether the next frame is looked at; counts it."""
@@ -60,7 +67,7 @@ class ResidualNoise:
         self.residuals = [*self.residuals[1 - LATEST :], (float(np.median(points.z[matched])), sigma)]
         if len(self.residuals) < FEWEST:
             return noise
-        ratios = [sigma / max(noise.sigma(z), SURFACE_SIGMA) for z, sigma in self.residuals]
+        ratios = [sigma / max(noise.sigma(z), SURFACE_SIGMA * min(1, z / ROOM_DEPTH)) for z, sigma in self.residuals]
         factor = float(np.median(ratios))
         if factor < DISHONEST:
             return noise

@@ -128,9 +128,11 @@ class PhotometricSettings:
 
     mode: PhotometricMode = "auto"
     """never; degenerate: where geometry leaves a direction of motion open; always; auto: always if the depth camera is
-    noisy, else where geometry is degenerate."""
+    noisy, or as long as residuals of tracking have not shown that smooth depth is exact, too; else where geometry is
+    degenerate."""
     noisy_m: float = setting(0.001, 0, 1, "m")
-    """For "auto": the depth camera is noisy if its standard deviation at the median depth is above this."""
+    """For "auto": the depth camera is noisy if its standard deviation at the median depth is above this, or that of
+    points about the surface that earlier frames measured."""
     shrink: int = setting(2, 1, 16)
     """Images are this many times smaller, for 320-pixel-wide ones; wider ones are shrunk more."""
     points: int = setting(5000, 1, 10**6)

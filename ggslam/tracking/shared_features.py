@@ -7,7 +7,7 @@ within some pixels of the true place alone. Matched features lie where they have
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -30,7 +30,7 @@ CLEARLY_FEWER = 0.7
 
 
 class SharedFeatures:
-    """What a view shares with earlier ones.
+    """What a view shares with earlier ones. They are matched one by one, when the first have not told enough.
 
     Args:
         view: the frame.
@@ -42,30 +42,38 @@ class SharedFeatures:
     def __init__(
         self, view: FeatureView, earlier: list[FeatureView], camera: Camera, settings: FeatureSettings
     ) -> None:
-        self._camera, self._settings = camera, settings
-        self.matches: list[ViewMatches] = [match_views(view, known, camera, settings) for known in earlier]
-        """With each of the earlier views."""
+        self._view, self._earlier, self._camera, self._settings = view, earlier, camera, settings
+        self._matches: dict[int, ViewMatches] = {}
         self._poses: dict[int, FeaturePose | None] = {}
 
     def starts(self) -> Iterator[tuple[str, np.ndarray]]:
         """What most of the matches with each view agree on: a name and a pose [4, 4]."""
-        for number in range(len(self.matches)):
+        for number in range(len(self._earlier)):
             pose = self._pose(number)
             if pose is not None:
                 yield f"features of view {number}", pose.T_world_camera
 
+    def _match(self, number: int) -> ViewMatches:
+        """What is shared with an earlier view."""
+        if number not in self._matches:
+            self._matches[number] = match_views(self._view, self._earlier[number], self._camera, self._settings)
+        return self._matches[number]
+
+    def _all(self) -> Iterator[ViewMatches]:
+        return (self._match(number) for number in range(len(self._earlier)))
+
     def _pose(self, number: int) -> FeaturePose | None:
         """What most of the matches with an earlier view agree on."""
         if number not in self._poses:
-            self._poses[number] = self.matches[number].pose(self._camera, self._settings)
+            self._poses[number] = self._match(number).pose(self._camera, self._settings)
         return self._poses[number]
 
     def contradict(self, T_world_camera: np.ndarray, slack: float = 1.0) -> str:
         """Why a pose [4, 4] cannot be right: another one explains far more of what the view shares with the last one.
         Empty if it can, or if too little is shared to tell; `slack` widens the limit within which it explains them."""
-        if not self.matches:
+        if not self._earlier:
             return ""
-        shared, needed = self.matches[0], 2 * self._settings.min_inliers
+        shared, needed = self._match(0), 2 * self._settings.min_inliers
         found = shared.count_explained(T_world_camera, self._camera, self._settings, slack)
         if len(shared) < needed or found >= CONTRADICTED_BELOW * len(shared):
             return ""
@@ -80,15 +88,15 @@ class SharedFeatures:
     def vouch(self, T_world_camera: np.ndarray) -> bool:
         """Whether a pose [4, 4] is right without further witnesses: most of what the view shares with an earlier one,
         all over the image, lies where this pose has it."""
-        return any(self._vouches(shared, T_world_camera) for shared in self.matches)
+        return any(self._vouches(shared, T_world_camera) for shared in self._all())
 
     @property
     def could_vouch(self) -> bool:
         """Whether enough is shared with the last view to vouch for a pose."""
-        return bool(self.matches) and len(self.matches[0]) >= VOUCHED_TIMES * self._settings.min_inliers
+        return bool(self._earlier) and len(self._match(0)) >= VOUCHED_TIMES * self._settings.min_inliers
 
     def _vouches(self, shared: ViewMatches, T_world_camera: np.ndarray) -> bool:
-        explained = shared.explained(T_world_camera, self._camera, self._settings)
+        explained = shared.which_agree(T_world_camera, self._camera, self._settings)
         needed = max(VOUCHED_TIMES * self._settings.min_inliers, VOUCHED_SHARE * len(shared))
         if explained.sum() < needed:
             return False
@@ -96,14 +104,18 @@ class SharedFeatures:
         cells = np.floor(shared.pixels[explained] / size * CELLS).clip(0, CELLS - 1) @ (CELLS, 1)
         return len(np.unique(cells)) >= VOUCHED_CELLS
 
-    def count_explained(self, T_world_camera: np.ndarray) -> int:
-        """Matches with any of the earlier views that lie where a pose [4, 4] has them."""
-        return sum(shared.count_explained(T_world_camera, self._camera, self._settings) for shared in self.matches)
+    def keeps(self, T_world_camera: np.ndarray, T_start: np.ndarray, share: float) -> bool:
+        """Whether a pose [4, 4] explains a share of what its start does, of what was matched so far."""
+        known = self._matches.values()
+        return self._count(known, T_world_camera) >= share * self._count(known, T_start)
+
+    def _count(self, matches: Iterable[ViewMatches], T_world_camera: np.ndarray) -> int:
+        return sum(shared.count_explained(T_world_camera, self._camera, self._settings) for shared in matches)
 
     def prefer(self, T_one: np.ndarray, T_other: np.ndarray) -> bool | None:
         """Whether one pose [4, 4] explains clearly more of the features than another; None: there is no clear
         difference."""
-        one, other = self.count_explained(T_one), self.count_explained(T_other)
+        one, other = self._count(self._all(), T_one), self._count(self._all(), T_other)
         if max(one, other) < self._settings.min_inliers or min(one, other) >= CLEARLY_FEWER * max(one, other):
             return None
         return one > other

@@ -19,6 +19,7 @@ from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.residual_noise import ResidualNoise
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
+from ggslam.tracking.still_camera import StillCamera
 
 
 class TrackingStatus(enum.Enum):
@@ -48,6 +49,7 @@ class TrackingResult:
         reason: why it was lost or is doubted, or how it was recovered, else empty.
         points: of the frame; what a keyframe adds to a `MeasuredSurface`.
         alignment: everything G-ICP says; None for the first frame.
+        still: whether the pose is that of the frame before because the image says so (`still_camera`).
     """
 
     T_world_camera: np.ndarray
@@ -57,6 +59,7 @@ class TrackingResult:
     reason: str
     points: PointSource
     alignment: AlignmentResult | None = None
+    still: bool = False
 
     @property
     def median_depth_m(self) -> float:
@@ -77,6 +80,7 @@ class TrackerState:
         noise: of the depth camera; measured on the first frame if the settings leave it open, and held to the
             residuals of the frames that follow.
         residuals: what these say.
+        still: since when the camera stands still.
     """
 
     camera: Camera
@@ -86,6 +90,7 @@ class TrackerState:
     target: GicpTarget | None = None
     noise: DepthNoise | None = None
     residuals: ResidualNoise = field(default_factory=ResidualNoise)
+    still: StillCamera = field(default_factory=StillCamera)
 
     @staticmethod
     def begin(
@@ -173,6 +178,7 @@ class Tracker(ABC):
     def move(self, T_new_old: np.ndarray) -> None:
         """Moves the tracker's own pose, after the world about it was moved by a correction [4, 4]."""
         self.state.motion.move(T_new_old)
+        self.state.still.move(T_new_old)
 
     def relocate(self, view: FeatureView, points: PointSource, found: AlignmentResult, source: str) -> TrackingResult:
         """A frame that was lost was located by other means; tracking goes on from there.
@@ -185,6 +191,7 @@ class Tracker(ABC):
         """
         motion, T = self.state.motion, orthonormalize(found.T_world_camera)
         motion.restart(view, T)
+        self.state.still.forget()
         motion.remember(view, points, self.settings)
         return TrackingResult(T.copy(), TrackingStatus.RECOVERED, found.overlap, found.rmse, source, points, found)
 
@@ -205,6 +212,7 @@ class Tracker(ABC):
             result = replace(result, status=TrackingStatus.LOST)
         if result.status is TrackingStatus.LOST:
             state.motion, state.target = before
+            state.still.forget()
         return result
 
     def begin_part(self, view: FeatureView, points: PointSource, T_world_camera: np.ndarray) -> TrackingResult:
@@ -216,6 +224,7 @@ class Tracker(ABC):
             T_world_camera: where nothing else was mapped.
         """
         motion, T = self.state.motion, np.array(T_world_camera, float)
+        self.state.still.forget()
         motion.restart(view, T)
         motion.remember(view, points, self.settings)
         return TrackingResult(T.copy(), TrackingStatus.FIRST, 1.0, 0.0, "a new part of the map begins", points)

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from ggslam.errors import ConfigError
+from ggslam.geometry.scene_size import voxel_times
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.mesh import MIN_WEIGHT, Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.posed_view import PosedView
 from ggslam.volumes.tsdf import TsdfMap
@@ -91,12 +93,34 @@ class VolumeMaps:
         onto: TsdfMap | None = None, device: str | None = None,
     ) -> None:  # fmt: skip
         self.settings = settings
+        self._goes_on, self.times_a_room = onto is not None, 1
         self._on_device = None if device is None else _fusion_on(device, settings, onto)
         self.tsdf = TsdfMap(settings.tsdf) if onto is None else onto
         self.context = self.tsdf.context
         self.field = DistanceField(self.tsdf, settings.esdf) if esdf else None
         self.occupancy = None if occupancy is None else self._occupancy(occupancy)
         self.times = VolumeTimes()
+
+    def fit(self, scale: float, voxel: bool = True) -> None:
+        """Fits the TSDF's voxels and range to the size of the scene, before the first frame; in rooms, and where a
+        TSDF is gone on with, nothing changes.
+
+        Args:
+            scale: of the scene, see `geometry.scene_size.scene_scale`.
+            voxel: whether the voxel follows, too.
+        """
+        tsdf = self.settings.tsdf.in_scene(scale, voxel)
+        if self._goes_on or tsdf == self.settings.tsdf:
+            return
+        self.settings, self.times_a_room = replace(self.settings, tsdf=tsdf), voxel_times(scale)
+        if self._on_device is not None:
+            self._on_device = TorchTsdf(tsdf, self._on_device.device)
+        self.tsdf = TsdfMap(tsdf, self.context)
+        self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
+
+    def mesh(self, min_triangles: int = 0) -> Mesh:
+        """The surface of the TSDF; see `volumes.mesh.extract_mesh`."""
+        return extract_mesh(self.tsdf, MIN_WEIGHT / self.times_a_room**2, min_triangles)
 
     @property
     def _receiver(self) -> TsdfMap | TorchTsdf:

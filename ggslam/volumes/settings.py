@@ -3,25 +3,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from ggslam.geometry.scene_size import voxel_times
 from ggslam.system.settings import Conflict, setting, settings_class
+
+_LARGEST_VOXEL, _FARTHEST, _LEAST_MAX_WEIGHT, _LEAST_FREE_WEIGHT = 1.0, 1000.0, 1.0, 0.1
 
 
 @settings_class(frozen=True)
 class TsdfSettings:
     """How depth is fused."""
 
-    voxel: float = setting(0.02, 1e-3, 1, "m", basic=True)
-    """Edge of a voxel."""
+    voxel: float = setting(0.02, 1e-3, _LARGEST_VOXEL, "m", basic=True)
+    """Edge of a voxel; unless set, larger in scenes larger than rooms (median depth above 6 m)."""
     truncation_voxels: float = setting(4.0, 2, 32, "voxels")
     """Distances are kept up to this many voxels on either side of a surface."""
-    max_weight: float = setting(16.0, 1, 1000)
+    max_weight: float = setting(16.0, _LEAST_MAX_WEIGHT, 1000)
     """A voxel's weight grows to this at most, in measurements from 1 m: how many of them new ones are averaged with."""
-    max_free_weight: float = setting(1.0, 0.1, 1000)
+    max_free_weight: float = setting(1.0, _LEAST_FREE_WEIGHT, 1000)
     """The same for voxels of free space, so that what appears in it is taken over soon."""
     min_depth: float = setting(0.1, 0, 100, "m")
     """Nearer depth is not fused."""
-    max_depth: float = setting(7.0, 0.1, 1000, "m", basic=True)
-    """Farther depth is not fused."""
+    max_depth: float = setting(7.0, 0.1, _FARTHEST, "m", basic=True)
+    """Farther depth is not fused; unless set, farther in scenes larger than rooms."""
     free_share: float = setting(0.9, 0.1, 1)
     """A block without voxels becomes free throughout if all depth seen through it lies behind it, and at least this
     share of its pixels have depth. Else it gets voxels, if it is not known yet, until all of them were seen."""
@@ -38,6 +43,29 @@ class TsdfSettings:
     def __post_init__(self) -> None:
         if self.min_depth >= self.max_depth:
             raise Conflict("max_depth", f"expected more than min_depth, {self.min_depth:g}, found {self.max_depth:g}")
+
+    def in_scene(self, scale: float, voxel: bool = True) -> TsdfSettings:
+        """The settings for a scene of another size than a room's: what is at its default follows the scene.
+
+        Args:
+            scale: of the scene, see `geometry.scene_size.scene_scale`.
+            voxel: whether the voxel follows, too.
+        """
+        usual, scaled = TsdfSettings(), self.of_size(voxel_times(scale))
+        return scaled if voxel and self.voxel == usual.voxel else replace(scaled, voxel=self.voxel)
+
+    def of_size(self, times: float) -> TsdfSettings:
+        """The settings with voxels and range that are at their defaults so many times as large, and with weights that
+        are as much as a measurement from so many metres: in a large scene nothing is seen from near."""
+        usual, names = TsdfSettings(), ("voxel", "max_depth", "max_weight", "max_free_weight")
+        new = (
+            min(usual.voxel * times, _LARGEST_VOXEL),
+            min(usual.max_depth * times, _FARTHEST),
+            max(usual.max_weight / times**2, _LEAST_MAX_WEIGHT),
+            max(usual.max_free_weight / times**2, _LEAST_FREE_WEIGHT),
+        )
+        left = {n: v for n, v in zip(names, new, strict=True) if getattr(self, n) == getattr(usual, n)}
+        return replace(self, **left)
 
     @property
     def truncation(self) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 
 from ggslam.formats.cubes_to_come import CubesToCome
 from ggslam.formats.voxel_cloud import VoxelCloud, VoxelSums, cloud_of_sums, pack
+from ggslam.geometry.scene_size import surface_reach
 from ggslam.geometry.voxels import neighbour_step, voxel_keys
 from ggslam.native.loader import NativeContext
 from ggslam.volumes.mesh import Mesh, extract_mesh
@@ -28,8 +29,6 @@ _TRUNCATION = 3.0
 LEAST_WEIGHT = 0.06
 """In measurements from 1 m: what one view from 3 m tells of a voxel halfway through its truncation. Where more is asked
 for, a surface has a rim without points; where less, noisy maps have points that only one view shows."""
-FARTHEST = 1000.0
-"""Metres."""
 _LEAST_AREA = 0.1
 """Squared voxels: where the surface only cuts off a corner of a voxel, its neighbours have the point."""
 _CUBE_BLOCKS = 4
@@ -48,7 +47,7 @@ Look = Callable[[int, bool], PosedView]
 
 def surface_points(
     look: Look, count: int, voxel_size: float, with_object_id: bool = False, most_blocks: int = MOST_BLOCKS,
-    context: NativeContext | None = None,
+    context: NativeContext | None = None, times: float = 1.0,
 ) -> Iterator[VoxelCloud]:  # fmt: skip
     """The points of a surface, in clouds one after the other that have no voxel in common.
 
@@ -62,9 +61,14 @@ def surface_points(
         with_object_id: whether the points carry object ids.
         most_blocks: see `MOST_BLOCKS`.
         context: threads to work on.
+        times: size of the scene against a room's, see `geometry.scene_size.voxel_times`: tells how far views are fused.
+
+    Raises:
+        VoxelError: voxels too small for what a view shows.
     """
-    settings = TsdfSettings(voxel=voxel_size, truncation_voxels=_TRUNCATION, max_depth=FARTHEST)
-    sweep = _Sweep(TsdfMap(settings, context), [_cubes(look(k, True), voxel_size) for k in range(count)])
+    settings = surface_settings(voxel_size, times, _TRUNCATION)
+    of_view = [_cubes(look(k, True), voxel_size, settings.max_depth) for k in range(count)]
+    sweep = _Sweep(TsdfMap(settings, context), of_view, LEAST_WEIGHT / times**2)
     limit = most_blocks
     for number in range(count):
         sweep.add(number, look(number, False))
@@ -73,16 +77,24 @@ def surface_points(
             limit = max(most_blocks, int(_GROWTH * sweep.blocks))  # where little is finished, it pays to look rarely
 
 
-def _cubes(view: PosedView, voxel_size: float) -> np.ndarray:
-    """The cubes that a view's surfaces lie in, keys, each once."""
-    return np.unique(voxel_keys(view.points(), voxel_size * SIDE * _CUBE_BLOCKS))
+def surface_settings(voxel_size: float, times: float, truncation_voxels: float | None = None) -> TsdfSettings:
+    """How depth is fused into a surface of points: voxels in metres, in a scene so many times a room's size."""
+    usual = TsdfSettings()
+    truncation = usual.truncation_voxels if truncation_voxels is None else truncation_voxels
+    return replace(usual.of_size(times), voxel=voxel_size, max_depth=surface_reach(times), truncation_voxels=truncation)
+
+
+def _cubes(view: PosedView, voxel_size: float, reach: float) -> np.ndarray:
+    """The cubes that a view's surfaces within reach lie in, keys, each once."""
+    near = replace(view, depth=np.where(view.depth <= reach, view.depth, np.float32(0)))
+    return np.unique(voxel_keys(near.points(), voxel_size * SIDE * _CUBE_BLOCKS))
 
 
 class _Sweep:
     """A TSDF that forgets what no view to come reaches."""
 
-    def __init__(self, tsdf: TsdfMap, of_view: list[np.ndarray]) -> None:
-        self._tsdf, self._to_come = tsdf, CubesToCome(of_view)
+    def __init__(self, tsdf: TsdfMap, of_view: list[np.ndarray], least_weight: float) -> None:
+        self._tsdf, self._to_come, self._least = tsdf, CubesToCome(of_view), least_weight
         self._handed_out = np.empty(0, np.int64)
         self._voxel = tsdf.settings.voxel
 
@@ -99,7 +111,7 @@ class _Sweep:
     def take_finished(self, with_object_id: bool) -> Iterator[VoxelCloud]:
         """The points of what is finished, which is forgotten when all were taken."""
         out = self._handed_out
-        for cloud in _clouds_of(extract_mesh(self._tsdf, LEAST_WEIGHT), self._voxel, with_object_id):
+        for cloud in _clouds_of(extract_mesh(self._tsdf, self._least), self._voxel, with_object_id):
             of_point = voxel_keys(cloud.grid + np.rint(cloud.origin / self._voxel), SIDE * _CUBE_BLOCKS)
             present = np.unique(of_point)
             ripe = present[self._all_around(present, self._to_come.are_done)]

@@ -8,17 +8,18 @@ of the poses. Blocks that are free space throughout are remembered as such and h
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from ggslam.errors import InputError
+from ggslam.errors import CoreInputError, InputError, VoxelError
 from ggslam.interface.core.volumes import FusionSettings, FusionStats, VoxelArrays
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame_checks import wrong_unit
 from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.working_voxel import working_voxel
 
 SIDE = 8
 VOXELS = SIDE**3
@@ -169,6 +170,7 @@ class TsdfMap:
             within: least and greatest coordinates [3] of blocks; others stay as they are. None: all.
 
         Raises:
+            VoxelError: the view shows too many blocks for voxels of this size.
             InputError: an image of another size or kind than the camera's, a pose that is not finite and rigid, or
                 depth that cannot be in metres.
         """
@@ -180,13 +182,38 @@ class TsdfMap:
         if within is not None:
             low, high = (np.asarray(ends).astype(int).tolist() for ends in within)
             numbers.bounded, numbers.low[:], numbers.high[:] = 1, low, [end + 1 for end in high]
-        self._library.ggslam_tsdf_integrate(
-            self.handle, self.context.handle, ctypes.byref(view.structure()), ctypes.byref(numbers), ctypes.byref(stats)
-        )
+        try:
+            self._library.ggslam_tsdf_integrate(
+                self.handle, self.context.handle, ctypes.byref(view.structure()), ctypes.byref(numbers),
+                ctypes.byref(stats),
+            )  # fmt: skip
+        except CoreInputError as error:
+            raise self._too_small(error, view.depth, camera, T_world_camera) from None
         # Looked at only where nothing came of the view.
         if not stats.blocks and within is None and (unit := wrong_unit(view.depth)):
             raise InputError(unit)
         return IntegrationStats(*(getattr(stats, field.name) for field in fields(IntegrationStats)))
+
+    def _too_small(
+        self, error: InputError, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
+    ) -> InputError:
+        """The core's refusal of a view; where that shows too many blocks, one that names voxels that work."""
+        if "blocks" not in str(error):
+            return error
+
+        def blocks_of(edge: float) -> int:
+            other = TsdfMap(replace(self.settings, voxel=edge), self.context)
+            other.integrate(depth, camera, T_world_camera)
+            return other.dense_blocks
+
+        works = working_voxel(blocks_of, self.settings.voxel)
+        if works is None:
+            return error
+        seen = depth[(depth > 0) & (depth <= self.settings.max_depth)]
+        return VoxelError(
+            f"voxels of {self.settings.voxel:g} m are too small for a view that shows depth up to "
+            f"{float(seen.max()):.3g} m: {works:g} m works"
+        )
 
     def decay(self, spare_in_view: bool = False) -> int:
         """Lets the map forget: all weights are multiplied by `TsdfSettings.decay`.

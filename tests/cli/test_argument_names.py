@@ -40,7 +40,12 @@ def messages() -> list[tuple[str, str]]:
 
 def options() -> set[str]:
     commands = typer.main.get_command(app).commands.values()  # type: ignore[attr-defined]
-    return {option for command in commands for parameter in command.params for option in parameter.opts}
+    return {
+        option
+        for command in commands
+        for parameter in command.params
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
 
 
 def test_the_library_knows_no_options() -> None:

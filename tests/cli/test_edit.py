@@ -13,7 +13,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from ggslam.cli.main import app
-from ggslam.errors import GgslamError, RunFolderError
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.jobs.edit.edit import Edit
+from ggslam.jobs.edit.edits import edit_run
 from ggslam.runs.folder import RunFolder
 
 
@@ -96,6 +98,27 @@ def test_removal_shows_in_the_render_and_nowhere_else(finished: Path, tmp_path: 
     changed = np.abs(a - b).max(2) > 4
     assert there.sum() > 100 and changed[there].mean() > 0.5
     assert changed[~around].mean() < 0.01
+
+
+def test_most_of_a_map_is_removed_only_when_that_is_confirmed(finished: Path, tmp_path: Path) -> None:
+    table, count = RunFolder.open(finished).object_table(), len(RunFolder.open(finished).gaussians())
+    largest = sorted(table.objects, key=lambda record: -record.gaussians)
+    most, total = [], 0
+    for record in largest:
+        most.append(str(record.id))
+        total += record.gaussians
+        if total > 0.7 * count:
+            break
+    before, out, objects = contents(finished), tmp_path / "new", ",".join(most)
+    one_error(ggslam("edit", finished, "--remove", objects, "--out", out), "of the map", "--yes")
+    assert not out.exists() and contents(finished) == before
+    edit_run(finished, [Edit("remove", objects)], tmp_path / "asked", confirm=lambda what: f"of {count}" in what)
+    with pytest.raises(ConfigError, match="not confirmed"):
+        edit_run(finished, [Edit("remove", objects)], tmp_path / "refused", confirm=lambda _: False)
+    assert not (tmp_path / "refused").exists()
+    done("edit", finished, "--remove", objects, "--yes", "--out", out)
+    left = len(RunFolder.open(out).gaussians())
+    assert left == len(RunFolder.open(tmp_path / "asked").gaussians()) < 0.5 * count
 
 
 def test_in_place(run: Path) -> None:

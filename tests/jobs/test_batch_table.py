@@ -13,21 +13,27 @@ from ggslam.jobs.batch.job_states import JobState, State
 from ggslam.jobs.batch.manifest import BatchJob
 from ggslam.jobs.batch.scores_table import MEAN, ScoresTable
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.verdict import Grade, RunVerdict
 
 
-def done(out: Path, recording: str, settings: str, seed: int, psnr: float, ate: float | None) -> JobState:
+def done(
+    out: Path, recording: str, settings: str, seed: int, psnr: float, ate: float | None, grade: Grade | None = None
+) -> JobState:
     state = JobState(BatchJob(recording, settings, seed, (recording,)), out, State.DONE)
     state.run.mkdir(parents=True)
     images = {"held_out": {"psnr": psnr, "ssim": 0.9, "frames": 3}, "all": {"psnr": psnr + 1, "frames": 20}}
     trajectory = {} if ate is None else {"trajectory": {"ate_rmse_m": ate, "ate_mean_m": 0.9 * ate}}
     MetricsRecord.of({"images": images, "map": {"gaussians": 12345}, **trajectory}).write(state.run)
+    if grade is not None:
+        RunVerdict(grade=grade).write(state.run)
     return state
 
 
 @pytest.fixture
 def table(tmp_path: Path) -> ScoresTable:
     states = [
-        done(tmp_path, "room0", "default", 0, 30.0, 0.010), done(tmp_path, "room0", "default", 1, 32.0, 0.020),
+        done(tmp_path, "room0", "default", 0, 30.0, 0.010, "bad"),
+        done(tmp_path, "room0", "default", 1, 32.0, 0.020, "good"),
         done(tmp_path, "kitchen", "default", 0, 25.0, None), done(tmp_path, "room0", "k_1", 0, 28.0, 0.030),
     ]  # fmt: skip
     failed = JobState(BatchJob("kitchen", "k_1", 0, ()), tmp_path, State.FAILED, "no depth & 50% of it")
@@ -41,6 +47,7 @@ def test_means_and_spreads_over_seeds_and_means_over_recordings(table: ScoresTab
     assert room["runs"] == "2" and room["PSNR dB"] == "31.00 ± 1.41" and room["ATE RMSE cm"] == "1.500 ± 0.707"
     assert kitchen["ATE RMSE cm"] == "–" and kitchen["PSNR dB"] == "25.00" and kitchen["Gaussians k"] == "12.3"
     assert mean["PSNR dB"] == "28.00" and mean["ATE RMSE cm"] == "–"  # not of all recordings: no mean
+    assert room["verdict"] == "bad" and kitchen["verdict"] == "" == mean["verdict"]  # the worst of the seeds
     assert room["PSNR dB, GS-ICP (published)"] == "35.37" and kitchen["PSNR dB, GS-ICP (published)"] == ""
 
 
@@ -55,7 +62,7 @@ def test_every_form_holds_the_same_and_names_what_failed(table: ScoresTable) -> 
     for text in (markdown, page):
         assert "31.00 ± 1.41" in text and "held-out" in text and "a machine" in text
     assert "failed: kitchen/k_1/seed0: no depth & 50% of it" in markdown and "no depth &amp; 50% of it" in page
-    assert r"room0 & k\_1 & 1 & 3.000" in latex and r"31.00$\pm$1.41" in latex and r"mIoU \%" in latex
+    assert r"room0 & k\_1 & 1 &  & 3.000" in latex and r"31.00$\pm$1.41" in latex and r"mIoU \%" in latex
     lines = [line for line in latex.splitlines() if line.endswith(r"\\")]
     assert len(lines) == 5 and len({line.count("&") for line in lines}) == 1
 

@@ -20,7 +20,7 @@ from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.edit.edits import Edit, edit_run
 from ggslam.jobs.merge.merge import MergeOutcome, merge_runs
 from ggslam.jobs.report.gather import path_of_run
-from ggslam.jobs.score.evaluate_run import evaluate_run
+from ggslam.jobs.run.evaluate_run import evaluate_run
 from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.merging.settings import MergeSettings
 from ggslam.runs.folder import RunFolder

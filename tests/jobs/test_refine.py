@@ -256,7 +256,8 @@ def test_a_refined_run_is_a_run(room_run: RunFolder, tmp_path: Path) -> None:
     assert better.has_objects() and better.object_table().ids() == room_run.object_table().ids()
     assert better.timing().refine_iterations == room_run.timing().refine_iterations + 30
     names = {path.name for path in room_run.path.iterdir() if path.suffix not in (".html", ".lock")}
-    assert names - {path.name for path in better.path.iterdir()} <= {"cells", "volumes", ".lock"}
+    assert names - {path.name for path in better.path.iterdir()} <= {"cells", "volumes", "verdict.json", ".lock"}
+    assert better.verdict() is None  # the one of another map would be stale
     succeed("verify", tmp_path / "better")
 
 

@@ -35,7 +35,7 @@ class Played:
     """What `LiveVolumes` asks of a run, at given poses; each frame is a keyframe."""
 
     def __init__(self) -> None:
-        self.corrections = 0
+        self.corrections, self.scale = 0, 1.0
         self.cameras = [None]
         self.mapper: Any = SimpleNamespace(keyframes=[], identity=None)
         self.poses: dict[int, np.ndarray] = {}

@@ -15,7 +15,7 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cuda.insertion import CudaInsertion
-from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE
+from ggslam.mapping.keyframe import DEPTH_UNIT
 from ggslam.mapping.new_gaussians import NewGaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.scene.camera import Camera
@@ -37,7 +37,7 @@ class Images:
 
     @property
     def depth_m(self) -> np.ndarray:
-        return self.depth.astype(np.float32) / np.float32(DEPTH_UNITS_PER_METRE)
+        return self.depth.astype(np.float32) / np.float32(1 / DEPTH_UNIT)
 
 
 def make_images(height: int, width: int, seed: int = 0, holes: float = 0.02) -> Images:
@@ -54,7 +54,7 @@ def make_images(height: int, width: int, seed: int = 0, holes: float = 0.02) -> 
     alpha = np.where(u + 3 * np.sin(v) > 0.7 * width, 0.95, rng.random((height, width))).astype(np.float32)
     rendered = (depth * np.where(rng.random((height, width)) < 0.1, 1.2, 1.001)).astype(np.float32)
     camera = Camera(width, height, 60.0, 61.5, 0.5 * width - 0.3, 0.5 * height + 0.2)
-    return Images(camera, color, (depth * DEPTH_UNITS_PER_METRE + 0.5).astype(np.uint16), alpha, rendered)
+    return Images(camera, color, (depth / DEPTH_UNIT + 0.5).astype(np.uint16), alpha, rendered)
 
 
 def on_device(library: CudaLibrary, images: Images, s: InsertionSettings, empty: bool = False) -> NewGaussians:
@@ -64,7 +64,7 @@ def on_device(library: CudaLibrary, images: Images, s: InsertionSettings, empty:
     )
     insertion = CudaInsertion(device, library)
     known = (None, None) if empty else (alpha, rendered)
-    return insertion.new_gaussians(color, depth, 1 / DEPTH_UNITS_PER_METRE, *known, images.camera, POSE, s)
+    return insertion.new_gaussians(color, depth, DEPTH_UNIT, *known, images.camera, POSE, s)
 
 
 def on_host(images: Images, s: InsertionSettings, empty: bool = False) -> list[NewGaussians]:

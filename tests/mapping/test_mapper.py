@@ -324,3 +324,13 @@ def test_noisy_maps_lose_what_is_hidden_while_they_grow(monkeypatch: pytest.Monk
         for n in range(11):
             mapper.add_keyframe(wall(n), np.eye(4))
         assert len(looks) == wanted
+
+
+def test_steps_of_means_are_no_longer_than_half_a_pixel() -> None:
+    mapper = make_mapper()
+    rates = mapper.settings.rates
+    assert mapper._standard_adam().learning_rates["means"] == rates.means
+    for pixel_m, wanted in ((0.008, rates.means), (0.001, 0.0005), (0.0002, 0.0001)):
+        mapper.pixel_m = pixel_m
+        assert mapper._standard_adam().learning_rates["means"] == pytest.approx(wanted)
+        assert mapper._adam(0.1).learning_rates["means"] == pytest.approx(0.1 * wanted)

@@ -27,7 +27,7 @@ def test_report(make: Make) -> None:
 
 def test_suspicious_depth_scale(make: Make) -> None:
     folder = make("replica")
-    for scale in (20.0, 50000.0):
+    for scale in (10.0, 50000.0):
         report = inspect_sequence(open_sequence(folder, depth_scale=scale))
         assert any(f"depth scale {scale:g} is suspicious" in warning for warning in report.warnings)
     assert not any("suspicious" in warning for warning in inspect_sequence(open_sequence(folder)).warnings)

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import ggslam
+from command_line import ggslam, refuse
 from format_makers import MORE_MAKERS
 from test_all_formats import MORE_OPTIONS
 from tiny_recordings import MAKERS, make_tum, pose
@@ -53,7 +53,10 @@ def test_distortion_is_undone(make: Callable[[str], Path]) -> None:
     assert open_sequence(sequence.path, intrinsics="30 31 15 11 .1 0 0 0 .1 .1").lens.startswith("8 ")
 
 
-@pytest.mark.parametrize("text", ["", "1 2 3", "30 31 15 eleven", "30 31 15 nan", "-30 31 15 11", "1 " * 13])
+IMPOSSIBLE = ("", "1 2 3", "30 31 15 eleven", "30 31 15 nan", "-30 31 15 11", "0.75 1 0.5 0.5", "30 9e5 15 11")
+
+
+@pytest.mark.parametrize("text", [*IMPOSSIBLE, "1 " * 13])
 def test_impossible_intrinsics(make: Callable[[str], Path], text: str) -> None:
     with pytest.raises(SequenceError, match="`intrinsics`"):
         open_sequence(make("replica"), intrinsics=text)
@@ -65,9 +68,28 @@ def test_both_or_a_file_that_is_none(make: Callable[[str], Path], tmp_path: Path
         open_sequence(folder, intrinsics="30 31 15 11", camera=tmp_path / "a.yaml")
     with pytest.raises(SequenceError, match=r"a\.yaml: file is missing"):
         open_sequence(folder, camera=tmp_path / "a.yaml")
-    (tmp_path / "a.yaml").write_text("width: 640\nheight: 200\nfx: 30\nfy: 31\ncx: 15\ncy: 11\n")
+    (tmp_path / "a.yaml").write_text("width: 640\nheight: 200\nfx: 300\nfy: 310\ncx: 15\ncy: 11\n")
     with pytest.raises(SequenceError, match="image is 32x24, but the intrinsics of the recording are for 640x200"):
         open_sequence(folder, camera=tmp_path / "a.yaml")
+
+
+@pytest.mark.parametrize("numbers", ["fx: 0.75\nfy: 1\ncx: 0.5\ncy: 0.5", "fx: 30000\nfy: 30000\ncx: 15\ncy: 11"])
+def test_focal_lengths_in_other_units_than_pixels(make: Callable[[str], Path], tmp_path: Path, numbers: str) -> None:
+    """Of the image's width, or in micrometres; in camera.yaml, in a file with the image's size, and without it."""
+    folder = make("folder")
+    own = folder / "camera.yaml"
+    kept = own.read_text()
+    told = (tmp_path / "own.yaml", f"width: 32\nheight: 24\n{numbers}\n"), (tmp_path / "K.yaml", f"{numbers}\n")
+    for path, text in told:
+        path.write_text(text)
+        with pytest.raises(SequenceError, match=rf"{path.name}: impossible focal lengths.*32x24: expected pixels"):
+            open_sequence(folder, camera=path)
+        refuse(ggslam("inspect", folder, "--camera", path), path.name, "impossible focal lengths")
+    own.write_text(f"{told[0][1]}depth_scale: 1000\n")
+    with pytest.raises(SequenceError, match=r"camera\.yaml: impossible focal lengths"):
+        open_sequence(folder)
+    own.write_text(kept)
+    assert open_sequence(folder).camera.width == 32
 
 
 def test_intrinsics_need_no_file_of_the_recording(make: Callable[[str], Path]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from app_recordings import phone_frames, write_scanner_app
 
+from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences import open_sequence
 from ggslam.sequences.upsampling import upsample_depth
@@ -75,17 +76,19 @@ def test_a_room_is_better_than_by_nearest_and_between_nothing() -> None:
     assert between["guided"] < 0.2 * between["linear"]
 
 
-def test_scale_is_of_colour(tmp_path: Path) -> None:
-    """By default as many pixels as other recordings have; at every scale the same intrinsics."""
+def test_scale_is_of_what_comes_by_default(tmp_path: Path) -> None:
+    """By default as many pixels as other recordings have; 0.5 halves that; at every scale the same intrinsics."""
     frames = [dataclasses.replace(
         frame, color=cv2.resize(frame.color, (1920, 1440)), camera=frame.camera.resize(1920, 1440)
     ) for frame in phone_frames(2, (240, 180), (256, 192), frames=120)]  # fmt: skip
     folder = write_scanner_app(tmp_path / "scan", frames, color_every=1)
-    for scale, size in ((None, (640, 480)), (0.25, (480, 360)), (0.1, (192, 144)), (1.0, (1920, 1440))):
+    for scale, size in ((None, (640, 480)), (0.75, (480, 360)), (0.5, (320, 240)), (3.0, (1920, 1440))):
         sequence = open_sequence(folder, scale=scale)
         assert (sequence.camera.width, sequence.camera.height) == size and sequence.finer
         assert sequence.native_camera == frames[0].camera
         assert sequence.camera == frames[0].camera.resize(*size)
-        assert sequence.scale == pytest.approx(size[0] / 1920)
+        assert sequence.scale == pytest.approx(size[0] / 640)
+    with pytest.raises(SequenceError, match="at most 3, found 3.5"):
+        open_sequence(folder, scale=3.5)
     again = open_sequence(**sequence.options)  # type: ignore[arg-type]
     assert again.camera == sequence.camera

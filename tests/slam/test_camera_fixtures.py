@@ -56,6 +56,19 @@ def test_a_tool_is_found_within_four_views() -> None:
     assert 0.2 < found.nearest < 0.25
 
 
+@pytest.mark.parametrize(("size", "found"), [(1.0, True), (6.0, True), (60.0, False)])
+def test_nothing_far_is_fixed_to_the_camera(size: float, found: bool) -> None:
+    """The tool 0.15, 0.9 and 9 m away, in a scene that is larger by the same factor: the last is no tool."""
+
+    def pose(k: int) -> np.ndarray:
+        T = sideways(k)
+        T[:3, 3] *= size
+        return T
+
+    frames = [frame(np.float32(size) * with_tool(wall(sideways(k))), k) for k in range(12)]
+    assert (find_fixtures(frames, {k: pose(k) for k in range(12)}).mask is not None) == found
+
+
 @pytest.mark.parametrize("slant", [0.0, 0.4])
 def test_a_wall_is_never_taken_for_it(slant: float) -> None:
     """Also one along which the camera goes, so that every pixel's depth stays the same."""

@@ -231,3 +231,15 @@ def test_a_map_made_before_is_taken_whole(turning: Path, limited: RunOutcome, tm
     request = RunRequest(SequenceRequest(turning), tmp_path / "on", None, [*PLAIN, *SMALL], map=limited.folder.path)
     with pytest.raises(ConfigError, match=r"memory_limit_mb.*`map`"):
         execute(request)
+
+
+def test_gaussians_on_disk_get_another_exposure(turning: Path) -> None:
+    slam, gain = slam_over(turning, *SMALL), np.array([2.0, 0.5, 3.0])
+    assert slam.pager is not None and slam.pager.on_disk > 500
+    cells = slam.pager.cells
+    before = {key: part.rgb.numpy().copy() for key, part in cells.parts()}
+    slam.mapper.residency.scale_colors(gain)
+    after = {key: part.rgb.numpy() for key, part in cells.parts()}
+    assert before.keys() == after.keys()
+    assert all(np.abs(after[key] - gain * before[key]).max() < 1e-5 for key in before)
+    slam.close()

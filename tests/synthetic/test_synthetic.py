@@ -236,7 +236,7 @@ def test_refusals(tmp_path: Path, recording: Path) -> None:
     def write(folder: Path, **options: object) -> None:
         write_synthetic_sequence(folder, width=32, height=24, scene=small_scene(), **options)  # type: ignore[arg-type]
 
-    with pytest.raises(SequenceError, match="expected one of loop, round, pan, route, walk, found 'fly'"):
+    with pytest.raises(SequenceError, match="expected one of loop, round, pan, route, walk, turns, still, found 'fly'"):
         write(tmp_path / "a", trajectory="fly")
     with pytest.raises(SequenceError, match="frames: expected at least 2, found 1"):
         write(tmp_path / "a", frames=1)

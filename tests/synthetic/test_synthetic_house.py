@@ -155,7 +155,7 @@ def test_a_written_loop_repeats(quick_light: None, caster: RayCaster, house: Sce
     np.testing.assert_allclose(frame.depth, depth, atol=2e-4)
     assert frame.mask is not None and (frame.mask == mask).all()
     assert contents(tmp_path / "a")["depth/000000.png"] != contents(tmp_path / "c")["depth/000000.png"]
-    with pytest.raises(SequenceError, match="expected one of room, loop, corridor, found 'maze'"):
+    with pytest.raises(SequenceError, match="expected one of room, loop, corridor, bare, found 'maze'"):
         write_synthetic_sequence(tmp_path / "d", scene="maze")
     with pytest.raises(SequenceError, match="depth_distortion: expected 0 to 10"):
         write_synthetic_sequence(tmp_path / "d", depth_distortion=-1.0)

@@ -6,17 +6,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ggslam.scene.camera import Camera
+from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.residual_noise import EVERY, FEWEST, ResidualNoise
-from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.settings import DepthNoise, TrackerSettings
 
 
-def observed(sigma: float, first: DepthNoise, frames: int = 2 * FEWEST) -> DepthNoise:
-    """Noise after frames of points 2 m away whose distances to the surface have a standard deviation."""
+def observed(
+    sigma: float, first: DepthNoise, frames: int = 2 * FEWEST, depth: float = 2.0, watch: ResidualNoise | None = None
+) -> DepthNoise:
+    """Noise after frames of points so far away whose distances to the surface have a standard deviation."""
     random, points = np.random.default_rng(0), np.zeros((2000, 3), np.float32)
-    points[:, 2] = 2.0
+    points[:, 2] = depth
     frame = FramePoints(points, points, np.zeros((2000, 6), np.float32), np.zeros((2000, 2), np.int32), points[:, 0])
-    watch, noise = ResidualNoise(), first
+    watch, noise = watch or ResidualNoise(), first
     for _ in range(frames):
         squared = (sigma * random.standard_normal(2000)).astype(np.float32) ** 2
         squared[:200] = np.inf  # without a match
@@ -35,6 +39,26 @@ def test_an_honest_noise_is_kept() -> None:
     assert observed(1.5 * honest.sigma(2.0), honest) is honest
     exact = DepthNoise(0.0002, 0.0)  # the surface's own noise does not count as the camera's
     assert observed(0.0008, exact) is exact
+
+
+def test_near_surfaces_are_gathered_in_smaller_voxels() -> None:
+    smooth = DepthNoise(0.0002, 0.0)
+    assert observed(0.0016, smooth, depth=0.5).sigma(0.5) == pytest.approx(0.0016, rel=0.05)
+    assert observed(0.0016, smooth) is smooth
+    assert observed(0.0003, smooth, depth=0.5) is smooth
+
+
+@pytest.mark.parametrize(("sigma", "mode"), [(None, "always"), (0.0003, "degenerate"), (0.0016, "always")])
+def test_grey_values_are_compared_until_smooth_depth_has_shown_its_error(sigma: float | None, mode: str) -> None:
+    tracker = GicpTracker(Camera(80, 60, 70.0, 70.0, 39.5, 29.5))
+    tracker.noise = DepthNoise(0.0002, 0.0)
+    if sigma is not None:
+        observed(sigma, tracker.noise, watch=tracker.state.residuals)
+    assert tracker._mode(2.0) == mode
+    told = TrackerSettings(noise=DepthNoise(0.0002, 0.0))  # whoever gives the noise is believed
+    known = GicpTracker(Camera(80, 60, 70.0, 70.0, 39.5, 29.5), told)
+    known.noise = told.noise
+    assert known._mode(2.0) == "degenerate"
 
 
 def test_a_few_frames_are_no_evidence() -> None:

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ggslam.geometry.scene_size import scene_scale
 from ggslam.scene.poses import inverse
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
-from ggslam.tracking.scale import scale_settings, scene_scale
+from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.settings import TrackerSettings
 
 

@@ -11,9 +11,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from ggslam.jobs.batch.job_states import JobState, State
+from ggslam.jobs.batch.manifest import BatchJob
 from ggslam.jobs.batch.published import PUBLISHED, Published
 from ggslam.reporting.page import Html, bullets, page, section, table
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.verdict import Grade, RunVerdict, worst
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ COLUMNS = (
     Column("memory MB", ("memory", "peak_rss_mb"), 1, 0),
 )
 MEAN = "mean"
+_NAMES = ("recording", "settings", "runs", "verdict")
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,8 @@ class Row:
     runs: int
     means: tuple[float, ...]
     spreads: tuple[float, ...]
+    verdict: str = ""
+    """The worst of the runs; "": none has one."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +90,14 @@ class ScoresTable:
         metrics = {state.job: MetricsRecord.read(state.run) for state in done}
         held_out = all(m.images.held_out is not None for m in metrics.values())
         set_name = "held_out" if held_out else "all"
-        groups: dict[tuple[str, str], list[MetricsRecord]] = {}
-        for job, found in metrics.items():
-            groups.setdefault((job.recording, job.settings), []).append(found)
-        rows = [_row(names, found, set_name) for names, found in groups.items()]
+        grades = {state.job: verdict.grade for state in done if (verdict := RunVerdict.read_if_there(state.run))}
+        groups: dict[tuple[str, str], list[BatchJob]] = {}
+        for job in metrics:
+            groups.setdefault((job.recording, job.settings), []).append(job)
+        rows = [
+            _row(names, [metrics[job] for job in jobs], set_name, [grades[job] for job in jobs if job in grades])
+            for names, jobs in groups.items()
+        ]
         rows += _mean_rows(rows)
         recordings = {row.recording for row in rows}
         published = [column for column in PUBLISHED if recordings & set(column.values)]
@@ -98,7 +107,7 @@ class ScoresTable:
     def head(self) -> list[str]:
         """Headings."""
         own = [column.title for column in COLUMNS]
-        return ["recording", "settings", "runs", *own, *(f"{p.beside}, {p.title} (published)" for p in self.published)]
+        return [*_NAMES, *own, *(f"{p.beside}, {p.title} (published)" for p in self.published)]
 
     def notes(self) -> list[str]:
         """What a reader has to know."""
@@ -119,22 +128,23 @@ class ScoresTable:
             for column, mean, spread in zip(COLUMNS, row.means, row.spreads, strict=True)
         ]
         others = [f"{p.values[row.recording]:g}" if row.recording in p.values else "" for p in self.published]
-        return [row.recording, row.settings, str(row.runs), *found, *others]
+        return [row.recording, row.settings, str(row.runs), row.verdict, *found, *others]
 
     def to_csv(self) -> str:
         """Numbers with all their digits, means and spreads in columns of their own."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         spreads = [f"{column.title} std" for column in COLUMNS]
-        writer.writerow([*self.head()[: 3 + len(COLUMNS)], *spreads, *self.head()[3 + len(COLUMNS) :]])
+        names, end = len(_NAMES), len(_NAMES) + len(COLUMNS)
+        writer.writerow([*self.head()[:end], *spreads, *self.head()[end:]])
         for row, cells in zip(self.rows, self.cells(), strict=True):
             numbers = ["" if math.isnan(value) else repr(value) for value in (*row.means, *row.spreads)]
-            writer.writerow([*cells[:3], *numbers, *cells[3 + len(COLUMNS) :]])
+            writer.writerow([*cells[:names], *numbers, *cells[end:]])
         return out.getvalue()
 
     def to_markdown(self) -> str:
         """A table and its notes."""
-        lines = [self.head(), ["---", "---", *["---:"] * (len(self.head()) - 2)], *self.cells()]
+        lines = [self.head(), ["---", "---", "---:", "---", *["---:"] * (len(self.head()) - 4)], *self.cells()]
         body = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
         return f"# {self.title}\n\n{body}\n\n" + "\n".join(f"- {note}" for note in self.notes()) + "\n"
 
@@ -143,12 +153,12 @@ class ScoresTable:
         lines = [" & ".join(_latex(cell) for cell in line) + r" \\" for line in (self.head(), *self.cells(r"$\pm$"))]
         notes = "".join(f"% {note}\n" for note in self.notes())
         body = "\n".join([r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"])
-        return f"{notes}\\begin{{tabular}}{{ll{'r' * (len(self.head()) - 2)}}}\n{body}\n\\end{{tabular}}\n"
+        return f"{notes}\\begin{{tabular}}{{llrl{'r' * (len(self.head()) - 4)}}}\n{body}\n\\end{{tabular}}\n"
 
     def to_html(self) -> str:
         """A page that opens from disk."""
         parts: list[Html] = [
-            section("Scores", "scores", table(self.head(), self.cells(), sorts=True, text_columns=(1,))),
+            section("Scores", "scores", table(self.head(), self.cells(), sorts=True, text_columns=(1, 3))),
             section("Notes", "notes", bullets(self.notes())),
         ]
         lead = f"{sum(row.runs for row in self.rows if row.recording != MEAN)} runs, {len(self.failed)} failed"
@@ -162,9 +172,10 @@ class ScoresTable:
         }  # fmt: skip
 
 
-def _row(names: tuple[str, str], found: Sequence[MetricsRecord], set_name: str) -> Row:
+def _row(names: tuple[str, str], found: Sequence[MetricsRecord], set_name: str, grades: list[Grade]) -> Row:
     values = [[_value(m, column, set_name) for m in found] for column in COLUMNS]
-    return Row(*names, len(found), tuple(map(_mean, values)), tuple(map(_spread, values)))
+    means, spreads = tuple(map(_mean, values)), tuple(map(_spread, values))
+    return Row(*names, len(found), means, spreads, worst(grades) if grades else "")
 
 
 def _mean_rows(rows: Sequence[Row]) -> list[Row]:

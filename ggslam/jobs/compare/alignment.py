@@ -15,6 +15,7 @@ from ggslam.formats.trajectory import Trajectory
 from ggslam.geometry.clouds import Cloud, overlap
 from ggslam.geometry.icp import CloudRegistration
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.poses import fit_similarity, inverse
 
 Alignment = Literal["auto", "none", "truth", "icp", "trajectory"]
@@ -39,6 +40,7 @@ class Side:
         points: float64 [N, 3] metres. Of a run: its map sampled on a grid of 1 cm (points.ply).
         trajectory: of a run.
         metrics: of a run that was scored.
+        verdict: of a run, if it has one.
         truth: true poses of a run's frames, by their times, where the run kept them.
     """
 
@@ -47,6 +49,7 @@ class Side:
     trajectory: Trajectory | None = None
     metrics: MetricsRecord | None = None
     truth: Trajectory | None = None
+    verdict: RunVerdict | None = None
 
 
 def common_poses(a: Side, b: Side) -> np.ndarray:

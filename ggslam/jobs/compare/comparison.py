@@ -77,6 +77,7 @@ class Comparison:
             name: {
                 "path": str(side.path), "points": len(side.points),
                 "metrics": None if side.metrics is None else side.metrics.values(),
+                "verdict": None if side.verdict is None else side.verdict.values(),
             }
             for name, side in (("a", self.a), ("b", self.b))
         }  # fmt: skip
@@ -178,7 +179,8 @@ def _read_run(path: Path) -> Side:
     if not len(points):
         raise RunFolderError(f"{path}: the map has no points to compare")
     truth = read_tum(path / TRUTH_FILE) if (path / TRUTH_FILE).is_file() else None
-    return Side(path, np.asarray(points, np.float64), folder.trajectory(), folder.metrics(), truth)
+    return Side(path, np.asarray(points, np.float64), folder.trajectory(), folder.metrics(), truth,
+                folder.verdict())  # fmt: skip
 
 
 def _trajectory_scores(a: Side, b: Side, pairs: np.ndarray) -> TrajectoryScores | None:

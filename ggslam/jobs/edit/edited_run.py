@@ -27,8 +27,8 @@ RECORDS = (STEPS_FILE, TRUTH_FILE, *MOVER_FILES)
 """Files that stay true, too, but older runs have none."""
 COPIED = ("trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "loops.json", *RECORDS)
 """Files that stay true of an edited run."""
-SCORES = ("metrics.json", "frames.csv")
-"""Files that do not, unless objects were only renamed. `ggslam eval` makes them anew."""
+SCORES = ("metrics.json", "frames.csv", "verdict.json")
+"""Files that do not, unless objects were only renamed. `ggslam eval` makes scores anew."""
 
 
 def save_edited(

@@ -44,6 +44,11 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.interrupts import delay_interrupts
 
+MOST_OF_A_MAP = 0.5
+"""Removing a larger share has to be confirmed."""
+Apply = Callable[[SegmentedMap, Edit], Change]
+"""Does an edit to a map."""
+
 
 @dataclass
 class EditOutcome:
@@ -76,6 +81,7 @@ def edit_run(
     inpainting: bool = False,
     settings: InpaintSettings | None = None,
     sequence: str | Path | None = None,
+    confirm: Callable[[str], bool] | None = None,
 ) -> EditOutcome:
     """Edits a run's map, in the order given, and writes the result.
 
@@ -90,9 +96,11 @@ def edit_run(
         settings: of inpainting.
         sequence: where the recording is now, if it was moved; only for inpainting, which does without the recording
             if this is None and it is not where it was.
+        confirm: asked, with what is at stake, before more than half of the map is removed; None: nobody is.
 
     Raises:
-        ConfigError: unknown objects, values that cannot be read, no edits, or a folder that is the run's own.
+        ConfigError: unknown objects, values that cannot be read, no edits, a folder that is the run's own, or a removal
+            that was not confirmed.
         RunFolderError: the run has no objects, or is damaged, or the folder cannot be written.
         SequenceError: the recording is not at `sequence`.
     """
@@ -100,11 +108,11 @@ def edit_run(
         raise ConfigError("no edit was given; there are " + ", ".join(f"`{kind}`" for kind in KINDS))
     if sequence is not None and not inpainting:
         raise ConfigError("`sequence`: only `inpainting` looks at the recording")
-    folder = folder if isinstance(folder, RunFolder) else open_map(folder)
+    folder, apply = folder if isinstance(folder, RunFolder) else open_map(folder), _with_consent(confirm)
     if isinstance(folder, MapFile):
         if inpainting or in_place:
             raise ConfigError(f"{folder.path}: `inpainting` and `in_place` need a run, and this is a file")
-        path, texts = edit_file(folder, edits, None if out is None else Path(out), overwrite, apply_edit, read_vector)
+        path, texts = edit_file(folder, edits, None if out is None else Path(out), overwrite, apply, read_vector)
         return EditOutcome(RunFolder(path), texts)
     sequence = None if sequence is None else Path(sequence)
     target = _target(folder, None if out is None else Path(out), in_place)
@@ -112,7 +120,7 @@ def edit_run(
     notes: list[str] = []
     recording = _open_recording(folder, sequence, notes) if inpainting else None
     scene, original = folder.segmented_map(), folder.gaussians()
-    changes = _apply_all(scene, edits, source.displacement)
+    changes = _apply_all(scene, edits, source.displacement, apply)
     if in_place:
         target.check_writable()
     written = target if in_place else RunFolder.create(target.path, overwrite)
@@ -182,12 +190,14 @@ class _Source:
         return _Source(recording.camera_of, record, views, displacement)
 
 
-def _apply_all(scene: SegmentedMap, edits: Sequence[Edit], displacement: Displacement) -> list[Change]:
+def _apply_all(
+    scene: SegmentedMap, edits: Sequence[Edit], displacement: Displacement, apply: Apply
+) -> list[Change]:
     """Does the edits."""
     original, changes = scene.table, list[Change]()
     for edit in edits:
         try:
-            changes.append(apply_edit(scene, edit))
+            changes.append(apply(scene, edit))
         except ConfigError as error:
             if changes and set(_ids_of(original, edit)) - set(scene.table.ids()):
                 raise ConfigError(f"`{edit.kind}` {edit.objects}: an earlier edit left none of it: {error}") from None
@@ -202,6 +212,22 @@ def _ids_of(table: ObjectTable, edit: Edit) -> list[int]:
         return table.select(edit.objects)
     except ConfigError:
         return []
+
+
+def _with_consent(confirm: Callable[[str], bool] | None) -> Apply:
+    """`apply_edit` that asks before it removes most of the map: on flat ground one object may hold nearly all of it."""
+
+    def apply(scene: SegmentedMap, edit: Edit) -> Change:
+        names, before = edit.objects, len(scene.gaussians)
+        change = apply_edit(scene, edit)
+        removed = len(change.before.means)
+        if confirm is None or edit.kind != "remove" or removed <= MOST_OF_A_MAP * before:
+            return change
+        if not confirm(f"`remove` {names}: {removed} of {before} Gaussians, {removed / before:.0%} of the map"):
+            raise ConfigError(f"`remove` {names}: not confirmed; nothing was changed")
+        return change
+
+    return apply
 
 
 def apply_edit(scene: SegmentedMap, edit: Edit) -> Change:

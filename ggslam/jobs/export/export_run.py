@@ -70,7 +70,7 @@ def export_run(
             without `format` is a mesh); usd: .usda, .usdc, .usdz; points, pcd: coloured clouds; mesh: .glb, .obj or
             .ply; trajectory: TUM; colmap, nerfstudio: images with poses and points. None: what the name of `out` says.
         voxel: metres: distance of points (default 0.01), or the edge of a mesh's voxels (default: as the run's
-            settings say).
+            settings say); both defaults are larger in scenes larger than rooms.
         objects: names or ids, "mug,7", or "all", for ply, segmented, mesh, sog, streamed-sog, gltf, usd: only these.
         movers: instead of the map, the points of each thing that moved, as a PLY file for each in the folder `out`.
         min_opacity: leave out fainter Gaussians (not of trajectory, mesh, colmap, nerfstudio; of points and pcd only
@@ -111,12 +111,12 @@ def export_run(
     folder = run if isinstance(run, RunFolder) else open_map(run)
     if kind in (*_WITH_VIEWS, ExportFormat.mesh, ExportFormat.trajectory):
         _with_poses(folder, f"format {kind.value}")
-    images, points = None if recording is None else Path(recording), 0.01 if voxel is None else voxel
+    images = None if recording is None else Path(recording)
     widen = None if zoom == 1 else _widen_for(_with_poses(folder, "`zoom`"), zoom)
     turn = None if up is None else upward_turn(folder, up, kind)
     prepare = _both(widen, turn)
     mesh = MeshRequest(voxel, objects, rendered, images, wanted)
-    wish = _Wish(place, kind, points, objects, min_opacity, plain, discs, keyframes, images, mesh)
+    wish = _Wish(place, kind, voxel, objects, min_opacity, plain, discs, keyframes, images, mesh)
     said = _write(folder, wish, prepare, observer)
     return said if turn is None else f"{said}; {turn.text}"
 
@@ -127,7 +127,7 @@ class _Wish:
 
     place: Path
     kind: ExportFormat
-    points: float
+    points: float | None
     objects: str | None
     min_opacity: float
     plain: bool

@@ -138,23 +138,23 @@ def object_file_name(record: ObjectRecord) -> str:
 
 
 def export_points(
-    folder: RunFolder, path: Path, voxel_size: float, discs: bool = False, min_opacity: float = 0.0
+    folder: RunFolder, path: Path, voxel_size: float | None, discs: bool = False, min_opacity: float = 0.0
 ) -> str:
     """Writes points.ply (metres) and points_grid.ply (integer cells) into the folder `path`; see `points_to_export`."""
-    clouds = points_to_export(folder, voxel_size, discs, min_opacity)
+    voxel_size, clouds = points_to_export(folder, voxel_size, discs, min_opacity)
     make_folder(path)
     count = write_points_in_parts(path, clouds)
-    return f"wrote {path}/points.ply and points_grid.ply: {count} points on a {voxel_size} m grid"
+    return f"wrote {path}/points.ply and points_grid.ply: {count} points on a {voxel_size:g} m grid"
 
 
 def points_to_export(
-    folder: RunFolder, voxel_size: float, discs: bool = False, min_opacity: float = 0.0
-) -> Iterator[VoxelCloud]:
-    """The points of a run's surface in clouds, at least one that is not empty.
+    folder: RunFolder, voxel_size: float | None, discs: bool = False, min_opacity: float = 0.0
+) -> tuple[float, Iterator[VoxelCloud]]:
+    """The voxel size, and the points of a run's surface in clouds, at least one that is not empty.
 
     Args:
         folder: of the run.
-        voxel_size: metres.
+        voxel_size: metres; None: 0.01, or more in scenes larger than rooms.
         discs: take the discs of the Gaussians instead, whether a keyframe sees them or not...
         min_opacity: ...that are at least this opaque; 0: 0.3.
 
@@ -163,7 +163,7 @@ def points_to_export(
         RunFolderError: the map has no points.
     """
     opacity = min_opacity if min_opacity > 0 else 0.3
-    if not voxel_size > 0 or not 0 < opacity < 1:
+    if not (voxel_size is None or voxel_size > 0) or not 0 < opacity < 1:
         raise ConfigError(f"impossible voxel size {voxel_size} or minimum opacity {opacity}")
     try:
         clouds = opened_points(folder, voxel_size, discs, opacity)
@@ -172,7 +172,7 @@ def points_to_export(
         raise ConfigError(str(error)) from None
     if first is None:
         raise RunFolderError(f"{folder.path}: the map has no points to export")
-    return chain([first], clouds)
+    return first.voxel_size, chain([first], clouds)
 
 
 def export_trajectory(folder: RunFolder, path: Path) -> str:

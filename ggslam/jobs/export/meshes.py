@@ -11,6 +11,7 @@ import numpy as np
 
 from ggslam.errors import RunFolderError, SequenceError
 from ggslam.formats.mesh_files import check_mesh_path, write_mesh
+from ggslam.geometry.scene_size import scene_scale
 from ggslam.jobs.export.map_files import object_file_name
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.volumes.frames import PosedFrame, frames_of_run
@@ -31,7 +32,8 @@ class MeshRequest:
     """Which mesh is wanted.
 
     Attributes:
-        voxel: edge of the voxels, metres; None: as the run's settings say.
+        voxel: edge of the voxels, metres; None: as the run's settings say; where they say nothing, as goes with the
+            scene's size.
         objects: names or ids, "mug,7", or "all": only these; None: the whole surface.
         rendered: take depth from the map in any case.
         recording: where the recording is now, if it was moved.
@@ -109,6 +111,8 @@ def _fuse(folder: RunFolder, views: _Views, voxel: float | None, observer: Obser
     observer.begin("fuse", views.count)
     poses: list[np.ndarray] = []
     for done, view in enumerate(views.frames):
+        if not done:
+            maps.fit(scene_scale(view.frame.depth), voxel is None)
         maps.add(view.frame, view.T_world_camera, view.labels)
         poses.append(view.T_world_camera)
         observer.advance(done + 1, views.count)

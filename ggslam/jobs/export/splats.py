@@ -66,7 +66,7 @@ def _left_out(written: int, degree: int) -> str:
 
 
 def export_pcd(
-    folder: RunFolder, path: Path, voxel_size: float, discs: bool = False, min_opacity: float = 0.0
+    folder: RunFolder, path: Path, voxel_size: float | None, discs: bool = False, min_opacity: float = 0.0
 ) -> str:
     """Writes the points of the surface, in metres, with colours, and with object ids if there are any, as PCD.
 
@@ -76,13 +76,14 @@ def export_pcd(
         RunFolderError: nothing to write, or the file cannot be written.
     """
     _check_ending(path, "pcd")
-    cloud = join_clouds(points_to_export(folder, voxel_size, discs, min_opacity))
+    voxel_size, clouds = points_to_export(folder, voxel_size, discs, min_opacity)
+    cloud = join_clouds(clouds)
     attributes = {"color": cloud.colors}
     if cloud.object_id is not None:
         attributes["object_id"] = cloud.object_id
     make_folder(path.parent)
     write_point_cloud(path, cloud.points.astype("f4"), attributes)
-    return f"wrote {path}: {len(cloud)} points on a {voxel_size} m grid"
+    return f"wrote {path}: {len(cloud)} points on a {voxel_size:g} m grid"
 
 
 def _check_ending(path: Path, kind: str) -> None:

@@ -52,8 +52,9 @@ class _Views:
 
 
 def export_colmap(
-    folder: RunFolder, out: Path, voxel_size: float = 0.02, keyframes_only: bool = False, recording: Path | None = None
-) -> str:
+    folder: RunFolder, out: Path, voxel_size: float | None = 0.02, keyframes_only: bool = False,
+    recording: Path | None = None,
+) -> str:  # fmt: skip
     """Writes `images/`, a sparse model `sparse/0/` in COLMAP's binary form and `sparse/0/test.txt`, the images that
     were held out; returns a line that says so.
 
@@ -62,7 +63,7 @@ def export_colmap(
     Args:
         folder: of the run.
         out: folder to write, new or empty.
-        voxel_size: distance of the points, metres.
+        voxel_size: distance of the points, metres; None: as `points_to_export` chooses.
         keyframes_only: leave out frames that are neither keyframes nor held out.
         recording: where the recording is now, if it was moved.
 
@@ -71,7 +72,7 @@ def export_colmap(
         RunFolderError: no frame was located, the map has no points, or the folder cannot be written.
         SequenceError: the recording cannot be read.
     """
-    views, cloud = _views(folder, keyframes_only, recording), join_clouds(points_to_export(folder, voxel_size))
+    views, cloud = _views(folder, keyframes_only, recording), join_clouds(points_to_export(folder, voxel_size)[1])
     make_empty_folder(out)
     make_folder(out / MODEL)
     written = list(_write_images(views, out, with_depth=False))
@@ -84,11 +85,12 @@ def export_colmap(
 
 
 def export_nerfstudio(
-    folder: RunFolder, out: Path, voxel_size: float = 0.02, keyframes_only: bool = False, recording: Path | None = None
-) -> str:
+    folder: RunFolder, out: Path, voxel_size: float | None = 0.02, keyframes_only: bool = False,
+    recording: Path | None = None,
+) -> str:  # fmt: skip
     """Writes `images/`, `depth/` (16 bit, millimetres), `points.ply` and `transforms.json`, which names the images to
     train on and those that were held out; returns a line that says so. Arguments and errors as in `export_colmap`."""
-    views, cloud = _views(folder, keyframes_only, recording), join_clouds(points_to_export(folder, voxel_size))
+    views, cloud = _views(folder, keyframes_only, recording), join_clouds(points_to_export(folder, voxel_size)[1])
     make_empty_folder(out)
     written = list(_write_images(views, out, with_depth=True))
     write_metric_points(out / "points.ply", cloud)

@@ -12,11 +12,13 @@ import numpy as np
 
 from ggslam.errors import ConfigError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.geometry.scene_size import scene_scale
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.refine.cell_mapper import StillMapper
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.visit_records import exposure_of
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.mapping.scale import scale_settings
 from ggslam.native.loader import NativeContext
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.runs.folder import RunFolder
@@ -105,7 +107,9 @@ def _refine(
     keyframes, valid = _read_keyframes(source, sequence, observer)
     scene = source.segmented_map() if source.has_objects() else None
     gaussians = source.gaussians(with_moments=True)
-    mapper = StillMapper(gaussians, source.config().mapping, NativeContext(), keyframes, valid)
+    scale = scene_scale(keyframes[0].depth_m()) if keyframes else 1.0  # as the run itself did
+    trained_by = scale_settings(source.config().mapping, scale)
+    mapper = StillMapper(gaussians, trained_by, NativeContext(), keyframes, valid)
     observer.begin("refine", settings.steps)
     before, after = mapper.train(settings.steps, [settings.seed], observer.advance)
     refined = None if scene is None else SegmentedMap(gaussians, scene.classifier, scene.table, scene.votes)

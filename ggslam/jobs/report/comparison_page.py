@@ -93,6 +93,8 @@ def _scores(runs: Sequence[RunData]) -> Html:
             unit = f", {metric.unit}" if metric.unit else ""
             texts = [metric.text(value) for value in values]
             rows.append([f"{metric.name}{unit}", *(_mark_best(metric, values) if one else texts)])
+    if any(run.verdict is not None for run in runs):
+        rows.insert(0, ["verdict", *("-" if run.verdict is None else run.verdict.summary() for run in runs)])
     if not rows:
         return p.tag("p", "None of these runs was scored; ggslam eval does that.")
     unscored = [run.name for run in runs if run.metrics is None]

@@ -59,6 +59,7 @@ def _load(folder: RunFolder, sequence: Sequence | None, views: list[FrameView]) 
         keyframes=np.array([k.frame for k in record.keyframes], int),
         steps=_table(folder, STEPS_FILE), scores=_table(folder, "frames.csv"), metrics=metrics, timing=timing,
         settings=_settings(folder), defaults=flat(config_to_dict(Config())), recording=recording, mark=mark,
+        verdict=folder.verdict(),
         warnings=run_warnings(mark, recording, timing, loops, record, metrics), views=views,
         movers=movers, mover_views=mover_views(sequence, movers, record.poses()),
     )  # fmt: skip

@@ -14,6 +14,7 @@ from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoverRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
+from ggslam.runs.records.verdict import RunVerdict
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,7 @@ class RunData:
         settings: name -> value, all of them.
         defaults: name -> value that a fresh run would have.
         recording: where its recording is and how it was read.
+        verdict: how good it is; None: it was edited, merged or made by an older version.
         mark: what it was made with.
         warnings: what a user should know.
         views: pictures.
@@ -107,6 +109,7 @@ class RunData:
     settings: dict[str, Any] = field(default_factory=dict)
     defaults: dict[str, Any] = field(default_factory=dict)
     recording: SequenceRecord | None = None
+    verdict: RunVerdict | None = None
     mark: RunRecord = field(default_factory=RunRecord)
     warnings: list[str] = field(default_factory=list)
     views: list[FrameView] = field(default_factory=list)

@@ -20,6 +20,7 @@ from ggslam.reporting import page as p
 from ggslam.reporting.page import Html
 from ggslam.runs.records.metrics import SETS, MetricsRecord, SegmentationRecord, SurfaceScoresRecord
 from ggslam.runs.records.record import Record
+from ggslam.runs.records.verdict import GRADES
 
 FOOTER = "Written by ggslam. The page needs nothing but itself: no network, no other files."
 _OPEN_VIEWS = 2
@@ -38,7 +39,8 @@ def run_page(run: RunData) -> str:
         ("meaning", "What the numbers mean", p.definitions(MEANINGS)), ("settings", "Settings", _settings(run)),
         ("versions", "Recording and versions", _versions(run)),
     ]  # fmt: skip
-    content = [_tiles(run), _warnings(run), *(p.section(title, anchor, body) for anchor, title, body in parts)]
+    sections = [p.section(title, anchor, body) for anchor, title, body in parts]
+    content = [_verdict(run), _tiles(run), _warnings(run), *sections]
     links = [(anchor, title) for anchor, title, _ in parts]
     return p.page(run.name, _lead(run), content, links, FOOTER)
 
@@ -47,6 +49,21 @@ def _lead(run: RunData) -> str:
     size = "" if run.recording is None else f" at {run.recording.camera.width}x{run.recording.camera.height}"
     frames = len(run.tracked.get("frame", ()))
     return f"{frames} frames of {run.recording_name()}{size}, {len(run.keyframes)} keyframes"
+
+
+def _verdict(run: RunData) -> Html:
+    """How good the run is, and what to try."""
+    verdict = run.verdict
+    if verdict is None:
+        return Html("")
+    rows = [
+        [name, p.tag("td", p.tag("span", grade), class_=f"grade-{grade}") if grade in GRADES else grade, text]
+        for name, grade, text in verdict.rows()
+    ]
+    parts = [p.tag("p", "Verdict: ", p.tag("b", verdict.grade), f". {verdict.failure}." if verdict.failure else ".")]
+    parts.append(p.table(["", "verdict", "what was measured"], rows, text_columns=(1, 2)))
+    parts += [p.tag("p", f"To try: {verdict.next}")] if verdict.next else []
+    return p.tag("div", *parts, class_=f"verdict grade-{verdict.grade}")
 
 
 def _tiles(run: RunData) -> Html:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from ggslam.errors import GgslamError
 from ggslam.sequences import Sequence, inspect_sequence
+from ggslam.sequences.depth_doubts import CODES as DEPTH_CODES
 from ggslam.sequences.live import LiveSequence
 from ggslam.sequences.rig import RigSequence
 from ggslam.sequences.rig_inspection import inspect_rig
@@ -12,25 +13,37 @@ from ggslam.sequences.verdicts import Verdict, judge_intrinsics, judge_times
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import judge_path, judge_run
 
+MOVES = "something moves in"
+"""What the note of a run that found movers says."""
 FRAMES = 5
 """Of the recording that are looked at."""
 
 
-def judge(sequence: Sequence | LiveSequence, result: SlamResult) -> list[Verdict]:
-    """Verdicts on a run that has ended; some frames of its recording are read once more."""
-    verdicts = [*_judge_recording(sequence, result), *judge_run(result)]
+def judge(sequence: Sequence | LiveSequence, result: SlamResult, depth: list[Verdict] | None = None) -> list[Verdict]:
+    """Verdicts on a run that has ended; some frames of its recording are read once more. `depth`: what was said of its
+    depth before it began; None: nobody looked."""
+    verdicts = [*_judge_recording(sequence, result, depth), *judge_run(result)]
     told = {verdict.code for verdict in verdicts}
     if isinstance(sequence, Sequence) and not told & {"depth_scale", "intrinsics"}:  # which make paths wrong
         verdicts += judge_path(result, sequence.ground_truth, sequence.depth_scale)
     return verdicts
 
 
-def _judge_recording(sequence: Sequence | LiveSequence, result: SlamResult) -> list[Verdict]:
+def doubt_movers(notes: list[str], verdicts: list[Verdict]) -> list[str]:
+    """Notes of a run; where depth is at fault, what seems to move is put down to it first."""
+    if not any(verdict.code in DEPTH_CODES for verdict in verdicts):
+        return notes
+    return [f"{note}; more likely depth is at fault, see below" if MOVES in note else note for note in notes]
+
+
+def _judge_recording(
+    sequence: Sequence | LiveSequence, result: SlamResult, depth: list[Verdict] | None
+) -> list[Verdict]:
     if isinstance(sequence, LiveSequence):
         return [*judge_intrinsics(sequence.camera), *judge_times(result.timestamps())]
     try:
         if isinstance(sequence, RigSequence):
             return inspect_rig(sequence, FRAMES, masks=False).verdicts
-        return inspect_sequence(sequence, FRAMES, masks=False).verdicts
+        return inspect_sequence(sequence, FRAMES, masks=False, depth=depth).verdicts
     except GgslamError:  # a recording that went away meanwhile; the run ends as it would have
         return []

@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,16 +15,20 @@ from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.checkpointing import Checkpointing, start_record
-from ggslam.jobs.run.health import judge
+from ggslam.jobs.run.health import doubt_movers, judge
+from ggslam.jobs.run.map_fit import MapFit, measure_fit
 from ggslam.jobs.run.rescue import save_somewhere
 from ggslam.jobs.run.resuming import Resumption
+from ggslam.jobs.run.run_verdict import judge_result
 from ggslam.jobs.run.slam_loop import Follower, SlamLoop
+from ggslam.jobs.run.start_check import check_depth
 from ggslam.jobs.score.run import score_run
 from ggslam.runs.checkpoints import Checkpoints
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe, open_recording_of
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.verdict import RunVerdict
 from ggslam.runs.starting import ancestors
 from ggslam.runs.writing import REPORT_FILE, RunToWrite
 from ggslam.sequences import Sequence
@@ -34,11 +40,14 @@ from ggslam.slam.saved_state import reason_against_saving
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import StopRequest, stop_on_request
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True)
 class RunRequest:
     """A whole run; with `map` in the map of an earlier one, which grows unless `localize_only`. Its state is saved
-    after every `checkpoint_every` frames: 0: never; None: as often as it hardly takes time."""
+    after every `checkpoint_every` frames: 0: never; None: as often as it hardly takes time. `check`: look at the
+    recording's depth first, and refuse what is certainly wrong with it."""
 
     sequence: SequenceRequest
     out: Path | None = None
@@ -49,12 +58,14 @@ class RunRequest:
     map: Path | None = None
     localize_only: bool = False
     checkpoint_every: int | None = None
+    check: bool = True
 
 
 @dataclass
 class RunOutcome:
     """A finished run, or what was saved of one that stopped early (`error` says why). If it could not be saved as it
-    should be, `failure` says so, and where it is. `verdicts` tell what seems wrong with it or its recording."""
+    should be, `failure` says so, and where it is. `verdicts` tell what seems wrong with it or its recording, `verdict`
+    how good it is; None: that could not be told."""
 
     folder: RunFolder
     result: SlamResult
@@ -62,6 +73,7 @@ class RunOutcome:
     error: BaseException | None = None
     failure: GgslamError | None = None
     verdicts: list[Verdict] = field(default_factory=list)
+    verdict: RunVerdict | None = None
 
     def headline(self) -> str:
         """One line for people."""
@@ -103,9 +115,12 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     out = request.out if request.out is not None else Path("runs") / sequence.name
     if earlier is not None and out.resolve() in ancestors(earlier):
         raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
+    observer = observer or SilentObserver()
+    verdicts = check_depth(sequence, observer) if request.check else None
     folder = RunFolder.create(out, overwrite=request.overwrite)
     with stop_on_request() as stop, folder_lock(folder.path):
-        return _Run(request, config, sequence, earlier, folder, observer or SilentObserver(), follower, stop).run(None)
+        run = _Run(request, config, sequence, earlier, folder, observer, follower, stop, depth=verdicts)
+        return run.run(None)
 
 
 def resume(
@@ -140,7 +155,7 @@ def resume(
 
 @dataclass
 class _Run:
-    """A run about to be made; see `RunRequest`."""
+    """A run about to be made; see `RunRequest`. `depth`: what `check_depth` said; None: it was not asked."""
 
     request: RunRequest
     config: Config
@@ -150,6 +165,8 @@ class _Run:
     observer: Observer
     follower: Follower | None
     stop: StopRequest
+    depth: list[Verdict] | None = None
+    fit: MapFit | None = None
 
     def run(self, resumption: Resumption | None) -> RunOutcome:
         """From the first frame, or from where it was, to the report."""
@@ -180,8 +197,7 @@ class _Run:
             reason = result.frames[0].reason if result.frames else "no frame could be read"
             raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
         outcome = self._save(result, error)
-        if outcome.failure is None:
-            self._look_at(outcome)
+        self._look_at(outcome)
         if error is None and outcome.failure is None:
             checkpoints.remove()
         return outcome
@@ -211,35 +227,40 @@ class _Run:
         """Writes the folder, or if that cannot be, another one."""
         described = describe(self.request.sequence, self.sequence, self.earlier)
         lacking = _objects_notes(self.sequence, result, self.config, self.earlier)
+        verdicts = self._or_note(lambda: judge(self.sequence, result, self.depth)) or []
+        result.notes = doubt_movers(result.notes, verdicts)
         for text in [*LoopsRecord.of_result(result).notes(), *described.notes(), *lacking, *result.notes]:
             self.observer.note(text)
         names = {**_names(self.earlier), **self.sequence.instance_names}
         scored = self.request.evaluate and error is None and self._frames_stay()
         wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)
         told = None if error is None else repr(error)
-        verdicts = self._judge(result)
         try:
             folder, failure = save_somewhere(
                 self.folder, RunToWrite(self.config, described, result, told, names, wanted, verdicts)
             )
+            self.fit = self._or_note(lambda: measure_fit(result.keyframes, folder.map_in_parts().in_view))
         finally:
             result.close()
         return RunOutcome(folder, result, error=error or failure, failure=failure, verdicts=verdicts)
 
-    def _judge(self, result: SlamResult) -> list[Verdict]:
-        """What seems wrong. The map is not saved yet: whatever a look at it and the recording ends in, it will be."""
+    def _or_note(self, look: Callable[[], T]) -> T | None:
+        """What a look at run, map or recording tells; None: it failed, which must not cost the run."""
         try:
-            return judge(self.sequence, result)
+            return look()
         except Exception as error:
             self.observer.note(f"the run could not be judged: {error!r}")
-            return []
+            return None
 
     def _frames_stay(self) -> bool:
         """Whether the frames of the run can be read again."""
         return isinstance(self.sequence, Sequence) or self.sequence.record is not None
 
     def _look_at(self, outcome: RunOutcome) -> None:
-        """Scores and report."""
+        """Scores, verdict and report; of a run that could not be saved as it should be the verdict alone."""
+        if outcome.failure is not None:
+            outcome.verdict = self._or_note(lambda: self._verdict(outcome))
+            return
         sequence, error = self.sequence, outcome.error
         kept = sequence if isinstance(sequence, Sequence) else None if error else _kept_recording(self.folder, sequence)
         if kept is not None and len(outcome.result.moving):
@@ -249,7 +270,17 @@ class _Run:
                 self.observer.note("not scored: the frames of a live camera are kept with `record` only")
             else:
                 outcome.metrics = score_run(self.folder, kept, self.observer)
+        outcome.verdict = self._or_note(lambda: self._verdict(outcome))
+        if outcome.verdict is not None:
+            with self.folder.change_files(RunVerdict.FILE):
+                outcome.verdict.write(self.folder.path)
         write_report(self.folder, kept)
+
+    def _verdict(self, outcome: RunOutcome) -> RunVerdict:
+        folder = outcome.folder
+        table = folder.object_table() if folder.has_objects() else None
+        recording = str(self.request.sequence.path)
+        return judge_result(outcome.result, outcome.verdicts, self.fit, table, outcome.metrics, recording)
 
 
 def _objects_notes(

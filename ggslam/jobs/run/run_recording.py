@@ -25,6 +25,7 @@ def run_recording(
     localize_only: bool = False,
     evaluate: bool = True,
     overwrite: bool = False,
+    check: bool = True,
     observer: Observer | None = None,
     **selection: Any,
 ) -> RunOutcome:
@@ -39,6 +40,7 @@ def run_recording(
         localize_only: only find the frames in the map of `map`, which stays as it is.
         evaluate: score the run.
         overwrite: replace a run that is there.
+        check: look at the recording's depth first, and refuse what is certainly wrong with it.
         observer: receives progress updates; see `ggslam.jobs.progress.Observer`.
         selection: start, stop, stride, scale and the other arguments of `open_sequence`, of a recording named by path.
 
@@ -56,7 +58,7 @@ def run_recording(
         sequence = _request(Path(recording), selection)
     request = RunRequest(
         sequence, None if out is None else Path(out), None if config is None else str(config), list(overrides),
-        evaluate, overwrite, None if map is None else Path(map), localize_only,
+        evaluate, overwrite, None if map is None else Path(map), localize_only, check=check,
     )  # fmt: skip
     return execute(request, observer)
 

@@ -40,6 +40,10 @@ from ggslam.system.atomic import make_folder, write_text
 
 PICTURES = 6
 """Comparison pictures written to renders/, spread over the recording."""
+DARK_IMAGES = 30
+"""Mean colour of 255 under which PSNR, whose range is from black to white, flatters."""
+ONE_OBJECT = 0.85
+"""Share of a map from which one object is named that holds it."""
 LOOKED_AT = 48
 """Frames in which is looked for what is fixed to the camera, spread likewise, if there is anything."""
 
@@ -79,7 +83,7 @@ def _score(
     looked_at = _spread(poses, LOOKED_AT if rig is None else 0)
     fixtures = find_fixtures((sequence.frame(i) for i in looked_at), poses)
     surface = SurfaceScorer(folder)
-    images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures, surface)
+    images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures, surface, notes)
     metrics = MetricsRecord.of({
         "trajectory": _trajectory(sequence, poses) if rig is None else rig.trajectory(poses),
         "images": {name: images[name] for name in sets},
@@ -113,6 +117,7 @@ def _score(
         notes.append(f"{reason}; no trajectory scores")
     if edits := folder.mark().edits:
         notes.append(f"the map was edited ({'; '.join(edits)}); the recording was not, so edits count as errors")
+    notes.extend(_one_object_notes(folder))
     notes.extend(_segmentation_notes(folder, metrics.segmentation is not None, masks))
     metrics = metrics.model_copy(update={"notes": notes})
     metrics.write(folder.path)
@@ -152,6 +157,20 @@ def _object_scorer(folder: RunFolder, sequence: Sequence, sets: dict[str, set[in
     return ObjectScorer(ObjectsInParts.of(folder), sets, sequence.instance_names)
 
 
+def _one_object_notes(folder: RunFolder) -> list[str]:
+    """Whether objects by geometry did not tell things from the ground they lie on."""
+    if not folder.has_objects():
+        return []
+    table = folder.object_table()
+    counts = {record.id: record.gaussians for record in table.objects}
+    largest = max(counts, key=counts.__getitem__, default=0)
+    share = counts.get(largest, 0) / max(1, sum(counts.values()) + table.unlabelled_gaussians)
+    if table.supervision != "geometry" or share <= ONE_OBJECT:
+        return []
+    return [f"object {largest} holds {share:.0%} of the map: geometry does not tell what lies flat from its ground; "
+            "masks of a segmentation model do (masks.model)"]  # fmt: skip
+
+
 def _segmentation_notes(folder: RunFolder, scored: bool, masks: Path | None) -> list[str]:
     """Which masks served as truth, or why there are no scores of objects."""
     if not folder.has_objects():
@@ -173,17 +192,20 @@ def _segmentation_notes(folder: RunFolder, scored: bool, masks: Path | None) -> 
 def _images(
     folder: RunFolder, record: KeyframesRecord, sequence: Sequence, sets: dict[str, set[int]],
     scorer: ObjectScorer | None, lpips: Lpips | None, observer: Observer, fixtures: CameraFixtures,
-    surface: SurfaceScorer,
+    surface: SurfaceScorer, notes: list[str],
 ) -> dict[str, Any]:  # fmt: skip
     poses = record.poses()
     keyframes, held_out = sets["keyframes"], sets["held_out"]
     pictured = set(_spread(poses, PICTURES))
     make_folder(folder.path / "renders")
-    show = _shower(folder, sequence, poses, pictured, scorer, any(k.is_exposed for k in record.keyframes))
+    typical = record.typical_exposure() if any(k.is_exposed for k in record.keyframes) else None
+    show = _shower(folder, sequence, poses, pictured, scorer, typical)
     rows: list[dict[str, Any]] = []
+    brightness: list[float] = []
     observer.begin("score", len(sequence))
 
     def note(frame: Frame, scores: ImageScores | None) -> None:
+        brightness.append(float(frame.color.mean()))
         observer.advance(frame.index + 1, len(sequence))
         if frame.index in poses:
             surface.add(frame, poses[frame.index])
@@ -196,6 +218,10 @@ def _images(
     means = score_images(show, map(fixtures.clean, frames), sets, lpips, note)
     observer.advance(len(sequence), len(sequence))
     _write_rows(folder, rows)
+    usual = float(np.median(brightness or [255]))
+    if usual < DARK_IMAGES:
+        notes.append(f"the images are dark (mean colour {usual:.0f} of 255), and every error is small against white: "
+                     "do not compare PSNR with that of other recordings")  # fmt: skip
     return {name: mean.to_dict() for name, mean in means.items()}
 
 
@@ -218,10 +244,10 @@ def _up_to(last: int, sequence: Sequence, masks: bool) -> Iterator[Frame]:
 
 def _shower(
     folder: RunFolder, sequence: Sequence, poses: dict[int, np.ndarray], pictured: set[int],
-    scorer: ObjectScorer | None, exposed: bool,
+    scorer: ObjectScorer | None, typical: np.ndarray | None,
 ) -> Callable[[Frame], RenderedView | None]:  # fmt: skip
     """A function that renders the map as a frame's camera sees it, and keeps some of the pictures. If the exposure
-    changed it measures that of each frame."""
+    changed, which is on the whole `typical` against the map's [3], it measures that of each frame."""
     parts = folder.map_in_parts() if scorer is None else scorer.map
     rasterizer = CpuRasterizer()
 
@@ -241,10 +267,11 @@ def _shower(
             picture = compare_pictures(frame.color, color_to_uint8(view.image.numpy()), frame.depth, depth, row)
             write_picture(folder.path / "renders" / f"compare{frame.index:06d}.png", picture)
         exposure = None
-        if exposed:
+        if typical is not None:
             measured = measure_exposure(frame.color, frame.depth, view.image.numpy(), view.alpha.numpy(), depth)
             exposure = identity_exposure() if measured is None else measured
-        return RenderedView(_picture(view), depth, by_3dgs, exposure)
+        usual = np.ones(3) if typical is None else typical
+        return RenderedView(_picture(view), depth, by_3dgs, exposure, usual)
 
     return show
 

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, GgslamError
 from ggslam.evaluation.surface import SurfaceScores, score_surface
 from ggslam.formats.point_ply import METRIC_FILE, read_points
+from ggslam.formats.point_sampling import USUAL_VOXEL
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.volumes.mesh import extract_mesh
-from ggslam.volumes.settings import TsdfSettings
-from ggslam.volumes.surface_points import FARTHEST, LEAST_WEIGHT
+from ggslam.volumes.surface_points import LEAST_WEIGHT, surface_settings
 from ggslam.volumes.tsdf import TsdfMap
 
 MOST_BLOCKS = 150_000
@@ -43,7 +43,8 @@ class SurfaceScorer:
             return
         self._points, self._voxel = cloud.points, cloud.voxel_size
         self._measured = np.zeros(len(self._points), bool)
-        self._tsdf = TsdfMap(TsdfSettings(voxel=self._voxel, max_depth=FARTHEST))
+        self._times = max(1.0, self._voxel / USUAL_VOXEL)
+        self._tsdf = TsdfMap(surface_settings(self._voxel, self._times))
 
     def _cloud_of(self, folder: RunFolder) -> VoxelCloud | None:
         """The points of a run; None, and a reason, where they are not scored."""
@@ -68,7 +69,11 @@ class SurfaceScorer:
             self.reason = f"{METRIC_FILE} is scored against the depth of the frames up to {frame.index}"
             return
         depth = frame.depth if frame.moving is None else np.where(frame.moving, np.float32(0), frame.depth)
-        self._tsdf.integrate(depth, frame.camera, T_world_camera)
+        try:
+            self._tsdf.integrate(depth, frame.camera, T_world_camera)
+        except GgslamError as error:  # points of an older run may have smaller voxels than go with its depth
+            self.reason, self._tsdf = f"its points are not scored: {error}", None
+            return
         rest = np.flatnonzero(~self._measured)
         row, column, inside = frame.camera.project(transform_points(self._points[rest], inverse(T_world_camera)))
         self._measured[rest] = inside & (depth[row, column] > 0)
@@ -82,7 +87,7 @@ class SurfaceScorer:
         """Of the points whose depth was measured; None if that are none."""
         if self._tsdf is None or not self._measured.any():
             return None
-        mesh = extract_mesh(self._tsdf, LEAST_WEIGHT)
+        mesh = extract_mesh(self._tsdf, LEAST_WEIGHT / self._times**2)
         if not len(mesh.vertices):
             return None
         return score_surface(self._points[self._measured], mesh.vertices, mesh.normals, self._voxel)

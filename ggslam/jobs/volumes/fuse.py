@@ -12,6 +12,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, RunFolderError, SequenceError
 from ggslam.formats.mesh_files import check_mesh_path
+from ggslam.geometry.scene_size import scene_scale
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.volumes.frames import FrameSource, frames_of_recording, frames_of_run
@@ -41,7 +42,7 @@ class VolumesRequest:
         scale: of the images of a run's recording; None: as the run did.
         recording: where a run's recording is now, if it was moved.
         out: folder of the results; None: `RUN/volumes`, or `volumes/NAME` of a recording.
-        voxel: of the TSDF, metres; None: as the settings say.
+        voxel: of the TSDF, metres; None: as the settings say; where they say nothing, as goes with the scene's size.
         esdf: whether a distance field is wanted.
         occupancy: voxel of the occupancy map in metres; None: none is wanted.
         mesh: file of the mesh; None: mesh.ply in `out`.
@@ -162,13 +163,13 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
         out = _folder(request, is_run)
         for note in [*source.sequence.warnings, *source.notes]:
             observer.note(note)
-        fused = _fuse(source, maps, observer)
+        fused = _fuse(source, maps, observer, request.voxel is None)
     if not fused.poses:
         raise fused.error if fused.error is not None else SequenceError(f"{request.source}: no frame could be fused")
     with delay_interrupts():
         maps.finish()
         if not len(maps.tsdf):
-            limits = config.volumes.tsdf
+            limits = maps.settings.tsdf
             raise SequenceError(
                 f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
             )
@@ -227,7 +228,8 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
     if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
         raise ConfigError(
             f"{request.source} is a run, read as it was made: `start`, `stop`, `stride`, `format`, `depth_scale`, "
-            "`pose_convention`, `camera`, `intrinsics`, `depth_camera` and `on_bad_frame` are for recordings"
+            "`pose_convention`, `camera`, `intrinsics`, `depth_camera`, `depth_kind`, `depth_delay`, `upright` and "
+            "`on_bad_frame` are for recordings"
         )
     if request.mesh is not None:
         _check_mesh(request.mesh, request.source)
@@ -261,11 +263,13 @@ def _source(request: VolumesRequest, is_run: bool) -> FrameSource:
     return frames_of_recording(request.sequence, request.objects)
 
 
-def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer) -> _Fused:
+def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer, fit_voxel: bool) -> _Fused:
     fused = _Fused(maps, source.name, names=source.names)
     observer.begin("fuse", len(source))
     try:
         for posed in source:
+            if not fused.poses:
+                maps.fit(scene_scale(posed.frame.depth), fit_voxel)
             maps.add(posed.frame, posed.T_world_camera, posed.labels)
             fused.saw(posed.frame, posed.T_world_camera)
             observer.advance(len(fused.poses), len(source))
@@ -293,7 +297,7 @@ def _level_occupancy(
 def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fused:
     """Tracks the recording into a run folder and fuses on the way."""
     fused = _Fused(maps, str(request.source))
-    follower = LiveVolumes(maps, fused.saw, request.objects)
+    follower = LiveVolumes(maps, fused.saw, request.objects, request.voxel is None)
     pace = [] if request.realtime is None else [f"realtime_fps={request.realtime}"]
     run = RunRequest(
         request.sequence, request.out, request.config, [*request.overrides, *pace], evaluate=False,
@@ -315,7 +319,8 @@ def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str,
     """What volumes.json says of where the volumes come from."""
     return {
         "source": fused.name, "live": request.live, "frames": len(fused.poses), "onto": request.onto,
-        "settings": config_to_dict(config)["volumes"], "times": fused.maps.times.summary(),
+        "settings": config_to_dict(replace(config, volumes=fused.maps.settings))["volumes"],
+        "times": fused.maps.times.summary(),
         "frames_a_window": WINDOW, "blocks_by_window": fused.maps.times.blocks[WINDOW - 1 :: WINDOW],
         "rebuilds_s": fused.maps.times.rebuilds,
         "stopped_by": None if fused.error is None else repr(fused.error),

@@ -24,11 +24,15 @@ class LiveVolumes:
         maps: to fuse into.
         saw: receives every frame that was fused, and its T_world_camera.
         objects: whether object ids are voted for.
+        fit_voxel: whether voxels, unless set, follow the size of the scene.
     """
 
-    def __init__(self, maps: VolumeMaps, saw: Callable[[Frame, np.ndarray], None], objects: bool = True) -> None:
+    def __init__(
+        self, maps: VolumeMaps, saw: Callable[[Frame, np.ndarray], None], objects: bool = True,
+        fit_voxel: bool = True,
+    ) -> None:  # fmt: skip
         self.maps = maps
-        self._saw, self._objects = saw, objects
+        self._saw, self._objects, self._fit_voxel = saw, objects, fit_voxel
         self._corrections = 0
         self._current: Callable[[np.ndarray], np.ndarray] | None = None
 
@@ -42,6 +46,8 @@ class LiveVolumes:
             self.maps.rebuild(_views(slam.mapper.keyframes, self._objects))
         if report.frame.status == TrackingStatus.LOST.value:
             return
+        if not self.maps.times.rows:
+            self.maps.fit(slam.scale, self._fit_voxel)
         T = slam.pose_of(report.frame)
         newest = slam.mapper.keyframes[-len(slam.cameras) :] if self._objects else []
         labels = next((keyframe.mask for keyframe in newest if keyframe.frame_index == frame.index), None)

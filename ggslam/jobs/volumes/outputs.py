@@ -45,7 +45,7 @@ from ggslam.volumes.floor_frame import (
     write_floor_file,
 )
 from ggslam.volumes.maps import VolumeMaps
-from ggslam.volumes.mesh import Mesh, extract_mesh
+from ggslam.volumes.mesh import Mesh
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.octomap_files import write_octomap
 from ggslam.volumes.output_frame import OutputFrame
@@ -106,7 +106,7 @@ class Surface:
     @staticmethod
     def of(maps: VolumeMaps, poses: Sequence[np.ndarray]) -> Surface:
         """The surface of finished maps."""
-        mesh, stacked = extract_mesh(maps.tsdf, min_triangles=SMALLEST_PIECE), np.array(poses)
+        mesh, stacked = maps.mesh(SMALLEST_PIECE), np.array(poses)
         # Marching cubes' vertices are spread evenly enough over surfaces to stand for their area.
         upright = estimate_up(stacked, mesh.vertices, mesh.normals)
         return Surface(mesh, upright, stacked, floor_from_map(upright, stacked))

@@ -9,12 +9,13 @@ from functools import partial
 import numpy as np
 import torch
 
-from ggslam.mapping.cpu.exposure import ExposureAdam
+from ggslam.mapping.color_changes import scale_colors, take_colors
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
+from ggslam.mapping.cpu.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.identity import MIN_WEIGHT, TERMS
-from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, ELSEWHERE, Keyframe, PoseAdam, make_keyframe
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
@@ -22,7 +23,7 @@ from ggslam.mapping.pixel_grid import WHOLE, PixelGrid, grid_of_turn
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.exposure import change_of, measure_exposure, without_exposure
+from ggslam.rendering.exposure import SeenAgain
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -63,9 +64,7 @@ class CpuMapper(Mapper):
         self._rasterizer = CpuRasterizer(context=context)
         self._loss = CpuImageLoss(context)
         self._pose_optimizers: list[PoseAdam] = []
-        self._exposure_optimizers: list[ExposureAdam] = []
-        self._exposure_changed = False
-        """Whether a keyframe has an anchor: as soon as one has, those that follow are compared with the map's."""
+        self._exposures = KeyframeExposures(settings.exposure)
 
     @property
     def losses(self) -> LossSums:
@@ -78,7 +77,7 @@ class CpuMapper(Mapper):
     def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         super().adopt(gaussians, keyframes)
         self._pose_optimizers = [PoseAdam() for _ in keyframes]
-        self._exposure_optimizers = [ExposureAdam(self.settings.exposure) for _ in keyframes]
+        self._exposures.adopt(len(keyframes))
 
     def render_view(self, camera: Camera, T_camera_world: np.ndarray) -> RenderBuffers:
         """The map as a camera sees it from a pose [4, 4], without identities; not beside `run`."""
@@ -86,20 +85,21 @@ class CpuMapper(Mapper):
 
     def _new_keyframe(self, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
         self._pose_optimizers.append(PoseAdam())
-        self._exposure_optimizers.append(ExposureAdam(self.settings.exposure))
+        self._exposures.add()
         return make_keyframe(len(self.keyframes), frame, T_world_camera)
 
     def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
         depth, s = keyframe.depth_m(), self.settings.insertion
         where, alpha = None, np.zeros(depth.shape, np.float32)
         show: Callable[[], MapLabels] | None = None
-        color = keyframe.color
+        seen: SeenAgain | None = None
         if self.map.count:
             view = self._render(keyframe, features=False, close_below=self.settings.close_below)
             alpha, rendered = view.alpha.numpy(), view.expected_depth.numpy()
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
-            color = self._compensate(keyframe, depth, view, rendered)
+            seen = SeenAgain(view.image.numpy(), alpha, rendered, depth)
+        color = self._colors(keyframe, seen)
         valid = self.valid_of(keyframe)
         if valid is not None:
             alpha = np.where(valid, alpha, np.float32(1))  # where images show nothing there is nothing to fill
@@ -120,36 +120,44 @@ class CpuMapper(Mapper):
                 labels = np.zeros(len(new.pixels), np.uint16) if mask is None else mask.reshape(-1)[new.pixels]
                 self.identity.begin(self.map, rows, labels)
 
-    def _compensate(
-        self, keyframe: Keyframe, depth: np.ndarray, view: RenderBuffers, rendered_depth: np.ndarray
-    ) -> np.ndarray:
-        """A keyframe seen with another exposure than the map gets what is measured; its colours [H, W, 3] as the map's
-        exposure would have shown them."""
+    def _colors(self, keyframe: Keyframe, seen: SeenAgain | None) -> np.ndarray:
+        """Colours [H, W, 3] that Gaussians of a new keyframe get: as the map's exposure shows them. Of a keyframe that
+        shows none, those that most of the map has."""
+        exposures = self._exposures
+        if exposures.lights_up(keyframe, seen):
+            take_colors(self.map, keyframe)
+        elif exposures.blind[keyframe.index]:
+            usual = np.median(self.map.rgb.numpy(), axis=0).clip(0, 1)
+            return np.broadcast_to(np.rint(255 * usual).astype(np.uint8), keyframe.color.shape).copy()
+        elif seen is not None:
+            return exposures.compensate(keyframe, seen, self.keyframes)
+        return keyframe.color
+
+    def use_typical_exposure(self, at_end: bool = False) -> None:
+        if at_end:
+            self._measure_exposures()
+        gain = self._exposures.typical(self.keyframes)
+        if gain is None or (not at_end and np.abs(np.log(gain)).max() < self.settings.exposure.typical):
+            return
+        scale_colors(self.map, gain)
+        if self.residency is not None:
+            self.residency.scale_colors(gain)
+        self._exposures.follow(gain, self.keyframes)
+
+    def _measure_exposures(self) -> None:
+        """Keyframes but those of an earlier map are compared with the map as trained by now: exposures are measured
+        again, and keyframes that are much less sharp colour it no longer."""
         if not self.settings.exposure.compensate:
-            return keyframe.color
-        images = (view.image.numpy(), view.alpha.numpy(), rendered_depth)
-        found = measure_exposure(keyframe.color, depth, *images)
-        if found is None:
-            return keyframe.color
-        self._exposure_optimizers[keyframe.index].measured = found
-        if not self._exposure_changed and abs(np.log(change_of(found))) > self.settings.exposure.change:
-            for earlier in self.keyframes:
-                self._anchor(earlier)
-            self._exposure_changed = True
-        return self._anchor(keyframe) if self._exposure_changed else keyframe.color
+            return
+        for keyframe in (self.keyframes[number] for number in self._trainable()):
+            if keyframe.frame_index != ELSEWHERE:
+                view = self._render(keyframe, features=False)
+                self._exposures.measure_again(keyframe, self._look(keyframe, view))
 
-    def _anchor(self, keyframe: Keyframe) -> np.ndarray:
-        """Gives a keyframe the exposure that was measured, if it differs from the map's; returns as `_compensate`."""
-        optimizer = self._exposure_optimizers[keyframe.index]
-        measured = optimizer.measured
-        if np.abs(np.log(measured[:, 0])).max() < self.settings.exposure.least:
-            return keyframe.color
-        keyframe.exposure, optimizer.anchor = measured.copy(), measured
-        return without_exposure(keyframe.color, measured)
-
-    def _is_exposed(self, keyframe: Keyframe) -> bool:
-        """Whether it has an exposure of its own."""
-        return self.settings.exposure.enabled or self._exposure_optimizers[keyframe.index].is_anchored
+    @staticmethod
+    def _look(keyframe: Keyframe, view: RenderBuffers) -> SeenAgain:
+        """What a view of the map shows where a keyframe looks; good until the next rendering."""
+        return SeenAgain(view.image.numpy(), view.alpha.numpy(), view.expected_depth.numpy(), keyframe.depth_m())
 
     def _show_labels(self, alpha: np.ndarray, depth: np.ndarray, stride: int = 2) -> MapLabels:
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
@@ -188,11 +196,13 @@ class CpuMapper(Mapper):
         )
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CpuLossResult:
-        exposure = keyframe.exposure if self._is_exposed(keyframe) else None
-        valid = self.valid_of(keyframe)
+        exposure = keyframe.exposure if self._exposures.is_exposed(keyframe) else None
+        valid, compared = self.valid_of(keyframe), self._exposures.usable_pixels(keyframe)
+        if compared is not None:
+            valid = compared if valid is None else valid & compared
         color, depth = grid.of(keyframe.color), grid.of(keyframe.depth)
         shown = None if valid is None else grid.of(valid)
-        target = LossTarget(color, depth, 1 / DEPTH_UNITS_PER_METRE, exposure, shown)
+        target = LossTarget(color, depth, keyframe.depth_unit, exposure, shown)
         return self._loss.evaluate(view, target, self.settings.loss)
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
@@ -200,8 +210,8 @@ class CpuMapper(Mapper):
             optimizer, T_before = self._pose_optimizers[keyframe.index], keyframe.T_camera_world
             keyframe.T_camera_world = optimizer.step(T_before, twist, pose_rate)
             self._move_rig(keyframe, T_before)
-        if keyframe.index > 0 and self._is_exposed(keyframe):
-            optimizer_of_exposure = self._exposure_optimizers[keyframe.index]
+        if keyframe.index > 0 and self._exposures.is_exposed(keyframe):
+            optimizer_of_exposure = self._exposures.optimizers[keyframe.index]
             keyframe.exposure = optimizer_of_exposure.step(keyframe.exposure, loss.exposure_gradient)
         self._last_psnr = loss.psnr
         self._losses.total += loss.values.total

@@ -23,7 +23,7 @@ from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages, Image
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
 from ggslam.mapping.deformation import move_with_keyframes
-from ggslam.mapping.keyframe import DEPTH_UNITS_PER_METRE, Keyframe, make_keyframe
+from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import WHOLE_END_SHARE, LossSums, Mapper
@@ -162,7 +162,7 @@ class CudaMapper(Mapper):
     ) -> Selection:  # fmt: skip
         """Starts to choose the pixels of a keyframe that the map, rendered as `alpha` and `depth`, does not explain."""
         return self._insertion.select(
-            images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, alpha, depth, keyframe.camera, T_world_camera,
+            images.color, images.depth, keyframe.depth_unit, alpha, depth, keyframe.camera, T_world_camera,
             self.settings.insertion,
         )  # fmt: skip
 
@@ -197,7 +197,7 @@ class CudaMapper(Mapper):
         if valid is not None and (self._valid_on_device is None or self._valid_on_device[0] is not valid):
             self._valid_on_device = (valid, torch.from_numpy(valid).to(self.device))
         shown = None if valid is None or self._valid_on_device is None else self._valid_on_device[1]
-        target = LossTarget(images.color, images.depth, 1 / DEPTH_UNITS_PER_METRE, exposure, shown)
+        target = LossTarget(images.color, images.depth, keyframe.depth_unit, exposure, shown)
         return self._loss.evaluate(view, target, s.loss)
 
     def _finish_step(self, keyframe: Keyframe, twist: torch.Tensor, loss: CudaLossResult, pose_rate: float) -> None:

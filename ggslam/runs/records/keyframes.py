@@ -8,7 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from ggslam.errors import RunFolderError
-from ggslam.rendering.exposure import identity_exposure
+from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.rendering.exposure import frame_weights, identity_exposure, typical_gain
 from ggslam.runs.records.record import Array, NumberOrNone, Record, RecordFile
 from ggslam.slam.result import SlamResult
 
@@ -81,6 +82,12 @@ class KeyframesRecord(RecordFile):
     def keyframe_numbers(self) -> set[int]:
         """Indices of the frames that became keyframes."""
         return {k.frame for k in self.keyframes}
+
+    def typical_exposure(self) -> np.ndarray:
+        """Median gain [3] against the map over the run's frames, see `rendering.exposure.typical_gain`."""
+        own = [k for k in self.keyframes if k.frame != ELSEWHERE]
+        gains = [np.ones(3) if k.exposure is None else k.exposure[:, 0] for k in own]
+        return typical_gain(gains, frame_weights([k.frame for k in own])) if own else np.ones(3)
 
     def notes(self) -> list[str]:
         """What a user should know, a line each."""

@@ -45,6 +45,10 @@ class OpenRecord(Record):
     pose_convention: str | None = None
     camera: str | None = None
     intrinsics: str | None = None
+    depth_kind: str | None = None
+    depth_delay: str | None = None
+    upright: bool = False
+    void_id: int | None = None
 
 
 class SkippedRecord(Record):

@@ -83,6 +83,7 @@ class FolderFormat:
             instance_names=_instances(path, settings),
             camera_source="" if path.name == CAMERA_FILE else path.name,
         )  # fmt: skip
+        _hint_at_numbering(recording, pairs.colors)
         if (folder / "poses.txt").is_file():
             options.add_truth(recording, lambda: _add_poses(recording, folder / "poses.txt"))
         return recording
@@ -149,6 +150,22 @@ def _numbered_times(folder: Path, colors: list[Path]) -> np.ndarray:
     depths = image_numbers(depth_images(folder / "depth"))
     first = numbers[0] if depths is None else min(numbers[0], depths[0])
     return (numbers - first) / np.median(steps)
+
+
+def _hint_at_numbering(recording: Recording, colors: list[Path]) -> None:
+    """Says of a missing depth image that depth may be numbered from another start, if there are as many."""
+    depths = depth_images(recording.path / "depth")
+    first, other = image_numbers(colors), image_numbers(depths)
+    if not recording.problems or first is None or other is None or len(first) != len(other):
+        return
+    step = int(other[0] - first[0])
+    if step == 0 or (other - first != step).any():
+        return
+    at = min(recording.problems)
+    recording.problems[at] += (
+        f"; depth images are numbered {other[0]} to {other[-1]}, colour images {first[0]} to {first[-1]}: if the first "
+        f"belong together, `depth_delay` {-step}f pairs them"
+    )
 
 
 def _add_poses(recording: Recording, path: Path) -> None:

@@ -178,7 +178,7 @@ def _color_camera(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera
     if own is None or own.camera is not None:
         return None if own is None else own.camera
     width, height = image_size(read_color(recording.files[0].color))
-    return None if own.calibration is None else Camera(width, height, *own.calibration)
+    return None if own.calibration is None else camera_of(own.source, width, height, *own.calibration)
 
 
 def _camera(place: str, info: Any, rectified: bool) -> Camera:

@@ -56,7 +56,7 @@ class SevenScenesFormat:
             )
         recording = Recording(
             self.name, folder, files, nominal_timestamps(len(files)), 1000.0, calibration=calibration,
-            invalid_depth=65535, problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
+            problems=missing_depth_problems(files), warnings=warnings, camera_source=source,
         )  # fmt: skip
         options.add_truth(recording, lambda: _add_poses(recording, bases))
         return recording

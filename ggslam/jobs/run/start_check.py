@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A look at a recording's depth and masks before a run spends its time on it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ggslam.errors import SequenceError
+from ggslam.jobs.progress import Observer
+from ggslam.sequences import Sequence
+from ggslam.sequences.depth_doubts import DepthDoubts
+from ggslam.sequences.inspection import VOID_TEXT
+from ggslam.sequences.live import LiveSequence
+from ggslam.sequences.rig import RigSequence
+from ggslam.sequences.verdicts import Verdict
+from ggslam.sequences.void_ids import has_void_id
+
+
+def check_depth(sequence: Sequence | LiveSequence, observer: Observer) -> list[Verdict]:
+    """What is doubtful about depth; each is told as a note.
+
+    Raises:
+        SequenceError: depth is certainly not what it is taken for; says what it is and what to do.
+    """
+    try:
+        found = _judge(sequence)
+    except Exception as error:  # the run itself will tell what is wrong with images, if it matters
+        observer.note(f"depth could not be checked: {error!r}")
+        return []
+    certain = [verdict.text for verdict in found if verdict.severity == "wrong"]
+    if certain:
+        raise SequenceError(f"{sequence.path}: {'; '.join(certain)} (or `check` to run it as it is)")
+    for verdict in found:
+        observer.note(verdict.text)
+    return found
+
+
+def _judge(sequence: Sequence | LiveSequence) -> list[Verdict]:
+    if isinstance(sequence, LiveSequence):
+        return []
+    if isinstance(sequence, RigSequence):
+        return [
+            replace(verdict, text=f"{part.name}: {verdict.text}")
+            for part in sequence.parts for verdict in DepthDoubts(part.sequence).judge()
+        ]  # fmt: skip
+    void = [Verdict("void_id", "doubtful", VOID_TEXT)] if has_void_id(sequence) else []
+    return [*DepthDoubts(sequence).judge(), *void]

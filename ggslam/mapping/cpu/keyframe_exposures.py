@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exposures of the keyframes against the map's, and keyframes whose colours tell nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ggslam.mapping.cpu.exposure import ExposureAdam
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.settings import ExposureSettings
+from ggslam.rendering.exposure import (
+    BRIGHT,
+    SeenAgain,
+    change_of,
+    frame_weights,
+    identity_exposure,
+    is_lit,
+    relative_sharpness,
+    shows_otherwise,
+    typical_gain,
+    without_exposure,
+)
+
+FEWEST_KEYFRAMES = 3
+"""So many exposures have to be known before one of them is called typical."""
+OVEREXPOSED = 1.1
+"""Where a keyframe is so much brighter than the map its saturated pixels are not compared: the map may be brighter."""
+BLURRED = 0.5
+"""A keyframe with less contrast from pixel to pixel than this share of the map's is out of focus; hands that shake
+leave 0.76 or more, a blur of four pixels 0.26."""
+
+
+class KeyframeExposures:
+    """What is known of the exposure of each keyframe of one mapper, by number.
+
+    Args:
+        settings: see there.
+
+    Attributes:
+        optimizers: of the exposures.
+        changed: whether a keyframe has an anchor: as soon as one has, those that follow are compared with the map's.
+        known: whether an exposure was measured, or is the map's own.
+        blind: whether colours tell nothing: the image is nearly black, saturated, or much less sharp than the map,
+            and others show that there is more to see.
+        found_lit: whether a keyframe has shown colours; those before are blind.
+    """
+
+    def __init__(self, settings: ExposureSettings) -> None:
+        self.settings = settings
+        self.optimizers: list[ExposureAdam] = []
+        self.changed = False
+        self.known: list[bool] = []
+        self.blind: list[bool] = []
+        self.found_lit = False
+
+    def adopt(self, count: int) -> None:
+        """Starts with so many keyframes of an earlier run, whose exposures are what they are."""
+        self.optimizers = [ExposureAdam(self.settings) for _ in range(count)]
+        self.known, self.blind, self.found_lit = [True] * count, [False] * count, count > 0
+
+    def add(self) -> None:
+        """A keyframe is about to follow."""
+        self.optimizers.append(ExposureAdam(self.settings))
+        self.known.append(False)
+        self.blind.append(False)
+
+    def lights_up(self, keyframe: Keyframe, seen: SeenAgain | None) -> bool:
+        """Whether a new keyframe is the first to show colours, of a map that has none so far: it is to take them from
+        there. If it has itself none it is blind.
+
+        Args:
+            keyframe: the new one.
+            seen: what the map shows where the keyframe looks; None: there is none.
+        """
+        if not self.settings.compensate:
+            return False
+        lit = is_lit(keyframe.color)
+        if self.found_lit:
+            self.blind[keyframe.index] = not lit and seen is not None and shows_otherwise(keyframe.color, seen)
+            return False
+        self.found_lit = lit
+        if not lit or keyframe.index == 0 or seen is None or not shows_otherwise(keyframe.color, seen):
+            self.known[keyframe.index] = lit
+            return False
+        self.blind[: keyframe.index] = [True] * keyframe.index
+        self.known[keyframe.index] = True
+        return True
+
+    def compensate(self, keyframe: Keyframe, seen: SeenAgain, keyframes: Sequence[Keyframe]) -> np.ndarray:
+        """A keyframe seen with another exposure than the map gets what is measured; its colours [H, W, 3] as the map's
+        exposure would have shown them.
+
+        Args:
+            keyframe: the new one.
+            seen: what the map shows where the keyframe looks.
+            keyframes: those before.
+        """
+        if not self.settings.compensate or self.blind[keyframe.index] or not self.found_lit:
+            return keyframe.color
+        found = seen.measure(keyframe.color)
+        if found is None:
+            return keyframe.color
+        self.known[keyframe.index] = True
+        self.optimizers[keyframe.index].measured = found
+        if not self.changed and abs(np.log(change_of(found))) > self.settings.change:
+            for earlier in keyframes:
+                self._anchor(earlier)
+            self.changed = True
+        return self._anchor(keyframe) if self.changed else keyframe.color
+
+    def _anchor(self, keyframe: Keyframe) -> np.ndarray:
+        """Gives a keyframe the exposure that was measured, if it differs from the map's; returns as `compensate`."""
+        optimizer = self.optimizers[keyframe.index]
+        measured = optimizer.measured
+        if np.abs(np.log(measured[:, 0])).max() < self.settings.least:
+            return keyframe.color
+        keyframe.exposure, optimizer.anchor = measured.copy(), measured
+        return without_exposure(keyframe.color, measured)
+
+    def measure_again(self, keyframe: Keyframe, seen: SeenAgain) -> None:
+        """A keyframe of a map that has been trained since gets what is measured against it, where exposures changed;
+        if the map is much sharper than its image it is blind."""
+        if self.blind[keyframe.index]:
+            return
+        found = seen.measure(keyframe.color) if self.changed else None
+        if found is not None:
+            self.known[keyframe.index] = True
+            keyframe.exposure, self.optimizers[keyframe.index].anchor = found.copy(), found
+        self.blind[keyframe.index] = relative_sharpness(keyframe.color, seen, keyframe.exposure) < BLURRED
+
+    def is_exposed(self, keyframe: Keyframe) -> bool:
+        """Whether a keyframe has an exposure of its own."""
+        return self.settings.enabled or self.optimizers[keyframe.index].is_anchored
+
+    def usable_pixels(self, keyframe: Keyframe) -> np.ndarray | None:
+        """Where the colours of a keyframe tell something, bool [H, W]; None: everywhere."""
+        if self.blind[keyframe.index]:
+            return np.zeros(keyframe.color.shape[:2], bool)
+        if self.is_exposed(keyframe) and change_of(keyframe.exposure) > OVEREXPOSED:
+            return np.asarray((keyframe.color < BRIGHT * 255).all(2))
+        return None
+
+    def typical(self, keyframes: Sequence[Keyframe]) -> np.ndarray | None:
+        """Median gain against the map, [3], over the frames that the keyframes stand for. None if the exposure did not
+        change, too little is known, or the map was made before: it keeps what it was trained with."""
+        if not self.changed or any(keyframe.frame_index == ELSEWHERE for keyframe in keyframes):
+            return None
+        weights = frame_weights([keyframe.frame_index for keyframe in keyframes])
+        told = [k.index for k in keyframes if self.known[k.index] and not self.blind[k.index]]
+        if len(told) < FEWEST_KEYFRAMES:
+            return None
+        return typical_gain([keyframes[number].exposure[:, 0] for number in told], weights[told])
+
+    def follow(self, gain: np.ndarray, keyframes: Sequence[Keyframe]) -> None:
+        """The map became `gain` [3] times as bright: every exposure is against that from here on."""
+        for keyframe in keyframes:
+            optimizer = self.optimizers[keyframe.index]
+            keyframe.exposure = _against(keyframe.exposure, gain)
+            optimizer.anchor, optimizer.measured = _against(optimizer.anchor, gain), _against(optimizer.measured, gain)
+            optimizer.first[:, 0] *= gain  # gradients with respect to a gain are as large as the map is bright
+            optimizer.second[:, 0] *= gain**2
+
+
+def _against(exposure: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """An exposure [3, 2] against a map that is `gain` times as bright."""
+    out = exposure / np.stack([gain, np.ones(3)], axis=1)
+    return out if np.abs(out - identity_exposure()).max() > 1e-6 else identity_exposure()

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images that a recording holds several times: the same depth beside new colour, or the same colour beside new
+depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.recording import ImageFile
+from ggslam.sequences.sequence import Sequence
+from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
+
+PLACES, LENGTH = 3, 9
+"""Where in a recording one looks, and how many successive frames there."""
+FEWEST, LEAST_SHARE = 3, 0.1
+"""Pairs of neighbours that are alike, and their share, from which it is told."""
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Neighbouring frames of which one image is the same and the other is not.
+
+    Attributes:
+        pairs: neighbours that were compared.
+        depth: pairs with the same depth and other colour.
+        color: pairs with the same colour and other depth.
+    """
+
+    pairs: int
+    depth: int
+    color: int
+
+    def many(self, count: int) -> bool:
+        """Whether so many pairs are worth a word."""
+        return count >= FEWEST and count >= LEAST_SHARE * self.pairs
+
+
+def find_repeats(sequence: Sequence) -> Repeats:
+    """Compares neighbours at some places of a recording, byte by byte."""
+    pairs = depth = color = 0
+    first = np.unique(np.linspace(0, max(len(sequence) - LENGTH, 0), PLACES).round().astype(int))
+    numbers = sorted({k for at in first.tolist() for k in range(at, min(at + LENGTH, len(sequence)) - 1)})
+    for number in numbers:
+        try:
+            here, there = sequence.files(number), sequence.files(number + 1)
+            same_depth, same_color = _alike(here.depth, there.depth), _alike(here.color, there.color)
+        except SequenceError:
+            continue
+        pairs += 1
+        depth += same_depth and not same_color
+        color += same_color and not same_depth
+    return Repeats(pairs, depth, color)
+
+
+def _alike(a: ImageFile, b: ImageFile) -> bool:
+    """Whether two images are the same: files by their bytes, others by their pixels."""
+    if isinstance(a, Path) and isinstance(b, Path):
+        return a == b or read_foreign(a, MAX_IMAGE_BYTES, SequenceError) == read_foreign(
+            b, MAX_IMAGE_BYTES, SequenceError
+        )
+    if isinstance(a, Path) or isinstance(b, Path):
+        return False
+    return bool(np.array_equal(a.read(), b.read()))

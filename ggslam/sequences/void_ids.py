@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The id 255 of masks, which VOC, DAVIS and their like give to pixels that nobody decided about."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.mask_images import EQUAL_CHANNELS, read_mask_image
+from ggslam.sequences.sequence import Sequence
+
+VOID = 255
+LOOKS = 8
+LEAST_SHARE = 0.5
+"""Of the masks that hold the id."""
+LARGEST_OTHER = 127
+"""Ids of things are counted from 1: one that is so far from all others is none."""
+
+
+def has_void_id(sequence: Sequence) -> bool:
+    """Whether 255 stands in most masks of a recording, far from all other ids, and no name says that it is a thing."""
+    if not sequence.has_masks or VOID in sequence.instance_names or sequence.void_id == VOID:
+        return False
+    held, others = [], 0
+    for number in np.unique(np.linspace(0, len(sequence) - 1, LOOKS).round().astype(int)):
+        path = sequence.files(int(number)).mask
+        try:
+            image = None if path is None else read_mask_image(path)
+        except SequenceError:
+            continue
+        if image is None:
+            continue
+        codes = np.unique(image.codes // EQUAL_CHANNELS if image.equal_channels else image.codes)
+        held.append(VOID in codes)
+        others = max([others, *(int(code) for code in codes if code != VOID)])
+    return bool(held) and float(np.mean(held)) >= LEAST_SHARE and 0 < others <= LARGEST_OTHER
