@@ -89,16 +89,16 @@ class MapParts:
         counts = Counter(loops.parts.of[keyframe] for keyframe in located if keyframe < len(loops.poses))
         return min(counts, key=lambda part: (-counts[part], part), default=0)
 
-    def kept(self) -> list[int]:
+    def kept_numbers(self) -> list[int]:
         """Numbers of the keyframes that are the result."""
         return [k for k in range(len(self._mapper.keyframes)) if k not in self._mapper.left_out]
 
     def keyframes(self) -> list[Keyframe]:
         """Those that are the result, numbered as there are no others."""
-        keyframes, kept = self._mapper.keyframes, self.kept()
+        keyframes, kept = self._mapper.keyframes, self.kept_numbers()
         if len(kept) == len(keyframes):
             return keyframes
-        return [_numbered(keyframes[k], number) for number, k in enumerate(kept)]
+        return [_with_number(keyframes[k], number) for number, k in enumerate(kept)]
 
     def frames(self) -> list[TrackedFrame]:
         """The frames, which hang on these keyframes."""
@@ -168,7 +168,7 @@ def _stretches(numbers: Sequence[int]) -> list[tuple[int, int]]:
     return [(numbers[a], numbers[b]) for a, b in zip(firsts, lasts, strict=True)]
 
 
-def _numbered(keyframe: Keyframe, number: int) -> Keyframe:
+def _with_number(keyframe: Keyframe, number: int) -> Keyframe:
     """A keyframe with another number, in the host's memory."""
     values = {of.name: getattr(keyframe, of.name) for of in fields(Keyframe)}
     return Keyframe(**{**values, "index": number, "archive": None})

@@ -50,7 +50,7 @@ def find_links(
     for k in np.unique(np.linspace(0, len(asked) - 1, min(len(asked), QUERIES)).round().astype(int)).tolist():
         new, own = asked[k], parts.members(asked[k])
         place = places.with_words(places[new])
-        points = disc_points(*surface.measured(new), comparison.noise)
+        points = disc_points(*surface.points_and_normals(new), comparison.noise)
         for match in places.query(place, candidates, own.__contains__):
             found, _ = comparison.find(points, place, places, poses, match.number, camera)
             if found.accepted:

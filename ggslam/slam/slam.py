@@ -270,7 +270,7 @@ class Slam:
         if self.loops is None or not len(self.surface):
             return None
         parts = [gaussians] if cells is None else (part for _, part in cells.parts())
-        kept = self._parts.kept()
+        kept = self._parts.kept_numbers()
         keyframes = [self.mapper.keyframes[k] for k in kept]
         poses = np.stack([k.T_world_camera for k in keyframes])
         noise = self.tracker.noise or DepthNoise()

@@ -205,7 +205,7 @@ class MeasuredSurface:
         for numbers in self._joined:
             self.target = self._gather([self._parts[number] for number in numbers], self.target)
 
-    def measured(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+    def points_and_normals(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Points, metres, and normals float32 [n, 3] of a keyframe in its camera's frame."""
         return self._parts[number].points, self._parts[number].normals
 
