@@ -29,6 +29,11 @@ CELLS, CELL_PIXELS = 4, 8
 """The image has `CELLS` x `CELLS` parts, of which those count that have so many textured pixels..."""
 STILL_CELLS, STILL_SHARE = 0.5, 0.5
 """...and such a share of them has to stand still: such a share of its pixels."""
+WAYS = ((1.0, 0.0), (0.7071, 0.7071), (0.0, 1.0), (-0.7071, 0.7071))
+"""Directions in the image; along each..."""
+ACROSS, FEWEST_ACROSS = 0.7, 50
+"""...motion is told by pixels whose gradient lies along it to this share; there must be so many, and `STILL_SHARE` of
+them has to stay: edges along a motion stay, however far it goes."""
 STILL_DEPTH, DEPTH_SIGMAS = 0.6, 4.0
 """Share of the pixels that stand still whose depth stays, within so many standard deviations."""
 MOSTLY = 0.5
@@ -97,7 +102,7 @@ def is_still(anchor: SmallFrame, now: SmallFrame, noise: DepthNoise) -> bool:
     difference = cv2.GaussianBlur(now.grey, (3, 3), 0.7)[rows, columns] - smooth[rows, columns]
     slope = np.hypot(gx, gy)
     stays = np.abs(difference - np.median(difference)) < LARGEST_FLOW * slope
-    if not _is_all_over(rows, columns, stays, anchor.grey.shape):
+    if not (_is_all_over(rows, columns, stays, anchor.grey.shape) and _stays_each_way(gx / slope, gy / slope, stays)):
         return False
     shifts = _shifts(rows, columns, gx, gy, smooth[rows, columns], difference, stays, anchor.grey.shape)
     if shifts is None or np.abs(shifts).max() > LARGEST_SHIFT:
@@ -114,6 +119,13 @@ def _is_all_over(rows: np.ndarray, columns: np.ndarray, stays: np.ndarray, shape
     still = np.bincount(cells[stays], minlength=CELLS**2)
     counted = textured >= CELL_PIXELS
     return bool(counted.sum() >= CELLS and (still[counted] >= STILL_SHARE * textured[counted]).mean() >= STILL_CELLS)
+
+
+def _stays_each_way(x: np.ndarray, y: np.ndarray, stays: np.ndarray) -> bool:
+    """Whether, for each direction in the image, most of the pixels stay that would show a motion along it; `x`, `y`:
+    unit gradients."""
+    telling = [np.abs(x * way[0] + y * way[1]) >= ACROSS for way in WAYS]
+    return all(one.sum() >= FEWEST_ACROSS and stays[one].mean() >= STILL_SHARE for one in telling)
 
 
 def _shifts(

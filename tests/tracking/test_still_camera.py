@@ -78,6 +78,22 @@ def test_what_is_fixed_to_the_camera_is_no_still_camera(caster: RayCaster) -> No
     assert not is_still(frames[0], frames[1], NOISE)
 
 
+def tiles(shift: float, seed: int) -> SmallFrame:
+    """A tiled wall at 2 m, whose joints are 12 pixels apart, seen from so many pixels farther left."""
+    columns, rows = np.meshgrid(np.arange(160) + shift, np.arange(120))
+    grey = np.where((columns / 12 % 1 > 0.12) & (rows / 12 % 1 > 0.12), 200, 60)
+    grey = grey + np.random.default_rng(seed).normal(0, 2, grey.shape)
+    color = np.repeat(grey[..., None], 3, 2).clip(0, 255).astype(np.uint8)
+    return SmallFrame.of(color, np.full((120, 160), 2, np.float32))
+
+
+@pytest.mark.parametrize("shift", [3.8, 5.0, 7.8, 15.6])
+def test_edges_along_a_motion_tell_nothing_of_it(shift: float) -> None:
+    """Half of the edges are horizontal, and stay where they are when the camera moves sideways."""
+    assert is_still(tiles(0, 0), tiles(0, 1), NOISE)
+    assert not is_still(tiles(0, 0), tiles(shift, 1), NOISE)
+
+
 def test_an_image_without_texture_tells_nothing() -> None:
     blank = SmallFrame.of(np.full((240, 320, 3), 90, np.uint8), np.full((240, 320), 2, np.float32))
     assert not is_still(blank, blank, NOISE)
