@@ -15,11 +15,11 @@ from ggslam.sequences.sequence import Sequence
 
 REACH = 2
 """Frames before and after."""
-PLACES = 4
-"""Where in a recording one looks."""
+PLACES, FEWEST_PLACES = 6, 3
+"""Where in a recording one looks, and at how many of them outlines have to be seen."""
 LEAST_GAIN, LEAST_SHARE = 0.05, 0.1
 """By how much another frame's colour must fit better, in standard deviations of the edge images, and as a share of how
-well that fits."""
+well that fits; without any one of the places, too: a black, blurred or overexposed start is sharper later on."""
 
 
 @dataclass(frozen=True)
@@ -30,36 +30,43 @@ class StepDoubt:
         behind: frames that depth is behind colour; negative: ahead of it. Either may be the largest looked at.
         strength: of the colour's edges under the outlines of depth as they stand, in standard deviations.
         best: the same of the colour of the frame that fits best.
+        agreed: whether that frame fits clearly better wherever one looks, any one place left out.
     """
 
     behind: int
     strength: float
     best: float
+    agreed: bool = True
 
     @property
     def wrong(self) -> bool:
         """Whether another frame's colour fits clearly better."""
-        gain = self.best - self.strength
-        return self.behind != 0 and gain > max(LEAST_GAIN, LEAST_SHARE * self.best)
+        return self.agreed and self.behind != 0 and _is_clear(self.strength, self.best)
+
+
+def _is_clear(strength: float, best: float) -> bool:
+    return best - strength > max(LEAST_GAIN, LEAST_SHARE * best)
 
 
 def doubt_steps(sequence: Sequence) -> StepDoubt | None:
     """Compares depth with the colour of neighbouring frames; None if too few outlines are seen or frames are few."""
     if len(sequence) < 2 * REACH + 1:
         return None
-    sums, used = np.zeros(2 * REACH + 1), 0
+    found = []
     for middle in np.unique(np.linspace(REACH, len(sequence) - 1 - REACH, PLACES).round().astype(int)):
         try:
             frames = [sequence.frame(int(k), masks=False) for k in range(middle - REACH, middle + REACH + 1)]
         except SequenceError:
             continue
-        found = _strengths(frames)
-        if found is not None:
-            sums, used = sums + found, used + 1
-    if used < 2:
+        strengths = _strengths(frames)
+        found += [] if strengths is None else [strengths]
+    if len(found) < FEWEST_PLACES:
         return None
-    best = int(sums.argmax())
-    return StepDoubt(REACH - best, float(sums[REACH]) / used, float(sums[best]) / used)
+    places = np.stack(found)
+    mean, others = places.mean(0), (places.sum(0) - places) / (len(places) - 1)
+    best = int(mean.argmax())
+    agreed = all(_is_clear(float(rest[REACH]), float(rest[best])) for rest in others)
+    return StepDoubt(REACH - best, float(mean[REACH]), float(mean[best]), agreed)
 
 
 def _strengths(frames: list[Frame]) -> np.ndarray | None:
