@@ -212,6 +212,11 @@ class DepthDoubts:
                 f"{same} images repeat: {count} of {found.pairs} neighbouring frames that were compared hold the same "
                 f"{same} beside other {other}, so most {same} is of another time{remedy}"
             )
+            if code == "color_repeats" and found.blank:
+                text = (
+                    f"colour images are blank: {count} of {found.pairs + 1} that were compared hold one colour and "
+                    f"nothing else; take the cover off the lens, or look how the images were written"
+                )
             verdicts.append(Verdict(code, "doubtful", text))
         return verdicts
 

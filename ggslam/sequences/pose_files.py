@@ -85,7 +85,7 @@ def read_pose_rows(path: Path, counts: tuple[int, ...] = (7, 8, 9, 12, 16)) -> P
             problems[row] = f"{path}, line {number}: expected {expected} numbers, found {held}"
             continue
         T = pose_of_numbers(values[:8] if count == 9 else values)
-        reason = invalid_pose_reason(T)
+        reason = _no_rotation_reason(values, count) or invalid_pose_reason(T)
         if reason is None:
             poses[row] = T
         else:
@@ -93,6 +93,15 @@ def read_pose_rows(path: Path, counts: tuple[int, ...] = (7, 8, 9, 12, 16)) -> P
         if count in (8, 9):
             stamps[row], ids[row] = values[0], values[-1]
     return PoseRows(path, poses, stamps if count in (8, 9) else None, ids if count == 9 else None, problems)
+
+
+def _no_rotation_reason(values: np.ndarray, count: int) -> str | None:
+    """That the finite numbers of a line hold a quaternion that is far from unit length; None if they do not."""
+    if count == MATRIX or not np.isfinite(values).all():
+        return None
+    quaternion = values[3:7] if count == 7 else values[4:8]
+    length = float(np.linalg.norm(quaternion))
+    return None if 0.5 < length <= MOST else f"pose holds a quaternion of length {length:.3g}, not 1"
 
 
 def _names_columns(line: str, count: int) -> bool:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.sequences.images import read_color
 from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
 from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
@@ -28,11 +29,13 @@ class Repeats:
         pairs: neighbours that were compared.
         depth: pairs with the same depth and other colour.
         color: pairs with the same colour and other depth.
+        blank: whether the images that are the same there show one colour and nothing else.
     """
 
     pairs: int
     depth: int
     color: int
+    blank: bool = False
 
     def many(self, count: int) -> bool:
         """Whether so many pairs are worth a word."""
@@ -42,6 +45,7 @@ class Repeats:
 def find_repeats(sequence: Sequence) -> Repeats:
     """Compares neighbours at some places of a recording, byte by byte."""
     pairs = depth = color = 0
+    blank = True
     first = np.unique(np.linspace(0, max(len(sequence) - LENGTH, 0), PLACES).round().astype(int))
     numbers = sorted({k for at in first.tolist() for k in range(at, min(at + LENGTH, len(sequence)) - 1)})
     for number in numbers:
@@ -52,8 +56,15 @@ def find_repeats(sequence: Sequence) -> Repeats:
             continue
         pairs += 1
         depth += same_depth and not same_color
-        color += same_color and not same_depth
-    return Repeats(pairs, depth, color)
+        if same_color and not same_depth:
+            color, blank = color + 1, blank and _is_blank(here.color)
+    return Repeats(pairs, depth, color, blank and color > 0)
+
+
+def _is_blank(file: ImageFile) -> bool:
+    """Whether an image holds one colour only."""
+    image = read_color(file)
+    return bool((image == image[0, 0]).all())
 
 
 def _alike(a: ImageFile, b: ImageFile) -> bool:

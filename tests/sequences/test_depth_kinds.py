@@ -132,6 +132,15 @@ def test_repeats(room: Path, tmp_path: Path) -> None:
     assert not any("repeat" in text for _, _, text in depth_verdicts(folder))
 
 
+@pytest.mark.parametrize("grey", [0, 128])
+def test_blank_colour_is_no_repeated_image(room: Path, tmp_path: Path, grey: int) -> None:
+    folder = write(room, tmp_path / "blank", "saturated")
+    for path in (folder / "rgb").iterdir():
+        cv2.imwrite(str(path), np.full_like(cv2.imread(str(path)), grey))
+    (text,) = [text for code, _, text in depth_verdicts(folder) if code == "color_repeats"]
+    assert text.startswith("colour images are blank: ") and "of another time" not in text
+
+
 @pytest.mark.parametrize(("seed", "noise", "size"), [(3, True, (160, 120)), (4, False, (128, 96)), (5, True, (96, 72))])
 def test_nothing_is_said_of_healthy_rooms(tmp_path: Path, seed: int, noise: bool, size: tuple[int, int]) -> None:
     from ggslam.synthetic import write_synthetic_sequence

@@ -36,3 +36,11 @@ def test_a_tum_line_without_a_rotation_is_named(tmp_path: Path) -> None:
     assert times.tolist() == [0.5, 0.6] and list(problems) == [1] and "line 3" in problems[1]
     np.testing.assert_array_equal(poses[0], [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
     assert np.isnan(poses[1]).all()
+
+
+@pytest.mark.parametrize("row", ["0 0 0 0 0 0 0", "0.1 0 0 0 0 0 0 0"])
+def test_a_quaternion_of_zeros_is_named_as_what_it_is(tmp_path: Path, row: str) -> None:
+    good = row[:-1] + "1"
+    (tmp_path / "poses.txt").write_text(f"{good}\n{row}\n{good}\n")
+    rows = read_pose_rows(tmp_path / "poses.txt")
+    assert rows.problems == {1: f"{tmp_path}/poses.txt, line 2: pose holds a quaternion of length 0, not 1"}

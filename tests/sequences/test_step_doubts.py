@@ -23,11 +23,14 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_synthetic_sequence(tmp_path_factory.mktemp("steps") / "room", frames=FRAMES, width=160, height=120)
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [np.zeros_like, lambda image: cv2.GaussianBlur(image, (0, 0), 6), lambda image: cv2.convertScaleAbs(image, alpha=4)],
-    ids=["black", "blurred", "overexposed"],
-)
+SPOILT = {
+    "black": np.zeros_like,
+    "blurred": lambda image: cv2.GaussianBlur(image, (0, 0), 6),
+    "overexposed": lambda image: cv2.convertScaleAbs(image, alpha=4),
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
 def test_a_bad_start_is_not_out_of_step(
     recording: Path, tmp_path: Path, spoil: Callable[[np.ndarray], np.ndarray]
 ) -> None:
