@@ -268,8 +268,17 @@ def test_what_to_try_is_the_cause_if_it_is_known(sound: RunOutcome) -> None:
     empty = replace(sound.folder.object_table(), objects=[])
     assert judge_result(sound.result, [], noisy, empty, None, "room").next == "`refine` 3000"
     assert judge_result(sound.result, [], fit_of(sound), empty, None, "room").next.startswith("`masks` FOLDER")
+    code = Verdict("depth_codes", "doubtful", "it seems to mean that nothing was measured; try `depth_kind` none:40000")
+    holes = replace(fit_of(sound), agreeing=0.8)
+    assert judge_result(sound.result, [code], holes, None, None, "room").next == "`depth_kind` none:40000"
     unnamed = judge_result(lost, [], None, None, None, "room")
     assert unnamed.next.startswith("ggslam inspect room")
+
+
+def test_a_headline_counts_in_english(sound: RunOutcome) -> None:
+    one = replace(sound.result, frames=sound.result.frames[:1], keyframes=sound.result.keyframes[:1])
+    words = replace(sound, result=one).headline().split(", ")
+    assert words[0] == "1 frame" and "1 keyframe" in words
 
 
 @dataclass

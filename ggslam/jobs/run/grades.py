@@ -172,7 +172,8 @@ def grade_movers(result: SlamResult) -> AspectRecord:
         _at_most(rate, MANY_MOVERS, TOO_MANY_MOVERS) if often else "good",
         "bad" if often and picture > MOVING_PICTURE else "good",
     ]
-    words = [f"{len(result.movers)} movers in {frames} of {total} frames, {picture:.1%} of the image there"]
+    movers = "1 mover" if len(result.movers) == 1 else f"{len(result.movers)} movers"
+    words = [f"{movers} in {frames} of {total} frames, {picture:.1%} of the image there"]
     return _aspect(grades, 100 * frames / max(1, total), "%", words)
 
 

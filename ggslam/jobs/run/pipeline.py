@@ -79,16 +79,21 @@ class RunOutcome:
         """One line for people."""
         r = self.result
         rate = r.frames_per_second()
-        parts = [f"{len(r.frames)} frames", *([f"{rate:.1f} frames/s"] if np.isfinite(rate) else []),
-                 f"{len(r.keyframes)} keyframes", f"{r.gaussian_count} Gaussians"]  # fmt: skip
+        parts = [_number_of(len(r.frames), "frame"), *([f"{rate:.1f} frames/s"] if np.isfinite(rate) else []),
+                 _number_of(len(r.keyframes), "keyframe"), _number_of(r.gaussian_count, "Gaussian")]  # fmt: skip
         counts = Counter(frame.status for frame in r.frames)
-        parts += [f"{counts[status]} frames {status}" for status in ("recovered", "doubted", "lost") if counts[status]]
-        parts += [f"{len(r.dropped_frames)} frames dropped"] if r.dropped_frames else []
+        told = [status for status in ("recovered", "doubted", "lost") if counts[status]]
+        parts += [f"{_number_of(counts[status], 'frame')} {status}" for status in told]
+        parts += [f"{_number_of(len(r.dropped_frames), 'frame')} dropped"] if r.dropped_frames else []
         closed = sum(event.kind == "closed" for event in r.loop_events)
-        parts += [f"{closed} loop{'s' if closed > 1 else ''} closed"] if closed else []
+        parts += [f"{_number_of(closed, 'loop')} closed"] if closed else []
         joined = sum(event.kind == "joined" for event in r.loop_events)
-        parts += [f"{joined} part{'s' if joined > 1 else ''} joined"] if joined else []
+        parts += [f"{_number_of(joined, 'part')} joined"] if joined else []
         return ", ".join(parts)
+
+
+def _number_of(number: int, thing: str) -> str:
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def execute(request: RunRequest, observer: Observer | None = None, follower: Follower | None = None) -> RunOutcome:

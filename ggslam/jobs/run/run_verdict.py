@@ -27,7 +27,10 @@ from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.tracking.tracker import TrackingStatus
 
-_CAUSES = ("depth_scale", "intrinsics", "poses", "alignment", "step", "time", "textureless", "degenerate")
+_CAUSES = (
+    "orientation", "depth_side", "depth_kind", "depth_delay", "registration", "depth_codes", "depth_repeats",
+    "color_repeats", "depth_scale", "intrinsics", "poses", "alignment", "step", "time", "textureless", "degenerate",
+)  # fmt: skip
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 _SAME_GAIN = 1.3
 _REFINE, _WITH_MASKS = "`refine` 3000", "`masks` FOLDER, with masks of a segmenter"
