@@ -214,8 +214,8 @@ class DepthDoubts:
             )
             if code == "color_repeats" and found.blank:
                 text = (
-                    f"colour images are blank: {count} of {found.pairs + 1} that were compared hold one colour and "
-                    f"nothing else; take the cover off the lens, or look how the images were written"
+                    f"colour images are blank: in {count} of {found.pairs} pairs of neighbours both hold one and the "
+                    f"same colour and nothing else; take the cover off the lens, or look how the images were written"
                 )
             verdicts.append(Verdict(code, "doubtful", text))
         return verdicts
