@@ -40,13 +40,13 @@ KINDS = [
     Kind("walk at 2 frames/s", {"scene": "loop", "speed": 5, "frames": 96}),
     Kind("bare walls, steps of 35 cm", {"scene": "bare", "speed": 6, "frames": 60}),
     Kind("turns, up to 4.7 degrees", {"trajectory": "turns", "frames": 180, "shutter": Shutter(0.13)}),
-    Kind("turns, up to 14 degrees", {"trajectory": "turns", "speed": 3, "frames": 60, "shutter": Shutter(0.4)}),
+    Kind("turns, up to 14 degrees", {"trajectory": "turns", "speed": 3, "frames": 90, "shutter": Shutter(0.4)}),
     *(
         Kind(
             f"turns, up to 14 degrees, rolling shutters, seed {seed}",
-            {"trajectory": "turns", "speed": 3, "frames": 60, "seed": seed, "shutter": Shutter(0.4, 0.4, 0.1)},
+            {"trajectory": "turns", "speed": 3, "frames": 70, "seed": seed, "shutter": Shutter(0.4, 0.4, delay)},
         )
-        for seed in (1, 2)
+        for seed, delay in ((1, 0.15), (2, -0.1))
     ),
     *(
         Kind(
