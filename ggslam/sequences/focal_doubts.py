@@ -15,6 +15,8 @@ from ggslam.scene.frame import Frame
 FACTORS = np.geomspace(1 / 2.6, 2.6, 29)
 """By which focal lengths are multiplied; 1 is among them."""
 FEATURES, FEWEST_MATCHES, PAIRS = 600, 60, 3000
+LEAST_SHIFT = 1.0
+"""Pixels that most points have to move: images of a still camera, or that got stuck, tell nothing of a focal length."""
 MOST_ALIKE = 0.75
 """Ratio of the best and second best distance of descriptors (D. Lowe, IJCV 2004)."""
 
@@ -47,13 +49,18 @@ def doubt_focal_length(pairs: list[tuple[Frame, Frame]]) -> FocalDoubt | None:
     generator, errors = np.random.default_rng(0), []
     for first, second in pairs:
         matched = match_points(first, second)
-        if matched is not None:
+        if matched is not None and _median_shift(*matched) >= LEAST_SHIFT:
             errors.append(_errors(*matched, first.camera, generator))
     if not errors:
         return None
     medians = np.median(np.concatenate(errors, 1), axis=1)
     best = int(medians.argmin())
     return FocalDoubt(float(medians[len(FACTORS) // 2]), float(FACTORS[best]), float(medians[best]))
+
+
+def _median_shift(a: np.ndarray, b: np.ndarray) -> float:
+    """Pixels by which matched points [n, 3] have moved in the image."""
+    return float(np.median(np.linalg.norm(a[:, :2] - b[:, :2], axis=1)))
 
 
 def match_points(first: Frame, second: Frame) -> tuple[np.ndarray, np.ndarray] | None:

@@ -311,6 +311,14 @@ def test_most_frames_lost_is_a_failure_that_shows_no_scores(spoilt: Copy, tmp_pa
     assert verdict is not None and verdict.tracked.grade == "bad" and verdict.tracked.value == 20
 
 
+def test_a_run_that_stopped_early_or_saw_hardly_anything_is_not_called_good(sound: RunOutcome) -> None:
+    stopped = judge_result(sound.result, [], fit_of(sound), None, None, "room", stopped=True)
+    assert stopped.grade == "doubtful" and "stopped before the end" in stopped.tracked.text
+    assert "skip_bad_frames" in stopped.next
+    assert grade_tracked(replace(sound.result, frames=sound.result.frames[:2]), []).grade == "doubtful"
+    assert grade_tracked(replace(sound.result, frames=sound.result.frames[:3]), []).grade == "good"
+
+
 def test_a_dark_beginning_does_not_spoil_a_run(spoilt: Copy, tmp_path: Path) -> None:
     for path, gain in zip(spoilt.paths("rgb"), (0.12, 0.15), strict=False):
         image = cv2.imread(str(path)).astype(np.float32)

@@ -56,6 +56,8 @@ MANY_MOVERS, TOO_MANY_MOVERS = 0.25, 0.75
 full-scale pixels 1."""
 MOVING_PICTURE = 0.5
 """Of the image moving on average where something moves: then the camera's pose or depth is wrong, not the world."""
+FEWEST_FRAMES = 3
+"""Frames of a run that show whether it is good: a first frame alone fits whatever comes."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,9 @@ class ScoredFigures:
     id_accuracy: float | None = None
 
 
-def grade_tracked(result: SlamResult, found: list[Verdict]) -> AspectRecord:
-    """Whether the camera was located, from the frames' states, the path, and what `judge` found."""
+def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = False) -> AspectRecord:
+    """Whether the camera was located, from the frames' states, the path, and what `judge` found; `stopped`: the run
+    ended before the recording did."""
     total, states = len(result.frames), [frame.status for frame in result.frames]
     lost, doubted, searched = (
         states.count(s.value) for s in (TrackingStatus.LOST, TrackingStatus.DOUBTED, TrackingStatus.RECOVERED)
@@ -83,6 +86,7 @@ def grade_tracked(result: SlamResult, found: list[Verdict]) -> AspectRecord:
         _at_most((lost + doubted) / max(1, total), LOST_SHARE, BADLY_LOST),
         "doubtful" if searched > MUCH_SEARCHED * total or len(jumps) or codes & {"degenerate", "dropped"} else "good",
         "bad" if "textureless" in codes else "good",
+        "doubtful" if stopped or total < FEWEST_FRAMES else "good",
     ]
     words = [f"{total - lost} of {total} frames located"]
     words += [f"{searched} of them by search"] if searched else []
@@ -91,6 +95,8 @@ def grade_tracked(result: SlamResult, found: list[Verdict]) -> AspectRecord:
     words += ["most with an open direction"] if "degenerate" in codes else []
     words += [f"the path jumps {len(jumps)} times (the first: frame {jumps[0]})"] if jumps else []
     words += [f"{dropped} frames dropped"] if dropped else []
+    words += ["too few to tell"] if total < FEWEST_FRAMES else []
+    words += ["stopped before the end of the recording"] if stopped else []
     return _aspect(grades, 100 * (total - lost) / max(1, total), "%", words)
 
 

@@ -285,7 +285,8 @@ class _Run:
         folder = outcome.folder
         table = folder.object_table() if folder.has_objects() else None
         recording = str(self.request.sequence.path)
-        return judge_result(outcome.result, outcome.verdicts, self.fit, table, outcome.metrics, recording)
+        stopped = outcome.error is not None
+        return judge_result(outcome.result, outcome.verdicts, self.fit, table, outcome.metrics, recording, stopped)
 
 
 def _objects_notes(

@@ -33,12 +33,13 @@ _CAUSES = (
 )  # fmt: skip
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 _SAME_GAIN = 1.3
+_GO_ON = "mend what stopped the run, or `skip_bad_frames`, and run it again"
 _REFINE, _WITH_MASKS = "`refine` 3000", "`masks` FOLDER, with masks of a segmenter"
 
 
 def judge_result(
     result: SlamResult, found: list[Verdict], fit: MapFit | None, table: ObjectTable | None,
-    metrics: MetricsRecord | None, recording: str,
+    metrics: MetricsRecord | None, recording: str, stopped: bool = False,
 ) -> RunVerdict:  # fmt: skip
     """The verdict on a run that has ended.
 
@@ -49,10 +50,11 @@ def judge_result(
         table: its objects; None: it has none.
         metrics: its scores; None: it was not scored.
         recording: its path, for commands.
+        stopped: whether it ended before the recording did, by an error or by the user.
     """
     scored = _figures_of_scores(metrics)
     aspects = {
-        "tracked": grade_tracked(result, found), "sharp": grade_sharp(fit, scored),
+        "tracked": grade_tracked(result, found, stopped), "sharp": grade_sharp(fit, scored),
         "geometry": grade_geometry(fit, found), "objects": grade_objects(table, scored),
         "movers": grade_movers(result),
     }  # fmt: skip
@@ -62,6 +64,8 @@ def judge_result(
         aspects = {name: aspect if name == "tracked" else rest for name, aspect in aspects.items()}
     grade = overall(aspects)
     advice = "" if grade == "good" else _advice(aspects, result, found, fit, recording)
+    if stopped and grade == "doubtful":
+        advice = _GO_ON
     kept = None if fit is None else FitRecord(**asdict(fit))
     return RunVerdict.of({"grade": grade, **aspects, "failure": failure, "next": advice, "fit": kept})
 
