@@ -121,7 +121,9 @@ def gather(
     return _as_things(_blobs_that_move(left, places, settings), places, segments, moving)
 
 
-def _segments_that_move(small: np.ndarray, places: Gathering, s: MoverSettings, moved: frozenset[int]) -> list[int]:
+def _segments_that_move(
+    small: np.ndarray, places: Gathering, s: MoverSettings, moved: frozenset[int]
+) -> list[int]:
     """Ids of segments of which enough has come and that do not rest."""
     counted = (places.known, places.novel, places.rests, places.judged)
     count, novel, rest, judged = (np.bincount(small[mask], minlength=int(small.max()) + 1) for mask in counted)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop: frames in, trajectory and map out.
 
-sequence = open_sequence("recording", scale=0.5)
-slam = Slam(sequence.camera)
-for frame in sequence.stream():
-    slam.step(frame)
-result = slam.finish()
+    sequence = open_sequence("recording", scale=0.5)
+    slam = Slam(sequence.camera)
+    for frame in sequence.stream():
+        slam.step(frame)
+    result = slam.finish()
 """
 
 from __future__ import annotations

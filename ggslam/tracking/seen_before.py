@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.features.orb import FeatureView
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse
+from ggslam.scene.poses import inverse, transform_points
 from ggslam.tracking.points import FramePoints
 
 POINTS = 600
@@ -23,11 +23,7 @@ def share_seen_before(
     chosen = points.points[:: max(1, len(points) // POINTS)].astype(float)
     seen = np.zeros(len(chosen), bool)
     for view in views:
-        T = inverse(view.T_world_camera) @ T_world_camera
-        x, y, z = (chosen @ T[:3, :3].T + T[:3, 3]).T
-        ahead = np.where(z > 0, z, np.inf)
-        columns = np.rint(camera.fx * x / ahead + camera.cx).astype(int)
-        rows = np.rint(camera.fy * y / ahead + camera.cy).astype(int)
-        inside = (z > 0) & (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
-        seen[inside] |= view.depth[rows[inside], columns[inside]] > 0
+        there = transform_points(chosen, inverse(view.T_world_camera) @ T_world_camera)
+        rows, columns, inside = camera.project(there)
+        seen |= inside & (view.depth[rows, columns] > 0)
     return float(seen.mean()) if len(seen) else 0.0
