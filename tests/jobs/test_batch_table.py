@@ -70,3 +70,24 @@ def test_every_form_holds_the_same_and_names_what_failed(table: ScoresTable) -> 
 def test_nothing_done(tmp_path: Path) -> None:
     table = ScoresTable.of("mine", [JobState(BatchJob("a", "b", 0, ()), tmp_path, State.FAILED, "why")], "m")
     assert table.rows == [] and "why" in table.to_markdown() and "tabular" in table.to_latex() and table.to_html()
+
+
+HOSTILE = ("=2+5", r"\input{/etc/passwd}", "a|b", "<script>alert(1)</script>", "[x](javascript:y)", "$^~#{}", "a\nb")
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_name_stays_a_name_in_every_form(tmp_path: Path, name: str) -> None:
+    states = [done(tmp_path, name, "default", 0, 30.0, 0.01), done(tmp_path, "room0", "default", 0, 30.0, 0.01)]
+    failed = JobState(BatchJob(name, "x", 0, ()), tmp_path, State.FAILED, f"{name}\n\\end{{document}}")
+    table = ScoresTable.of(name, [*states, failed], "a machine")
+    rows = list(csv.reader(io.StringIO(table.to_csv(), newline="")))
+    assert rows[1][0] == (f"'{name}" if name[0] == "=" else name) and len({len(row) for row in rows}) == 1
+    latex = table.to_latex()
+    assert latex.count("\\end") == 2  # the table's own and, in a comment, the error's
+    body = [line for line in latex.splitlines() if not line.startswith("%")]
+    assert not any(r"\input" in line or "\\end{document}" in line for line in body)
+    assert len([line for line in body if line.endswith(r"\\")]) == 4 and len(body) == 9
+    markdown = table.to_markdown()
+    assert "<script" not in markdown and "](" not in markdown.replace(r"\](", "")
+    assert len({len(line.replace(r"\|", "").split("|")) for line in markdown.splitlines() if line[:1] == "|"}) == 1
+    assert "<script>alert" not in table.to_html()

@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
+import re
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from ggslam.jobs.batch.published import PUBLISHED, Published
 from ggslam.reporting.page import Html, bullets, page, section, table
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import Grade, RunVerdict, worst
+from ggslam.system.csv_text import csv_text
 
 
 @dataclass(frozen=True)
@@ -132,26 +132,25 @@ class ScoresTable:
 
     def to_csv(self) -> str:
         """Numbers with all their digits, means and spreads in columns of their own."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
         spreads = [f"{column.title} std" for column in COLUMNS]
         names, end = len(_NAMES), len(_NAMES) + len(COLUMNS)
-        writer.writerow([*self.head()[:end], *spreads, *self.head()[end:]])
+        rows = []
         for row, cells in zip(self.rows, self.cells(), strict=True):
-            numbers = ["" if math.isnan(value) else repr(value) for value in (*row.means, *row.spreads)]
-            writer.writerow([*cells[:names], *numbers, *cells[end:]])
-        return out.getvalue()
+            numbers = [None if math.isnan(value) else value for value in (*row.means, *row.spreads)]
+            rows.append([*cells[:names], *numbers, *cells[end:]])
+        return csv_text([*self.head()[:end], *spreads, *self.head()[end:]], rows)
 
     def to_markdown(self) -> str:
         """A table and its notes."""
         lines = [self.head(), ["---", "---", "---:", "---", *["---:"] * (len(self.head()) - 4)], *self.cells()]
-        body = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
-        return f"# {self.title}\n\n{body}\n\n" + "\n".join(f"- {note}" for note in self.notes()) + "\n"
+        body = "\n".join("| " + " | ".join(map(_markdown, line)) + " |" for line in lines)
+        notes = "\n".join(f"- {_markdown(note)}" for note in self.notes())
+        return f"# {_markdown(self.title)}\n\n{body}\n\n{notes}\n"
 
     def to_latex(self) -> str:
         """A `tabular` for booktabs."""
-        lines = [" & ".join(_latex(cell) for cell in line) + r" \\" for line in (self.head(), *self.cells(r"$\pm$"))]
-        notes = "".join(f"% {note}\n" for note in self.notes())
+        lines = [" & ".join(map(_latex, line)) + r" \\" for line in (self.head(), *self.cells("±"))]
+        notes = "".join(f"% {_one_line(note)}\n" for note in self.notes())
         body = "\n".join([r"\toprule", lines[0], r"\midrule", *lines[1:], r"\bottomrule"])
         return f"{notes}\\begin{{tabular}}{{llrl{'r' * (len(self.head()) - 4)}}}\n{body}\n\\end{{tabular}}\n"
 
@@ -212,7 +211,22 @@ def _text(mean: float, spread: float, digits: int, plus_minus: str) -> str:
     return f"{mean:.{digits}f}" + ("" if math.isnan(spread) else f"{plus_minus}{spread:.{digits}f}")
 
 
+_LATEX = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}", "–": "--", "±": r"$\pm$",
+}  # fmt: skip
+
+
 def _latex(text: str) -> str:
-    for character in ("&", "%", "_", "#"):
-        text = text.replace(character, "\\" + character)
-    return text.replace("–", "--").replace("±", r"$\pm$")
+    """A cell's text; a name cannot become a command."""
+    return "".join(_LATEX.get(character, character) for character in _one_line(text))
+
+
+def _markdown(text: str) -> str:
+    """A cell's text; a name cannot become HTML, a link or another cell."""
+    return re.sub(r"([\\`*\[\]|])", r"\\\1", _one_line(text)).replace("<", "&lt;")
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

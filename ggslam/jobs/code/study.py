@@ -8,8 +8,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,7 @@ from ggslam.reporting.pictures import write_picture
 from ggslam.reporting.plot_files import write_sheet
 from ggslam.reporting.plots import Plot, Series
 from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.csv_text import csv_text
 from ggslam.system.json_files import write_json
 
 
@@ -79,11 +78,7 @@ def write_tables(
 ) -> list[Path]:
     """Writes study.csv and study.json; in the latter, and empty in the former, what is infinite or unknown is null."""
     table = [row.values() for row in rows]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
-    write_text(folder / "study.csv", text.getvalue())
+    write_text(folder / "study.csv", csv_text(list(table[0]), (list(row.values()) for row in table)))
     about = {
         "points": len(cloud.grid), "peak": cloud.peak, "voxels_per_unit": cloud.quantization.scale,
         "threads": settings.threads, "slices": settings.slices, "split": settings.split, "note": note or None,

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -37,6 +35,7 @@ from ggslam.sequences import Sequence
 from ggslam.sequences.rig import RigSequence
 from ggslam.slam.camera_fixtures import CameraFixtures, find_fixtures
 from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.csv_text import csv_text
 
 PICTURES = 6
 """Comparison pictures written to renders/, spread over the recording."""
@@ -281,12 +280,8 @@ def _picture(view: RenderBuffers) -> np.ndarray:
 
 
 def _write_rows(folder: RunFolder, rows: list[dict[str, Any]]) -> None:
-    text = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(text, rows[0].keys(), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    write_text(folder.path / "frames.csv", text.getvalue())
+    text = csv_text(list(rows[0]), (list(row.values()) for row in rows)) if rows else ""
+    write_text(folder.path / "frames.csv", text)
 
 
 def _performance(timing: TimingRecord) -> dict[str, Any]:
