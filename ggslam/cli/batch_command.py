@@ -63,7 +63,9 @@ Replica = Annotated[
 Out = Annotated[
     Path | None, typer.Option(help="Folder of runs and tables; default runs/NAME, or as the manifest says.")
 ]
-Options = Annotated[str, typer.Option(help="Of a folder: options of `ggslam run` for all recordings, as one text.")]
+Options = Annotated[
+    str, typer.Option(help="Options of `ggslam run` for all recordings, as one text; before those of a manifest.")
+]
 Seeds = Annotated[str, typer.Option(help="Of a folder: seeds, by commas.")]
 Workers = Annotated[int | None, typer.Option(help="Runs at a time; default: one for every two processors.")]
 Engine = Annotated[
@@ -140,9 +142,9 @@ def _manifest(
     assert manifest is not None
     if manifest.is_dir():
         return manifest_of_folder(manifest, out, numbers, words)
-    if options or seeds != "0":
-        raise ConfigError("--options and --seeds are for folders; a manifest says its own")
-    return read_manifest(manifest, out)
+    if seeds != "0":
+        raise ConfigError("--seeds is for folders; a manifest says its own")
+    return read_manifest(manifest, out, words)
 
 
 def _words(manifest: Path | None, replica: Path | None, out: Path, options: str, seeds: str) -> list[str]:

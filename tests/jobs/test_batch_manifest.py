@@ -7,9 +7,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+import typer
 
+from ggslam.cli.main import app
 from ggslam.errors import ConfigError
-from ggslam.jobs.batch.manifest import REPLICA, manifest_of_folder, read_manifest
+from ggslam.jobs.batch.manifest import ALLOWED, REPLICA, manifest_of_folder, read_manifest
 
 MANIFEST = """
 out: tables/first
@@ -62,11 +64,26 @@ def test_a_short_manifest(tmp_path: Path) -> None:
         ("recordings: [a]\noptions: --seed=3", "options: --seed is not for batches"),
         ("recordings: [a]\noptions: 'unclosed \"'", "options: No closing quotation"),
         ("recordings: [a]\noptions: [x]", "options: expected options of"),
+        ("recordings: [a]\noptions: --log=x.rrd", "options: --log is not for batches"),
+        ("recordings: [a]\nsettings: {x: --record b}", "settings.x: --record is not for batches"),
+        ("recordings: [{path: a, options: -h}]", r"recordings\[0\].options: -h is not for batches"),
+        ("recordings: [a]\noptions: --help-settings", "options: --help-settings is not for batches"),
+        ("recordings: [a]\noptions: --set masks.model=a.onnx", "a model of masks, which is run like a program"),
+        ("recordings: [a]\nsettings: {x: '--set=masks.model=a.onnx'}", "a model of masks"),
+        ("recordings: [{path: a, options: --config own.yaml}]", "a model of masks"),
+        ("recordings: [a]\nout: ../elsewhere", "out: ../elsewhere lies outside"),
+        ("recordings: [a]\nout: /elsewhere", "out: /elsewhere lies outside"),
+        ("recordings: [a]\nout: linked/elsewhere", "out: linked/elsewhere lies outside"),
         ("recordings: [a, b/a]", "two runs would have the folder a/default/seed0"),
         ("recordings: [a", "experiments.yaml: "),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, words: str) -> None:
+def test_what_is_wrong_is_named(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, text: str, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.yaml").write_text("masks: {model: a.onnx}")
+    (tmp_path / "linked").symlink_to(tmp_path_factory.mktemp("other"))
     with pytest.raises(ConfigError, match=words):
         read_manifest(written(tmp_path, text))
 
@@ -90,3 +107,24 @@ def test_all_recordings_of_a_folder(room: Path, tmp_path: Path) -> None:
     for folder in (tmp_path / "empty", tmp_path / "nothing"):
         with pytest.raises(ConfigError, match="no recording|no such folder"):
             manifest_of_folder(folder)
+
+
+def test_who_calls_may_name_a_model_and_any_folder(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path, elsewhere = written(tmp_path, "recordings: [a]\noptions: --scale 0.5"), tmp_path_factory.mktemp("other")
+    asked = ["--set", "masks.model=a.onnx"]
+    found = read_manifest(path, elsewhere, asked)
+    assert found.out == elsewhere
+    assert found.jobs[0].words[1:5] == ("--set", "masks.model=a.onnx", "--scale", "0.5")
+    with pytest.raises(ConfigError, match="a model of masks"):  # the file's own is another one
+        read_manifest(written(tmp_path, "recordings: [a]\noptions: --set masks.model=b.onnx"), None, asked)
+
+
+def test_every_option_of_a_run_is_passed_on_or_refused_on_purpose() -> None:
+    run = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
+    options = [parameter for parameter in run.params if parameter.param_type_name == "option"]
+    names = {name.lstrip("-") for option in options for name in (*option.opts, *option.secondary_opts)}
+    refused = {
+        "out", "seed", "resume", "overwrite", "view", "host", "port", "eval", "no-eval", "localize-only", "log",
+        "record", "help-setting", "help-settings",
+    }  # fmt: skip
+    assert names - set(ALLOWED) == refused and set(ALLOWED) <= names

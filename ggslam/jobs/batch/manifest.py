@@ -12,14 +12,21 @@ from typing import Any
 
 from ggslam.errors import ConfigError
 from ggslam.sequences import recognise_format
+from ggslam.slam.config import load_config
 from ggslam.system.foreign import given_path, read_foreign_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 
 REPLICA = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 """Replica's scenes in the order in which papers list them."""
 _KEYS = {"out", "options", "recordings", "settings", "seeds"}
-_OURS = ("out", "seed", "resume", "overwrite", "view", "rerun", "no-eval", "localize-only", "help")
-"""Names of options of `ggslam run` that a batch gives itself, or that make no sense in it."""
+ALLOWED = (
+    "config", "set", "start", "stop", "stride", "scale", "format", "depth-scale", "pose-convention", "masks", "camera",
+    "intrinsics", "depth-camera", "depth-kind", "depth-delay", "upright", "void-id", "min-confidence", "topic",
+    "iterations", "refine", "realtime", "tracker", "device", "map", "loops", "no-loops", "threads", "skip-bad-frames",
+    "no-skip-bad-frames", "check", "no-check", "strict", "checkpoint-every",
+)  # fmt: skip
+"""Options of `ggslam run` that a batch passes on: they say how a run is made. The others choose folders, write files of
+their own (`--log`, `--record`), serve pages, or are the batch's own business."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +65,16 @@ class Manifest:
     jobs: list[BatchJob] = field(default_factory=list)
 
 
-def read_manifest(path: str | Path, out: Path | None = None) -> Manifest:
+def read_manifest(path: str | Path, out: Path | None = None, options: Sequence[str] = ()) -> Manifest:
     """Reads a batch's YAML; recordings in it are relative to it. docs/batch.md describes the file.
+
+    A manifest may come from somebody else: it does not choose a folder outside its own or the working folder, and names
+    no model to run. Who calls may do both.
+
+    Args:
+        path: of the file.
+        out: folder of the batch; None: as the file says, or `runs/NAME`.
+        options: of `ggslam run`, before the file's.
 
     Raises:
         ConfigError: it is not there, no plain YAML, or says something impossible; names the place.
@@ -71,6 +86,7 @@ def read_manifest(path: str | Path, out: Path | None = None) -> Manifest:
         raise ConfigError(f"{path}: {error}") from None
     if not isinstance(values, dict) or set(values) - _KEYS or "recordings" not in values:
         raise ConfigError(f"{path}: expected recordings and no other keys than {', '.join(sorted(_KEYS))}")
+    asked = tuple(_check_words("`options`", options))
     common = _options(path, "options", values.get("options"))
     items = _take_list(path, "recordings", values["recordings"])
     recordings = [_recording(path, k, item) for k, item in enumerate(items)]
@@ -81,8 +97,10 @@ def read_manifest(path: str | Path, out: Path | None = None) -> Manifest:
     seeds = _take_list(path, "seeds", values.get("seeds", [0]))
     if not all(isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0 for seed in seeds):
         raise ConfigError(f"{path}: seeds: expected whole numbers from 0 on, found {seeds!r}")
-    folder = out or (path.parent / str(values["out"]) if "out" in values else Path("runs") / path.stem)
-    return Manifest(path.stem, folder, _jobs(recordings, settings, seeds, common, str(path)))
+    folder = out or (_own_folder(path, str(values["out"])) if "out" in values else Path("runs") / path.stem)
+    words = [(*common, *own, *chosen) for _, _, own in recordings for chosen in settings.values()]
+    _refuse_models(str(path), asked, words)
+    return Manifest(path.stem, folder, _jobs(recordings, settings, seeds, (*asked, *common), str(path)))
 
 
 def manifest_of_folder(
@@ -148,6 +166,14 @@ def _recording(path: Path, number: int, item: Any) -> tuple[str, Path, tuple[str
     return name, place, _options(path, f"{where}.options", item.get("options"))
 
 
+def _own_folder(path: Path, out: str) -> Path:
+    """The folder that a manifest names."""
+    folder = path.parent / given_path(out)
+    if not any(folder.resolve().is_relative_to(place.resolve()) for place in (path.parent, Path.cwd())):
+        raise ConfigError(f"{path}: out: {out} lies outside the manifest's folder; choose it with {option('out')}")
+    return folder
+
+
 def _options(path: Path, where: str, words: Any) -> tuple[str, ...]:
     if words is None:
         return ()
@@ -160,10 +186,44 @@ def _options(path: Path, where: str, words: Any) -> tuple[str, ...]:
 
 
 def _check_words(where: str, words: Sequence[str]) -> Sequence[str]:
-    ours = [name for word in words for name in [word.partition("=")[0]] if name in map(option, _OURS)]
-    if ours:
-        raise ConfigError(f"{where}: {ours[0]} is not for batches: folders, seeds and scores are theirs")
+    """Raises ConfigError if there are options that a batch does not pass on."""
+    for word in words:
+        name = word.partition("=")[0]
+        if name.startswith("-") and not _is_number(name) and name not in map(option, ALLOWED):
+            raise ConfigError(f"{where}: {name} is not for batches: folders, seeds, scores and pages are theirs")
     return words
+
+
+def _refuse_models(where: str, asked: tuple[str, ...], runs: Iterable[tuple[str, ...]]) -> None:
+    """Raises ConfigError if options in a file, after those that who calls has asked for, choose another model of masks:
+    a model is run like a program."""
+    own = _model_of(asked)
+    if any(_model_of((*asked, *words)) not in (None, own) for words in dict.fromkeys(runs)):
+        said = f"{option('options')} '{option('set')} masks.model=FILE'"
+        raise ConfigError(f"{where}: names a model of masks, which is run like a program; name it yourself: {said}")
+
+
+def _model_of(words: Sequence[str]) -> str | None:
+    """The model of masks that options of `ggslam run` lead to, by themselves or through a file of settings; "": none,
+    None: no run begins with these options."""
+    given: dict[str, list[str]] = {"config": [], "set": []}
+    for number, word in enumerate(words):
+        name, equals, value = word.partition("=")
+        for known, values in given.items():
+            if name == option(known):
+                values += [value] if equals else list(words[number + 1 : number + 2])
+    try:
+        return load_config(given["config"][-1] if given["config"] else None, given["set"]).masks.model
+    except ConfigError:
+        return None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _take_list(path: Path, where: str, values: Any) -> list[Any]:

@@ -24,15 +24,16 @@ def slurm_script(manifest: Manifest, arguments: Sequence[str], only: str, table:
         table: option that makes none and writes the table.
     """
     out, command = manifest.out.absolute(), shlex.join([sys.executable, "-m", "ggslam", "batch", *arguments])
+    title = " ".join(manifest.title.split())  # a comment ends with its line
     runs = {
-        "job-name": manifest.title, "array": f"0-{len(manifest.jobs) - 1}", "cpus-per-task": str(PROCESSORS),
+        "job-name": title, "array": f"0-{len(manifest.jobs) - 1}", "cpus-per-task": str(PROCESSORS),
         "mem": f"{_MEMORY_GB}G", "time": f"{_HOURS}:00:00", "output": str(out / "slurm-%A_%a.log"),
         "wrap": f"{command} {only} $SLURM_ARRAY_TASK_ID",
     }  # fmt: skip
-    end = {"job-name": f"{manifest.title} table", "cpus-per-task": "1", "wrap": f"{command} {table}"}
+    end = {"job-name": f"{title} table", "cpus-per-task": "1", "wrap": f"{command} {table}"}
     return "\n".join([
         "#!/bin/bash",
-        f"# Submits {len(manifest.jobs)} runs of {manifest.title} and a job for their table.",
+        f"# Submits {len(manifest.jobs)} runs of {title} and a job for their table.",
         "# Times and memory are guesses: change them to what your recordings need.",
         "set -eu",
         f"mkdir -p {shlex.quote(str(out))}",
