@@ -11,6 +11,8 @@ from __future__ import annotations
 import contextlib
 import hmac
 import ipaddress
+import logging
+import re
 import secrets
 import socket
 from collections.abc import Callable, Iterator
@@ -21,8 +23,18 @@ from urllib.parse import parse_qs, urlsplit
 
 MAX_MESSAGE_BYTES = 256 << 10
 """Of one message of a page; clicks, poses and names take a few hundred."""
+_unheard = logging.getLogger(f"{__name__}.connections")
+_unheard.setLevel(logging.CRITICAL + 1)
 _ANYWHERE = ("0.0.0.0", "::", "")
 _REFUSAL = "403: open the address that ggslam printed; it ends with ?token=...\n"
+_MALFORMED = "400: the request cannot be read\n"
+_HOST = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]{2,45})\]|(?P<name>[A-Za-z0-9._-]{1,253}))(?::(?P<port>[0-9]{1,5}))?")
+_SCHEME = "http"
+"""Of all our pages. One that a proxy serves under another name or scheme is not ours."""
+
+
+class MalformedRequest(ValueError):
+    """A request that is no good HTTP."""
 
 
 @dataclass
@@ -43,12 +55,21 @@ class Gate:
         Args:
             path: of the request, with its query.
             headers: mapping by name.
+
+        Raises:
+            MalformedRequest: they are not what HTTP allows: no address, or a header twice.
         """
+        try:
+            return self._reason_to_refuse(path, headers)
+        except (ValueError, LookupError) as error:
+            raise MalformedRequest(str(error)) from None
+
+    def _reason_to_refuse(self, path: str, headers: Any) -> str | None:
         host = headers.get("Host") or ""
-        if not self._is_own(urlsplit(f"//{host}").hostname):
+        if not self._is_own(_name_and_port(host)[0]):
             return f"host {host[:80]!r} is none of this server's"
         origin = headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and origin.lower() != f"{_SCHEME}://{host.lower()}":
             return f"a page of {origin[:80]!r} may not use it"
         if self._has_token(path):
             return None
@@ -95,9 +116,25 @@ class Gate:
         return True  # an address cannot be bent to another machine as a name can
 
 
+def _name_and_port(host: str) -> tuple[str, int]:
+    """What a Host header says.
+
+    Raises:
+        ValueError: it is no host, with or without a port.
+    """
+    if not host:
+        return "", 80
+    match = _HOST.fullmatch(host)
+    if match is None or int(match["port"] or 80) > 0xFFFF:
+        raise ValueError("no host")
+    if match["six"]:
+        ipaddress.IPv6Address(match["six"])
+    return (match["six"] or match["name"]).lower(), int(match["port"] or 80)
+
+
 def _cookie_name(host: str) -> str:
     """Cookies do not tell ports apart; two viewers on one machine must not share one."""
-    return f"ggslam-{urlsplit(f'//{host}').port or 80}"
+    return f"ggslam-{_name_and_port(host)[1]}"
 
 
 @contextlib.contextmanager
@@ -110,6 +147,7 @@ def guard(gate: Gate) -> Iterator[None]:
     def guarded_serve(handler: Any, host: str, port: int, **options: Any) -> Any:
         options["process_request"] = _process(gate, options.get("process_request"))
         options["max_size"] = MAX_MESSAGE_BYTES
+        options["logger"] = _unheard  # who sends what is no HTTP, as scanners of ports do, gets no traceback printed
         return serve(handler, host, port, **options)
 
     library.serve = guarded_serve  # type: ignore[assignment,misc]
@@ -121,7 +159,11 @@ def guard(gate: Gate) -> Iterator[None]:
 
 def _process(gate: Gate, inner: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
     def process(connection: Any, request: Any) -> Any:
-        if gate.reason_to_refuse(request.path, request.headers) is not None:
+        try:
+            reason = gate.reason_to_refuse(request.path, request.headers)
+        except MalformedRequest:
+            return connection.respond(400, _MALFORMED)
+        if reason is not None:
             return connection.respond(403, _REFUSAL)
         answer = None if inner is None else inner(connection, request)
         if answer is not None and gate.wants_cookie(request.path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import http.client
+import socket
 from collections.abc import Iterator
 from typing import Any
 from urllib.parse import urlsplit
@@ -52,7 +53,7 @@ def test_without_the_token_nothing_is_shown(server: Any, path: str) -> None:
     assert answer.status == 403 and answer.headers["Set-Cookie"] is None
 
 
-@pytest.mark.parametrize("host", ["attacker.example", "localhost.attacker.example", "", "127.0.0.1.nip.io"])
+@pytest.mark.parametrize("host", ["attacker.example", "localhost.attacker.example", "127.0.0.1.nip.io"])
 def test_a_name_bent_to_this_machine_is_refused(server: Any, host: str) -> None:
     port = server.get_port()
     assert get(server, "/", Host=f"{host}:{port}", Cookie=cookie_of(server)).status == 403
@@ -60,7 +61,10 @@ def test_a_name_bent_to_this_machine_is_refused(server: Any, host: str) -> None:
 
 def test_another_page_is_refused(server: Any) -> None:
     cookie = cookie_of(server)
-    for origin in ("http://attacker.example", "null", f"http://localhost:{server.get_port() + 1}"):
+    own = f"localhost:{server.get_port()}"
+    others = ("http://attacker.example", "null", f"http://localhost:{server.get_port() + 1}", f"https://{own}",
+              f"file://{own}", own, f"//{own}", f"http://{own}/", f"http://x@{own}", "http://[")  # fmt: skip
+    for origin in others:
         assert get(server, "/", Cookie=cookie, Origin=origin).status == 403
 
 
@@ -70,6 +74,29 @@ def test_frames_and_images_of_another_page_get_nothing(server: Any, sender: str,
     more = {"Sec-Fetch-Site": sender}
     assert get(server, "/", Cookie=cookie_of(server), **more).status == status
     assert get(server, "/?" + urlsplit(address(server)).query, **more).status == 200  # a link that was given
+
+
+MALFORMED = (
+    "Host: :80", "Host: [::1", "Host: [x]:80", "Host: a:99999", "Host: a:b", "Host: user@localhost", "Host: a/b",
+    "Host: localhost\r\nHost: localhost", "Host: localhost\r\nOrigin: http://a\r\nOrigin: http://b",
+    "Host: localhost\r\nCookie: a=1\r\nCookie: b=2",
+)  # fmt: skip
+NO_HTTP = ("garbage\r\n\r\n", "POST / HTTP/1.1\r\nHost: a\r\n\r\n", f"GET / HTTP/1.1\r\nX: {'a' * 20000}\r\n\r\n",
+           "GET / HTTP/1.1\r\n" + "A: x\r\n" * 500 + "\r\n", "GET / HTTP/1.1\r\n\xff: a\r\n\r\n")  # fmt: skip
+GIVEN = [f"GET / HTTP/1.1\r\n{headers}\r\n\r\n" for headers in MALFORMED]
+
+
+@pytest.mark.parametrize("text", [*GIVEN, "GET //[ HTTP/1.1\r\nHost: localhost\r\n\r\n", *NO_HTTP])
+def test_what_is_no_request_gets_400_at_most_and_no_traceback(
+    server: Any, text: str, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with socket.create_connection(("127.0.0.1", server.get_port()), timeout=10) as raw:
+        raw.sendall(text.encode("latin-1"))
+        answer = b""
+        while piece := raw.recv(4096):
+            answer += piece
+    assert answer == b"" if text in NO_HTTP else answer.startswith(b"HTTP/1.1 400 "), answer[:200]
+    assert "Traceback" not in capfd.readouterr().err and not caplog.records
 
 
 def connect(server: Any, message: bytes | None = None, **headers: str) -> str:
