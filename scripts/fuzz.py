@@ -12,6 +12,7 @@ PNG and zip repaired, so that what lies behind them is reached) and read, in pro
 from __future__ import annotations
 
 import argparse
+import json
 import multiprocessing
 import os
 import random
@@ -26,6 +27,7 @@ import traceback
 import zipfile
 import zlib
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -45,6 +47,12 @@ NUMBERS = [b"0", b"-1", b"1e999", b"nan", b"99999999999999999999", b"1e-320", b"
 WORDS = [b"../../../etc/passwd", b"\x1b[2J", b"\xff\xfe", b"null", b"[]", b"{}", b"true", b'"', b"*a",
          b"!!python/name:os.system", b"2024-01-01", b"1+2j", b"\x00"]  # fmt: skip
 INTEGERS = [0, 1, -1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 1 << 24]
+FLOATS = [float("nan"), float("inf"), -float("inf"), 3e38, -3e38, 1e-44, 0.0, -1.0, 1e9]
+VALUES: list[Any] = [
+    None, True, False, 0, 1, -1, 2, 255, 65536, 2**31 - 1, -(2**31), 2**32, 2**63 - 1, -(2**63), 2**63, 10**30, 0.5,
+    -0.0, 1e300, -1e300, 1e-320, float("nan"), float("inf"), "", "x", "=1", "../x", "\x00", "\ud800", "x" * 3000, "0",
+    "nan", [], {}, [[]], [0], [None], {"a": 0}, {"": None}, [1e300] * 3, [0] * 500,
+]  # fmt: skip
 
 
 @dataclass
@@ -112,6 +120,10 @@ def change_inside(data: bytes, rng: random.Random) -> bytes:
         return change_png(data, rng)
     if data.startswith(b"PK"):
         return change_zip(data, rng)
+    if data.startswith(b"ggstate1"):
+        return change_state(data, rng)
+    if data[:1] in (b"{", b"["):
+        return change_json(data, rng)
     return change(data, rng)
 
 
@@ -125,6 +137,61 @@ def change_png(data: bytes, rng: random.Random) -> bytes:
     chosen[1] = change(chosen[1], rng)
     parts = (struct.pack(">I", len(b)) + kind + b + struct.pack(">I", zlib.crc32(kind + b)) for kind, b in chunks)
     return data[:8] + b"".join(parts)
+
+
+def change_json(data: bytes, rng: random.Random) -> bytes:
+    """Puts strange values in the place of some, or takes away, doubles or exchanges them; it stays JSON."""
+    try:
+        tree = json.loads(data)
+    except (ValueError, RecursionError):
+        return change(data, rng)
+    return json.dumps(change_tree(tree, rng)).encode()
+
+
+def change_tree(tree: Any, rng: random.Random) -> Any:
+    """A tree of JSON with some values changed."""
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        places = list(places_in(tree))
+        if not places:
+            return tree
+        holder, key = rng.choice(places)
+        other, place = rng.choice(places)
+        action = rng.randrange(8)
+        if action == 0:
+            del holder[key]
+        elif action == 1 and isinstance(holder, list):
+            holder[:] = holder * rng.choice((2, 3))
+        elif action == 2:
+            holder[key] = json.loads(json.dumps(other[place]))
+        elif action == 3 and isinstance(holder[key], (int, float)):
+            holder[key] = holder[key] * rng.choice((-1, 2, 1000, 0.5)) + rng.choice((0, 1, -1))
+        else:
+            holder[key] = rng.choice(VALUES)
+    return tree
+
+
+def places_in(tree: Any) -> Iterator[tuple[Any, Any]]:
+    """(list or map, index or key) of every value."""
+    inside = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in list(inside):
+        yield tree, key
+        yield from places_in(value)
+
+
+def change_state(data: bytes, rng: random.Random) -> bytes:
+    """An array file (`system.array_file`) with changed values or arrays; who reads it repairs its sum."""
+    length = struct.unpack("<Q", data[8:16])[0]
+    head, arrays = data[16 : 16 + length], bytearray(data[16 + length :])
+    if rng.random() < 0.6 or len(arrays) < 16:
+        head = change_json(head, rng)
+        return data[:8] + struct.pack("<Q", len(head)) + head + bytes(arrays)
+    for _ in range(rng.choice((1, 4, 64))):
+        at = rng.randrange(0, len(arrays) - 11) & ~3
+        code = rng.choice(("<f", "<i", "<d", "<q"))
+        whole = (0, -1, 1, 1 << 20, (1 << 31) - 1, -(1 << 31))
+        value = rng.choice(FLOATS if code in ("<f", "<d") else whole)
+        arrays[at : at + struct.calcsize(code)] = struct.pack(code, value)
+    return data[: 16 + length] + bytes(arrays)
 
 
 def change_zip(data: bytes, rng: random.Random) -> bytes:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import fuzz_states as states
 import numpy as np
 
 Maker = Callable[[Path], list[Path]]
@@ -470,5 +471,22 @@ TARGETS = [
     Target("store", _stores, _store_read, 2), Target("run", _runs, _run_read, 2),
     Target("rig", _rigs, _recording_read, 2), Target("manifest", _manifests, _manifest_read, 2),
     Target("container", _containers, _container_read, 2),
+    Target("checkpoint", states.cut_off_runs, states.read_checkpoint, 2),
+    Target("store-parts", states.stores, states.read_store, 3),
+    Target("store-index", states.index_scripts, states.read_index_script, 3),
+    Target("places", states.part_files("places.npz"), states.read_part("places.npz", states.use_places)),
+    Target("surface", states.part_files("points.pcd"), states.read_part("points.pcd", states.use_surface)),
+    Target("cells", states.part_files("gaussians.npz"), states.read_part("gaussians.npz", states.use_gaussians)),
+    Target("coded-cells", states.coded_cells, states.read_coded_cells),
+    Target("visit", states.visit_files, states.read_visit_file),
+    Target("store-objects", states.store_objects, states.read_store_objects),
+    Target("records", states.records, states.read_record, 6),
+    Target("mover-points", states.mover_points, states.read_mover_points),
+    Target("verify", states.verified_runs, states.read_verified),
+    Target("whole-run", states.whole_runs, states.read_more_of_run),
+    Target("tsdf", states.tsdf_files, states.read_tsdf),
+    Target("rig-file", states.rig_files, states.read_rig),
+    Target("id-table", states.id_tables, states.read_id_table),
+    Target("edit-list", states.videos, states.read_edit_list, 2),
     *(Target(name.replace(" ", "-"), _recordings(name), _recording_read, 2) for name in RECORDINGS),
 ]  # fmt: skip
