@@ -28,7 +28,7 @@ def run_locally(
     try:
         while waiting or busy:
             while waiting and free:
-                busy.append(JobProcess.begin(waiting.pop(0), free.pop(0)))
+                busy.append(JobProcess.begin(waiting.pop(0), free.pop(0), with_parent=True))
             for worker in [worker for worker in busy if worker.process.poll() is not None]:
                 busy.remove(worker)
                 free.append(worker.processors)
