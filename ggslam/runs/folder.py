@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import logging
 import os
+import secrets
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
@@ -53,7 +54,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config, config_from_dict
 from ggslam.slam.result import SlamResult
-from ggslam.system.folder_lock import LOCK_FILE, folder_lock, refuse_other_writers
+from ggslam.system.folder_lock import LOCK_FILE, refuse_other_writers
 from ggslam.system.foreign import printable, read_foreign_text, refuse_links
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.staging import finish_saving, is_being_saved, leftovers
@@ -121,8 +122,7 @@ class RunFolder:
             raise RunFolderError(f"{path}: {_why_no_run(Path(path))}")
         refuse_links(path, RunFolderError)
         if is_being_saved(Path(path), MARKER):
-            with folder_lock(Path(path), wait_s=5):
-                finish_saving(Path(path), MARKER)
+            finish_saving(Path(path), MARKER)
         folder = RunFolder(path)
         folder.warn()
         return folder
@@ -168,7 +168,7 @@ class RunFolder:
 
     def _probe(self) -> None:
         """Finds out now, not after hours of work, whether files can be written."""
-        probe = self.path / f".probe-{os.getpid()}"
+        probe = self.path / f".probe-{os.getpid()}-{secrets.token_hex(4)}"
         try:
             probe.write_bytes(b"x")
         finally:
