@@ -13,6 +13,8 @@ import importlib as _importlib
 import os as _os
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
+from ggslam.system.forks import rest_before_forks as _rest_before_forks
+
 if _TYPE_CHECKING:
     from ggslam.coding import CodecSettings as CodecSettings
     from ggslam.coding import decode_cloud as decode_cloud
@@ -140,6 +142,9 @@ _HOMES = {
 """Where each public name is at home."""
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = sorted(["__version__", *_HOME_OF])
+
+
+_rest_before_forks()
 
 
 def __getattr__(name: str) -> object:

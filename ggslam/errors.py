@@ -3,12 +3,26 @@
 
 from __future__ import annotations
 
+import re
+
+_NOISE = re.compile(r"\[Errno -?\d+\] |(?<=/)\.staged-\d+-[0-9a-f]{8}/")
+"""What tells people nothing: numbers of the operating system's errors, and hidden folders that files are written to
+before they take their places."""
+
+
+def plain(text: str) -> str:
+    """A message without what only the program needs to know."""
+    return _NOISE.sub("", text)
+
 
 class GgslamError(Exception):
     """Base of every error that ggslam raises on purpose. The command line prints it and exits with `exit_code`."""
 
     exit_code = 2
     """2: the user's input is at fault; 1: ggslam or the machine is, or most frames were lost."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(plain(arg) if isinstance(arg, str) else arg for arg in args))
 
 
 class SequenceError(GgslamError):

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from ggslam.errors import NativeCoreError
 from ggslam.interface.binding import bind_core
+from ggslam.system.forks import refuse_lost_threads
 
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 _LIBRARY_NAMES = ("libggslam_core.so", "libggslam_core.dylib")
@@ -79,6 +80,7 @@ class NativeContext:
 
     def __init__(self, threads: int | None = None, instruction_set: str | None = None) -> None:
         self._handle: int | None = None
+        refuse_lost_threads()
         self._library = load_library()
         self.threads = threads if threads is not None else available_processors()
         if self.threads < 1:
@@ -89,15 +91,22 @@ class NativeContext:
                 f"instruction set {name!r} is not available here; available: {', '.join(available_instruction_sets())}"
             )
         self.instruction_set = name
-        self._handle = self._library.ggslam_context_create(self.threads, INSTRUCTION_SETS.index(name))
+        self._begin()
+
+    def _begin(self) -> None:
+        self._process = os.getpid()
+        self._handle = self._library.ggslam_context_create(self.threads, INSTRUCTION_SETS.index(self.instruction_set))
 
     @property
     def handle(self) -> ctypes.c_void_p:
         """Pointer that the C functions take as their first argument."""
+        if self._process != os.getpid():  # forked: the threads stayed in the parent
+            refuse_lost_threads()
+            self._begin()
         return ctypes.c_void_p(self._handle)
 
     def __del__(self) -> None:
-        if self._handle is not None:
+        if self._handle is not None and self._process == os.getpid():  # a fork would wait for the parent's threads
             self._library.ggslam_context_destroy(self._handle)
 
 

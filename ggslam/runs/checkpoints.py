@@ -12,7 +12,6 @@ that it needs. So whatever ends the program, the newest state that is there and 
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from ggslam.slam.slam import Slam
 from ggslam.system.array_file import PendingFile, WrittenFile, read_array_file, write_array_file
 from ggslam.system.atomic import make_folder, sync_folder
 from ggslam.system.kept_arrays import KeptArrays
+from ggslam.system.links import refuse_link, refuse_links_below, remove_folder
 
 FOLDER = "checkpoints"
 _STATE = re.compile(r"state-(\d{6,})\.bin")
@@ -56,10 +56,14 @@ class Checkpoints:
 
     Args:
         run: the run's folder.
+
+    Raises:
+        RunFolderError: its folder of checkpoints, or something in it, is a link.
     """
 
     def __init__(self, run: Path) -> None:
         self.folder = run / FOLDER
+        refuse_links_below(self.folder)
         self._kept = KeptArrays(self.folder)
         self._number = 0
         self._states: list[int] = []
@@ -90,6 +94,7 @@ class Checkpoints:
             RunFolderError: this state or the one before could not be written; earlier ones are there still.
         """
         self.settle()
+        refuse_link(self.folder)
         self._number += 1
         self._kept.begin(self._number)
         tree, arrays = describe_state(slam, self._kept)
@@ -147,9 +152,7 @@ class Checkpoints:
     def remove(self) -> None:
         """Removes all of it: the run is complete."""
         self.close()
-        if self.folder.is_symlink():
-            raise RunFolderError(f"{self.folder}: is a symbolic link; a folder of ggslam's own is expected there")
-        shutil.rmtree(self.folder, ignore_errors=True)
+        remove_folder(self.folder)
 
     # --- reading -----------------------------------------------------------------------------------------------------
 

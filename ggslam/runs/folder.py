@@ -22,7 +22,10 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Collection, Iterator, Mapping
+import secrets
+import shutil
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
@@ -53,7 +56,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config, config_from_dict
 from ggslam.slam.result import SlamResult
-from ggslam.system.folder_lock import LOCK_FILE, folder_lock, refuse_other_writers
+from ggslam.system.folder_lock import LOCK_FILE, refuse_other_writers
 from ggslam.system.foreign import printable, read_foreign_text, refuse_links
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.staging import finish_saving, is_being_saved, leftovers
@@ -121,8 +124,7 @@ class RunFolder:
             raise RunFolderError(f"{path}: {_why_no_run(Path(path))}")
         refuse_links(path, RunFolderError)
         if is_being_saved(Path(path), MARKER):
-            with folder_lock(Path(path), wait_s=5):
-                finish_saving(Path(path), MARKER)
+            finish_saving(Path(path), MARKER)
         folder = RunFolder(path)
         folder.warn()
         return folder
@@ -168,7 +170,7 @@ class RunFolder:
 
     def _probe(self) -> None:
         """Finds out now, not after hours of work, whether files can be written."""
-        probe = self.path / f".probe-{os.getpid()}"
+        probe = self.path / f".probe-{os.getpid()}-{secrets.token_hex(4)}"
         try:
             probe.write_bytes(b"x")
         finally:
@@ -208,8 +210,39 @@ class RunFolder:
         if run.failure is not None:
             raise run.failure
 
-    def save_trajectory(self, timestamps: np.ndarray, poses: np.ndarray, error: str) -> None:
-        """Writes what is left of a run whose map is lost: trajectory.txt, and why it stopped.
+    def write_poses(self, run: RunToWrite, reason: str) -> RunFolder:
+        """Writes what is small of a run whose map cannot be saved: poses, settings, records, and why.
+
+        Returns:
+            Where they are: here, or beside this folder if it holds a run with a map, to which they do not belong.
+
+        Raises:
+            RunFolderError: a file cannot be written.
+        """
+        return self._publish_poses(lambda folder: run.write_poses(folder, reason))
+
+    def _publish_poses(self, write: Callable[[Path], RunRecord]) -> RunFolder:
+        """Writes poses here, or beside this folder if it holds a run with a map; returns where they are."""
+        target = self._without_map()
+        there = target.path.is_dir()
+        try:
+            publish_run(target.path, write, RUN_FILES, f"{self.path}: the trajectory cannot be written")
+        except BaseException:
+            if not there:
+                shutil.rmtree(target.path, ignore_errors=True)
+            raise
+        return target
+
+    def _without_map(self) -> RunFolder:
+        """This folder, or a new one beside it if it holds a run with a map."""
+        if not (self.path / "map.ply").exists() and not is_being_saved(self.path, MARKER):
+            return self
+        there = self.path.resolve()
+        return RunFolder(there.with_name(f"{there.name}-poses-{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}"))
+
+    def save_trajectory(self, timestamps: np.ndarray, poses: np.ndarray, error: str) -> RunFolder:
+        """Writes what is left of a run whose map is lost: trajectory.txt, and why it stopped; returns where they are,
+        as `write_poses`.
 
         Args:
             timestamps: seconds, [n].
@@ -221,7 +254,7 @@ class RunFolder:
             write_tum(folder / "trajectory.txt", timestamps, poses)
             return RunRecord(ggslam=__version__, complete=False, stopped_by=error, missing=["map.ply"])
 
-        publish_run(self.path, write, RUN_FILES, f"{self.path}: the trajectory cannot be written")
+        return self._publish_poses(write)
 
     def change_files(self, *names: str) -> AbstractContextManager[None]:
         """Files (or folders of files) of the run are written within the block; see `publishing.change_files`."""

@@ -13,9 +13,13 @@ from pathlib import Path
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.runs.manifest import files_in, without
 from ggslam.runs.records.mark import RunRecord
-from ggslam.system.atomic import make_folder, sync_folder, write_failure
+from ggslam.system.atomic import make_folder, reason_of, sync_folder, write_failure
 from ggslam.system.folder_lock import folder_lock
-from ggslam.system.staging import new_staging, publish
+from ggslam.system.links import refuse_links_below
+from ggslam.system.staging import make_staging, publish
+
+WAIT_S = 600.0
+"""Seconds that a command which writes files into a finished run waits for another one that does."""
 
 
 def publish_run(target: Path, write: Callable[[Path], RunRecord], old: Sequence[str], failure: str) -> None:
@@ -33,9 +37,8 @@ def publish_run(target: Path, write: Callable[[Path], RunRecord], old: Sequence[
     """
     make_folder(target)
     with folder_lock(target):
-        staged = new_staging(target)
+        staged = make_staging(target)
         try:
-            make_folder(staged)
             mark = write(staged)
             mark = mark.model_copy(update={"files": {**_files_that_stay(staged, target, old), **files_in(staged)}})
             mark.write(staged)
@@ -44,18 +47,9 @@ def publish_run(target: Path, write: Callable[[Path], RunRecord], old: Sequence[
             shutil.rmtree(staged, ignore_errors=True)
             if isinstance(error, OSError):
                 raise _explain(failure, error) from None
-            if isinstance(error, GgslamError):
-                error.args = (_without_staging(str(error), staged, target),)
             raise
         meanwhile = {"complete": False, "stopped_by": "saving did not finish"}
-        try:
-            publish(staged, target, RunRecord.FILE, old, mark.model_copy(update=meanwhile).values())
-        except GgslamError:
-            shutil.rmtree(staged, ignore_errors=True)
-            raise
-        except OSError as error:
-            text = f"{target}: not all files could be put into place; the next command on it will go on: {error}"
-            raise RunFolderError(text) from None
+        publish(staged, target, RunRecord.FILE, old, mark.model_copy(update=meanwhile).values())
         sync_folder(target)
 
 
@@ -65,9 +59,11 @@ def change_files(run: Path, names: Sequence[str]) -> Iterator[None]:
     within, they are known to be unfinished.
 
     Raises:
-        RunFolderError: another process writes to the run, or run.json cannot be written.
+        RunFolderError: another process writes to the run for longer than `WAIT_S`, there is a link among the files, or
+            run.json cannot be written.
     """
-    with folder_lock(run):
+    with folder_lock(run, wait_s=WAIT_S):
+        refuse_links_below(run, [RunRecord.FILE, *names])
         mark = RunRecord.read(run)
         if mark.files is None:  # a run of before there were manifests
             yield
@@ -88,12 +84,6 @@ def change_in_run(path: Path | None) -> Iterator[None]:
         return
     with change_files(path.parent, [path.name]):
         yield
-
-
-def _without_staging(text: str, staged: Path, target: Path) -> str:
-    """What went wrong with a file, by the name that it was to have."""
-    text = text.replace(f"{staged}: cannot be made", f"{target}: cannot be written to")
-    return text.replace(f"{staged}{os.sep}", f"{target}{os.sep}")
 
 
 def _files_that_stay(staged: Path, target: Path, old: Sequence[str]) -> dict[str, object]:
@@ -122,7 +112,6 @@ def sync_all(folder: Path) -> None:
 
 def _explain(failure: str, error: OSError) -> RunFolderError:
     """As `write_failure`, which knows a full disk from a mistake."""
-    explained = write_failure("", error)
-    found = RunFolderError(f"{failure}: {error.strerror or error}")
-    found.exit_code = explained.exit_code
+    found = RunFolderError(f"{failure}: {reason_of(error)}")
+    found.exit_code = write_failure("", error).exit_code
     return found

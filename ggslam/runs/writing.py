@@ -73,15 +73,14 @@ class RunToWrite:
     failure: GgslamError | OSError | None = None
 
     def write(self, folder: Path) -> RunRecord:
-        """Writes everything but run.json; returns what that is to say.
+        """Writes everything but run.json, what is small and precious first; returns what that is to say.
 
         Raises:
             GgslamError, OSError: a file cannot be written; of the clouds, `failure` says it.
         """
+        self._write_records(folder)
         self._write_map(folder)
         result = self.result
-        for record in (TimingRecord.of_result(result), LoopsRecord.of_result(result)):
-            record.write(folder)
         if result.steps is not None:
             write_text(folder / STEPS_FILE, result.steps)
         if result.places is not None:
@@ -99,9 +98,24 @@ class RunToWrite:
 
     def write_least(self, folder: Path) -> RunRecord:
         """As `write`, but only the map with its objects, poses, settings: what a run cannot do without."""
+        self._write_records(folder)
         self._write_map(folder)
-        TimingRecord.of_result(self.result).write(folder)
         return self._mark((*self.wanted, *POINTS))
+
+    def write_poses(self, folder: Path, reason: str) -> RunRecord:
+        """As `write`, but without the map, for this reason: poses, settings, records."""
+        self._write_records(folder)
+        mark = self._mark((*self.wanted, "map.ply", *POINTS))
+        return mark.model_copy(update={"stopped_by": self.error or reason})
+
+    def _write_records(self, folder: Path) -> None:
+        """What is small and cannot be made again."""
+        result = self.result
+        save_config(self.config, folder / "config.yaml")
+        write_trajectories(folder, self.sequence, result)
+        records = (KeyframesRecord.of_result(result), TimingRecord.of_result(result), LoopsRecord.of_result(result))
+        for record in (self.sequence, *records):
+            record.write(folder)
 
     def _write_map(self, folder: Path) -> None:
         result = self.result
@@ -109,10 +123,6 @@ class RunToWrite:
             write_bytes(folder / MOVERS_FILE, arrays_to_bytes(**result.moving.to_arrays()))
             MoversRecord.of_result(result, self.names).write(folder)
             write_bytes(folder / POINTS_FILE, arrays_to_bytes(**points_to_arrays(result.movers)))
-        save_config(self.config, folder / "config.yaml")
-        for record in (self.sequence, KeyframesRecord.of_result(result)):
-            record.write(folder)
-        write_trajectories(folder, self.sequence, result)
         if result.cells is not None:
             save_map_in_parts(folder, result, self.names)
         elif result.objects is None:

@@ -217,7 +217,7 @@ def write_objects(store: GridStore, objects: StoreObjects) -> None:
     Raises:
         RunFolderError: it cannot be written.
     """
-    write_bytes(store.path / OBJECTS_FILE, objects_to_bytes(objects), fsync=True)
+    write_bytes(store.path / OBJECTS_FILE, objects_to_bytes(objects), fsync=True, follow=False)
 
 
 def objects_to_bytes(objects: StoreObjects) -> bytes:

@@ -40,7 +40,7 @@ def write_visit(store: GridStore, data: bytes) -> None:
     assert store.visit is not None
     path = visit_file(store.path, store.visit)
     make_folder(path.parent)
-    write_bytes(path, data, fsync=True)
+    write_bytes(path, data, fsync=True, follow=False)
 
 
 def read_visit(store: GridStore, name: str) -> bytes | None:

@@ -92,7 +92,7 @@ def write_array_file(path: Path, values: Any, arrays: Sequence[np.ndarray]) -> P
     header += b" " * (-(len(_MAGIC) + 8 + len(header)) % _ALIGNMENT)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with temporary.open("wb", buffering=0) as file:
+        with _new_file(temporary) as file:
             out = _Summed(file)
             out.write(_MAGIC + struct.pack("<Q", len(header)) + header)
             for array in arrays:
@@ -105,6 +105,12 @@ def write_array_file(path: Path, values: Any, arrays: Sequence[np.ndarray]) -> P
             temporary.unlink(missing_ok=True)
         raise write_failure(path, error) from error
     return PendingFile(path, temporary, WrittenFile(path.name, out.size, crc))
+
+
+def _new_file(path: Path) -> IO[bytes]:
+    """An empty file in the place of what is there; of a link the link goes, not what it points to."""
+    path.unlink(missing_ok=True)
+    return path.open("xb", buffering=0)
 
 
 class _Summed:

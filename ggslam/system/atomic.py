@@ -11,13 +11,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ggslam.errors import RunFolderError
+from ggslam.system.links import refuse_link
 
-_MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
-"""Not the user's fault: disk full, quota used up, disk broken."""
+_MACHINE_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
+"""Not the user's fault: disk full, quota used up, disk broken, file larger than the disk or `ulimit -f` allows."""
 
 
 @contextmanager
-def atomic_write(path: str | Path, fsync: bool = False) -> Iterator[Path]:
+def atomic_write(path: str | Path, fsync: bool = False, follow: bool = True) -> Iterator[Path]:
     """Gives the name of a temporary file to fill; it takes the place of `path` when the block ends well.
 
         with atomic_write("map.ply") as temporary:
@@ -30,12 +31,16 @@ def atomic_write(path: str | Path, fsync: bool = False) -> Iterator[Path]:
     Args:
         path: the file to write; its folder must exist.
         fsync: also waits until the data are on the disk, so that a power cut cannot leave an empty file.
+        follow: a link at `path`, which a user named, keeps pointing, and what it points to is replaced. False: it is
+            refused, for `path` is a file of ggslam's own in a folder that may come from elsewhere.
 
     Raises:
         RunFolderError: the file cannot be written (folder missing, no permission, disk full, ...), naming `path` and
             the reason of the operating system.
     """
     path = Path(path)
+    if not follow:
+        refuse_link(path)
     if path.exists() and not path.is_file():
         raise RunFolderError(f"cannot write {path}: it exists and is not a regular file")
     path = path.resolve() if path.is_symlink() else path
@@ -55,15 +60,15 @@ def atomic_write(path: str | Path, fsync: bool = False) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def write_bytes(path: str | Path, data: bytes, fsync: bool = False) -> None:
+def write_bytes(path: str | Path, data: bytes, fsync: bool = False, follow: bool = True) -> None:
     """Writes a whole file atomically; see `atomic_write` for errors."""
-    with atomic_write(path, fsync) as temporary:
+    with atomic_write(path, fsync, follow) as temporary:
         temporary.write_bytes(data)
 
 
-def write_text(path: str | Path, text: str, fsync: bool = False) -> None:
+def write_text(path: str | Path, text: str, fsync: bool = False, follow: bool = True) -> None:
     """Writes a whole UTF-8 text file atomically; see `atomic_write` for errors."""
-    write_bytes(path, text.encode("utf-8"), fsync)
+    write_bytes(path, text.encode("utf-8"), fsync, follow)
 
 
 def sync_folder(path: str | Path) -> None:
@@ -102,10 +107,20 @@ def make_empty_folder(path: str | Path) -> None:
 
 def write_failure(path: str | Path, error: OSError) -> RunFolderError:
     """The error to raise when the operating system would not write `path`; a full or broken disk is not the user's."""
-    failure = RunFolderError(f"cannot write {path}: {error.strerror or error}")
-    if error.errno in _MACHINE_ERRORS:
+    failure = RunFolderError(f"cannot write {path}: {reason_of(error)}")
+    if is_machine_error(error):
         failure.exit_code = 1
     return failure
+
+
+def is_machine_error(error: OSError) -> bool:
+    """Whether the machine is at fault, not whoever named the file."""
+    return error.errno in _MACHINE_ERRORS
+
+
+def reason_of(error: OSError) -> str:
+    """Why the operating system refused, in words and without a number."""
+    return str(error.strerror or error)
 
 
 def _sync(path: Path) -> None:

@@ -7,6 +7,7 @@ The system lets go of the lock when the process ends, however it ends: nothing i
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import threading
 import time
@@ -15,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ggslam.errors import RunFolderError
+from ggslam.system.foreign import printable
 
 try:
     import fcntl
@@ -25,9 +27,17 @@ LOCK_FILE = ".lock"
 _UNABLE = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL)
 """File systems that have no locks."""
 
+_QUIET_S = 2.0
+"""Seconds to wait without a word."""
+_log = logging.getLogger(__name__)
+
 _held: dict[tuple[int, int], list[int]] = {}
 """Folders (device and inode) that this process has locked: how many times over, and by which descriptor."""
 _guard = threading.Lock()
+
+
+class FolderInUse(RunFolderError):
+    """Another process writes to a folder."""
 
 
 @contextmanager
@@ -36,19 +46,32 @@ def folder_lock(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
 
     Args:
         folder: which must exist.
-        wait_s: seconds to wait for another process.
+        wait_s: seconds to wait for another process; of a wait that lasts, the log tells.
 
     Raises:
         RunFolderError: another process does, naming it; or the folder cannot be written to.
     """
-    last = time.monotonic() + wait_s
-    while writer_of(folder) is not None and time.monotonic() < last:
-        time.sleep(0.02)
-    key = _enter(folder)
+    key = _enter_within(folder, wait_s)
     try:
         yield
     finally:
         _leave(folder, key)
+
+
+def _enter_within(folder: Path, wait_s: float) -> tuple[int, int]:
+    """As `_enter`, after waiting for the writers before."""
+    start, told = time.monotonic(), False
+    while True:
+        try:
+            return _enter(folder)
+        except FolderInUse as refusal:
+            waited = time.monotonic() - start
+            if waited >= wait_s:
+                raise
+            if waited > _QUIET_S and not told:
+                told = True
+                _log.warning("note: %s; waiting for it", printable(str(refusal).partition(";")[0]))
+            time.sleep(0.02)
 
 
 def writer_of(folder: Path) -> int | None:
@@ -77,9 +100,9 @@ def refuse_other_writers(folder: Path) -> None:
         raise _refusal(folder, process)
 
 
-def _refusal(folder: Path, process: int) -> RunFolderError:
+def _refusal(folder: Path, process: int) -> FolderInUse:
     who = f"process {process}" if process else "another process"
-    return RunFolderError(f"{folder}: {who} is writing a run there; wait for it, or choose another folder")
+    return FolderInUse(f"{folder}: {who} is writing a run there; wait for it, or choose another folder")
 
 
 def _enter(folder: Path) -> tuple[int, int]:

@@ -134,11 +134,16 @@ def refuse_links(folder: str | Path, error: type[GgslamError] = FormatError, lin
                     target = Path(entry.path).resolve()
                     if not target.is_relative_to(root):
                         inner = Path(entry.path).relative_to(root)
-                        raise error(f"{Path(folder) / inner}: is a link to {target}, outside {folder}")
+                        raise error(f"{Path(folder) / inner}: is a link to {target}, outside {folder}{_advice(inner)}")
                 elif entry.is_dir(follow_symlinks=False):
                     waiting.append(entry.path)
                 elif not entry.is_file(follow_symlinks=False):
                     raise error(f"{Path(folder) / Path(entry.path).relative_to(root)}: is not a regular file")
+
+
+def _advice(inner: Path) -> str:
+    """What to do with a link that people do not see unless they look for it."""
+    return "; it may be deleted" if inner.name.startswith(".") else ""
 
 
 def printable(text: str) -> str:

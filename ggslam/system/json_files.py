@@ -31,9 +31,9 @@ def json_ready(value: Any) -> Any:
     return value
 
 
-def write_json(path: Path, values: Any) -> Path:
+def write_json(path: Path, values: Any, follow: bool = True) -> Path:
     """Writes a whole file of `json_ready` values; returns its path. See `atomic_write` for errors."""
-    write_text(path, json.dumps(json_ready(values), indent=1) + "\n")
+    write_text(path, json.dumps(json_ready(values), indent=1) + "\n", follow=follow)
     return path
 
 

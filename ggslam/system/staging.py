@@ -3,6 +3,8 @@
 
 While they do, the folder's marker (a JSON file) says from where and what is to go, so that whoever finds the folder
 after the program was killed can finish. At no time is a file gone whose successor is not on the disk.
+
+Folders are passed around, so what is found in one is not trusted: nothing is moved or deleted through a link.
 """
 
 from __future__ import annotations
@@ -17,29 +19,57 @@ from pathlib import Path
 from typing import Any
 
 from ggslam.errors import GgslamError, RunFolderError
-from ggslam.system.atomic import write_text
+from ggslam.system.atomic import is_machine_error, reason_of, write_text
+from ggslam.system.folder_lock import folder_lock
 from ggslam.system.foreign import is_plain_name, read_foreign_text
+from ggslam.system.links import first_link_in, refuse_link
 
 _SAVING = "saving"
 _NAME = re.compile(r"\.staged-(\d+)-[0-9a-f]{8}")
+_WAIT_S = 5.0
+"""For another process that finishes the same saving."""
 
 
 def new_staging(target: Path) -> Path:
-    """A name for a hidden folder in `target` to write files to; folders that killed programs left there go."""
+    """A name for a hidden folder in `target` to write files to; folders that killed programs left there go.
+
+    Raises:
+        RunFolderError: a link has the name of such a folder.
+    """
+    for path in target.iterdir():
+        if _NAME.fullmatch(path.name):
+            refuse_link(path)
     for left in leftovers(target):
         shutil.rmtree(left, ignore_errors=True)
     return target / f".staged-{os.getpid()}-{secrets.token_hex(4)}"
 
 
+def make_staging(target: Path) -> Path:
+    """As `new_staging`, and makes the folder.
+
+    Raises:
+        RunFolderError: likewise, or `target` cannot be written to.
+    """
+    staged = new_staging(target)
+    try:
+        staged.mkdir()
+    except OSError as error:
+        raise _failure(target, f"cannot be written to: {reason_of(error)}", error) from None
+    return staged
+
+
 def leftovers(target: Path) -> list[Path]:
     """Hidden folders in `target` whose writers do not run any more, less one that waits to be put into place."""
-    found = [path for path in target.iterdir() if (match := _NAME.fullmatch(path.name)) and not _runs(int(match[1]))]
+    found = [
+        path for path in target.iterdir()
+        if (match := _NAME.fullmatch(path.name)) and not path.is_symlink() and not _runs(int(match[1]))
+    ]  # fmt: skip
     waiting = [_trusted_saving(marker) for marker in target.glob("*.json")] if found else []
     return [path for path in found if all(record is None or record["from"] != path.name for record in waiting)]
 
 
 def publish(staged: Path, target: Path, marker: str, old: Sequence[str], before: dict[str, Any]) -> None:
-    """Moves the files of `staged` into place, the marker last.
+    """Moves the files of `staged` into place, the marker last. If it cannot begin, `staged` is removed.
 
     Args:
         staged: a folder of `new_staging`, in `target`, with a new marker.
@@ -49,13 +79,22 @@ def publish(staged: Path, target: Path, marker: str, old: Sequence[str], before:
         before: content of the marker meanwhile; what `finish_saving` needs is added.
 
     Raises:
-        RunFolderError: the marker cannot be written; nothing was moved.
-        OSError: something cannot be moved; `finish_saving` may be tried later.
+        RunFolderError: there is a link among the files, or the marker cannot be written: nothing was moved; or
+            something cannot be moved, and `finish_saving` may be tried later.
     """
     stale = [name for name in old if not (staged / name).exists()]
     record = {**before, _SAVING: {"from": staged.name, "stale": stale}}
-    write_text(target / marker, json.dumps(record, indent=1) + "\n")
-    _exchange(staged, target, marker, stale)
+    try:
+        _refuse_links(staged, target, marker, stale)
+        write_text(target / marker, json.dumps(record, indent=1) + "\n", follow=False)
+    except BaseException:
+        shutil.rmtree(staged, ignore_errors=True)  # of a link, which it is not, this would remove nothing
+        raise
+    try:
+        _exchange(staged, target, marker, stale)
+    except OSError as error:
+        text = f"not all files could be put into place; the next command on it will go on: {reason_of(error)}"
+        raise _failure(target, text, error) from None
 
 
 def is_being_saved(target: Path, marker: str) -> bool:
@@ -68,24 +107,32 @@ def is_being_saved(target: Path, marker: str) -> bool:
 
 
 def finish_saving(target: Path, marker: str) -> None:
-    """Finishes a `publish` that was interrupted; does nothing if there was none.
+    """Finishes a `publish` that was interrupted; does nothing if there was none, or if another process is at it.
 
     Raises:
-        RunFolderError: the folder cannot be written to, the files are gone, or the marker was not written by `publish`.
+        RunFolderError: the folder cannot be written to, the files are gone, there is a link among them, or the marker
+            was not written by `publish`.
     """
-    record = _read_saving(target / marker)
-    if record is None:
+    if _read_saving(target / marker) is None:
         return
-    if not (target / record["from"]).is_dir():
-        raise RunFolderError(f"{target}: saving was interrupted, and what was to be put into place is gone")
-    try:
-        _exchange(target / record["from"], target, marker, record["stale"])
-    except OSError as error:
-        reason = error.strerror or error
-        raise RunFolderError(f"{target}: saving was interrupted and cannot be finished: {reason}") from None
+    refuse_link(target / marker)
+    with folder_lock(target, wait_s=_WAIT_S):
+        record = _read_saving(target / marker)
+        if record is None:  # another process was at it
+            return
+        staged = target / record["from"]
+        if not staged.is_dir():
+            refuse_link(staged)
+            raise RunFolderError(f"{target}: saving was interrupted, and what was to be put into place is gone")
+        try:
+            _exchange(staged, target, marker, record["stale"])
+        except OSError as error:
+            text = f"saving was interrupted and cannot be finished: {reason_of(error)}"
+            raise _failure(target, text, error) from None
 
 
 def _exchange(staged: Path, target: Path, marker: str, stale: Sequence[str]) -> None:
+    _refuse_links(staged, target, marker, stale)
     for path in sorted(staged.iterdir()):
         if path.name != marker:
             if (target / path.name).is_dir():  # only for folders there is no replacing in one step
@@ -98,6 +145,28 @@ def _exchange(staged: Path, target: Path, marker: str, stale: Sequence[str]) -> 
             (target / name).unlink(missing_ok=True)
     (staged / marker).replace(target / marker)
     shutil.rmtree(staged, ignore_errors=True)
+
+
+def _refuse_links(staged: Path, target: Path, marker: str, stale: Sequence[str]) -> None:
+    """Raises RunFolderError unless files change places within `target` alone: the hidden folder, all that is in it and
+    all that it replaces are no links, and lie where `publish` has them."""
+    if staged.parent != target or not _NAME.fullmatch(staged.name) or not all(map(is_plain_name, stale)):
+        raise RunFolderError(f"{target}: files of another folder were to be put into it; nothing was moved or deleted")
+    refuse_link(staged)
+    link = first_link_in([staged])
+    if link is not None:
+        raise RunFolderError(
+            f"{staged}: holds a link, {link.relative_to(staged)}, and ggslam makes none; nothing was moved or deleted. "
+            "The hidden folder may be deleted"
+        )
+    for name in sorted({marker, *stale, *(path.name for path in staged.iterdir())}):
+        refuse_link(target / name)
+
+
+def _failure(target: Path, text: str, error: OSError) -> RunFolderError:
+    failure = RunFolderError(f"{target}: {text}")
+    failure.exit_code = 1 if is_machine_error(error) else failure.exit_code
+    return failure
 
 
 def _read_saving(marker: Path) -> dict[str, Any] | None:

@@ -302,7 +302,9 @@ def test_a_map_that_cannot_be_saved_goes_elsewhere(
     assert outcome.folder.path.parent == elsewhere and str(outcome.folder.path) in str(outcome.failure)
     saved = RunFolder.open(outcome.folder.path)
     assert (saved.path / "map.ply").read_bytes() == (whole / "map.ply").read_bytes()
-    assert not (tmp_path / "run" / "run.json").exists() and states(tmp_path / "run")
+    kept = RunFolder.open(tmp_path / "run")  # what is small is in the run's own folder, too
+    assert (kept.path / "trajectory.txt").read_bytes() == (whole / "trajectory.txt").read_bytes()
+    assert "map.ply" in kept.mark().missing and not kept.mark().complete and states(tmp_path / "run")
     monkeypatch.undo()
     assert resume(tmp_path / "run").error is None  # when there is room again
     assert_same(tmp_path / "run", whole)

@@ -9,7 +9,6 @@ machine, and ggslam has to be installed there in this version.
 from __future__ import annotations
 
 import secrets
-import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from ggslam.jobs.tasks.outcomes import Failure
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.jobs.tasks.ray_cluster import RayCluster
 from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.links import remove_folder
 
 _TOKEN = ".shared-by"
 """File in the batch's folder by which a worker sees that it is the driver's."""
@@ -157,12 +157,12 @@ def _take(state: JobState, made: Made | Failure) -> None:
 def _put(state: JobState, files: dict[str, bytes]) -> None:
     """Puts a run that was made elsewhere into the batch's folder: beside its place first."""
     beside = state.run.with_name(f".{state.run.name}-coming")
-    shutil.rmtree(beside, ignore_errors=True)
+    remove_folder(beside)
     for name, content in files.items():
         path = state.out / name
         path = beside / path.relative_to(state.run) if path.is_relative_to(state.run) else path
         make_folder(path.parent)
         path.write_bytes(content)
     if beside.is_dir():
-        shutil.rmtree(state.run, ignore_errors=True)
+        remove_folder(state.run)
         beside.replace(state.run)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Iterable
 from contextlib import ExitStack
@@ -31,6 +30,7 @@ from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.links import refuse_links_below, remove_folder
 from ggslam.tracking.settings import TargetSettings, TrackerSettings
 
 GIVEN = "given"
@@ -142,16 +142,16 @@ def _store_in_run(path: Path, observer: Observer) -> GridStore:
     if path.is_dir() and not (path / MARKER).is_file():
         raise ConfigError(f"{path}: neither a grid store (no index.sqlite) nor a run (no {MARKER})")
     folder = RunFolder.open(path)
-    cells = folder.path / _CELLS
+    cells, making = folder.path / _CELLS, folder.path / (_CELLS + ".new")
+    refuse_links_below(folder.path, [cells.name, making.name])
     if is_store(cells):
         store = GridStore.open(cells)
         if store.visits()[-1:] == [visit_of(folder)]:
             return store
         store.close()
-        shutil.rmtree(cells)
+        remove_folder(cells)
     observer.note(f"the map of {path} is cut into cells: {cells}")
-    making = folder.path / (_CELLS + ".new")
-    shutil.rmtree(making, ignore_errors=True)
+    remove_folder(making)
     with GridStore.create(making, INDOORS) as store:
         store_of_run(path, store)
     making.rename(cells)  # a store that was not finished has another name

@@ -15,6 +15,7 @@ from ggslam.errors import GgslamError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.grid import GridStore
+from ggslam.system.links import remove_folder
 
 FOLDER = "refining"
 _FINISHED = "finished"
@@ -37,7 +38,7 @@ class CellsDone:
             try:
                 self._done = GridStore.open(self.path, write=True)
             except GgslamError:  # cut off while it was made
-                shutil.rmtree(self.path, ignore_errors=True)
+                remove_folder(self.path)
 
     def close(self) -> None:
         """Lets others write to it."""

@@ -244,7 +244,8 @@ class _Run:
             folder, failure = save_somewhere(
                 self.folder, RunToWrite(self.config, described, result, told, names, wanted, verdicts)
             )
-            self.fit = self._or_note(lambda: measure_fit(result.keyframes, folder.map_in_parts().in_view))
+            if (folder.path / "map.ply").is_file():
+                self.fit = self._or_note(lambda: measure_fit(result.keyframes, folder.map_in_parts().in_view))
         finally:
             result.close()
         return RunOutcome(folder, result, error=error or failure, failure=failure, verdicts=verdicts)

@@ -149,8 +149,8 @@ class SlamLoop:
             slam.close()
             if self.folder is not None and slam.frames:
                 stamps = np.array([frame.timestamp for frame in slam.frames])
-                self.folder.save_trajectory(stamps, _last_poses(slam), repr(failure))
-                self.observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {self.folder.path}")
+                kept = self.folder.save_trajectory(stamps, _last_poses(slam), repr(failure))
+                self.observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {kept.path}")
             raise
 
 

@@ -32,10 +32,9 @@ from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import change_in_run
 from ggslam.runs.records.volumes import VolumesRecord
-from ggslam.system.atomic import make_folder
 from ggslam.system.foreign import is_plain_name
 from ggslam.system.json_files import write_json
-from ggslam.system.staging import finish_saving, new_staging, publish
+from ggslam.system.staging import finish_saving, make_staging, publish
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import (
     BELOW_CAMERAS,
@@ -133,9 +132,8 @@ class _Writer:
     def __init__(self, out: Path, request: OutputRequest, surface: Surface) -> None:
         self.out, self.request, self.surface, self.poses = out, request, surface, surface.poses
         self.T_out_map = surface.T_floor_map if request.frame is OutputFrame.floor else np.eye(4)
-        self.staged = new_staging(out)
+        self.staged = make_staging(out)
         self.outputs = Outputs()
-        make_folder(self.staged)
 
     def path(self, name: str) -> Path:
         """Where to write a file of the folder; it is noted as written."""

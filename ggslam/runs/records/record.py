@@ -89,8 +89,12 @@ class RecordFile(Record):
         return cls.read(folder) if (Path(folder) / cls.FILE).is_file() else None
 
     def write(self, folder: Path) -> Path:
-        """Writes it into a run's folder; returns the path of the file."""
-        return write_json(Path(folder) / self.FILE, self.values())
+        """Writes it into a run's folder; returns the path of the file.
+
+        Raises:
+            RunFolderError: it cannot be written, or there is a link in its place.
+        """
+        return write_json(Path(folder) / self.FILE, self.values(), follow=False)
 
 
 def explain(error: pydantic.ValidationError) -> str:

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Links where ggslam keeps files of its own: it makes none, so one that is there was planted or is a user's mistake.
+
+Whoever moves, replaces or deletes by name in such a folder asks here first. A folder that the user names may itself be
+a link: that is the user's choice.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from ggslam.errors import GgslamError, RunFolderError
+
+
+def refuse_link(path: Path, error: type[GgslamError] = RunFolderError) -> None:
+    """Refuses a path whose last part is a link, wherever it leads; what is missing is none.
+
+    Args:
+        path: of a file or folder that ggslam makes itself.
+        error: class of the error to raise.
+
+    Raises:
+        error: it is one; names it and where it leads, and says that it may be deleted.
+    """
+    if path.is_symlink():
+        raise error(
+            f"{path}: is a link to {_leads_to(path)}, and ggslam makes none there; nothing was moved or deleted. "
+            "The link may be deleted"
+        )
+
+
+def refuse_links_below(folder: Path, names: Iterable[str] | None = None) -> None:
+    """Refuses a folder that is a link or holds one, however deep.
+
+    Args:
+        folder: of ggslam's own.
+        names: only these files and folders in it, while `folder` may be a link; None: all, and it may not.
+
+    Raises:
+        RunFolderError: there is a link.
+    """
+    found = first_link_in([folder] if names is None else [folder / name for name in names])
+    if found is not None:
+        refuse_link(found)
+
+
+def first_link_in(paths: Iterable[Path]) -> Path | None:
+    """The first link among files and folders and below the folders; None: there is none."""
+    waiting = list(paths)
+    while waiting:
+        path = waiting.pop()
+        if path.is_symlink():
+            return path
+        if path.is_dir():
+            waiting += path.iterdir()
+    return None
+
+
+def remove_folder(folder: Path) -> None:
+    """Deletes a folder of ggslam's own with all that is in it, if it is there; what cannot be deleted stays.
+
+    Raises:
+        RunFolderError: it is a link.
+    """
+    refuse_link(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _leads_to(link: Path) -> str:
+    try:
+        return os.readlink(link)  # noqa: PTH115 (Path's drops "./")
+    except OSError:
+        return "somewhere"
