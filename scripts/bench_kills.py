@@ -63,6 +63,7 @@ CASES = {
     "decode run": Case(("decode", "run.ggz", "made"), "made", ("run.ggz",)),
     "decode store": Case(("decode", "cells.ggc", "made"), "made", ("cells.ggc",)),
     "encode run": Case(("encode", "run", "made.ggz"), "made.ggz", ("run",)),
+    "encode store": Case(("encode", "store", "made.ggc"), "made.ggc", ("store",)),
     "edit with inpaint": Case(("edit", "run", "--remove", "1", "--inpaint", "--out", "made"), "made", ("run", "room")),
     "edit in place": Case(("edit", "run", "--remove", "1", "--inpaint", "--in-place"), "run", ("room",)),
     "submaps": Case(("submaps", "run", "--out", "made"), "made", ("run", "room")),
