@@ -197,6 +197,10 @@ def killed_refinement(place: Place) -> None:
         place.keep("all cells that were trained")
 
 
+def device_for_recording(place: Place) -> None:
+    place.ggslam("eval", place.run(), "--sequence", "/dev/zero")
+
+
 FAULTS: dict[str, Callable[[Place], None]] = {
     "the hidden folder of a run is a link: verify": linked_run("", "verify", "RUN"),
     "the hidden folder of a run is a link: report": linked_run("", "report", "RUN"),
@@ -206,6 +210,7 @@ FAULTS: dict[str, Callable[[Place], None]] = {
     "the checkpoints are a link to another run's": linked_checkpoints,
     "files are limited to 60 kB (ulimit -f) when a run is saved": limited(60_000),
     "files are limited to 60 kB when a run is replaced": limited(60_000, "--overwrite"),
+    "a run is scored against a device": device_for_recording,
     "two exports of one name at once": two_exports,
     "SIGTERM while the interpreter ends": late_signal,
     "a fork after PyTorch was used": forked,
