@@ -52,7 +52,7 @@ def run(settings: list[str], arguments: argparse.Namespace) -> dict[str, Any]:
     """One run with scores in a fresh process."""
     with tempfile.TemporaryDirectory() as temporary:
         command = [
-            sys.executable, "-m", "ggslam.cli.main", "run", str(arguments.recording), "--scale", str(arguments.scale),
+            sys.executable, "-m", "ggslam", "run", str(arguments.recording), "--scale", str(arguments.scale),
             "--out", f"{temporary}/run", "--iterations", str(arguments.iterations),
             *[part for setting in settings for part in ("--set", setting)],
         ]  # fmt: skip

@@ -37,7 +37,7 @@ def run(recording: Path, k: int, arguments: argparse.Namespace, refine: int, rea
     with tempfile.TemporaryDirectory() as temporary:
         out = Path(arguments.out) / f"{recording.name}-k{k}-r{refine}" if arguments.out else Path(temporary) / "run"
         command = [
-            sys.executable, "-m", "ggslam.cli.main", "run", str(recording), "--scale", str(arguments.scale), "--out",
+            sys.executable, "-m", "ggslam", "run", str(recording), "--scale", str(arguments.scale), "--out",
             str(out), "--iterations", str(k), "--refine", str(refine), "--overwrite",
             *(["--realtime", str(realtime)] if realtime else []),
             *[part for setting in arguments.set for part in ("--set", setting)],

@@ -90,7 +90,7 @@ def measured(kind: str, words: list[str], out: Path) -> Result:
     """One run in a process of its own; ends the program if it fails."""
     port, looker = free_port(), None
     viewed = [] if kind == KINDS[0] else ["--view", "--port", str(port)]
-    command = [sys.executable, "-m", "ggslam.cli.main", "run", *words, "--out", str(out), *viewed]
+    command = [sys.executable, "-m", "ggslam", "run", *words, "--out", str(out), *viewed]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     said = []

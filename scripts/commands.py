@@ -27,7 +27,7 @@ def usage(words: Sequence[str]) -> Usage:
     """Runs `ggslam` with these words; ends the program if that fails."""
     start = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, "-m", "ggslam.cli.main", *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        [sys.executable, "-m", "ggslam", *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         text=True,
     )  # fmt: skip
     assert process.stdout is not None

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import cv2
 import fault_disk
+import fault_moving
 import numpy as np
 from fault_bench import FEW, Place
 from fault_disk import NotHere
@@ -399,5 +400,6 @@ FAULTS: dict[str, Fault] = {
     "there is a run at --out": out_is_there,
     "--out is a file": out_is_a_file,
     **fault_disk.FAULTS,
+    **fault_moving.FAULTS,
 }
 assert len(FAULTS) >= 60 and FEW

@@ -92,7 +92,7 @@ def run_recordings(recordings: Sequence[Path], more: Sequence[str], out: Path, p
     for number, recording in enumerate(recordings):
         progress.update(task, description=recording.name, completed=number)
         folder = out / f"{number:02d}_{re.sub(r'[^A-Za-z0-9_.-]', '_', recording.name)}"
-        command = [sys.executable, "-m", "ggslam.cli.main", "run", str(recording.absolute()), *more]
+        command = [sys.executable, "-m", "ggslam", "run", str(recording.absolute()), *more]
         found = outcome_of([*command, "--out", str(folder), "--overwrite"], folder)
         progress.console.print(line([recording.name, *figures(found), str(found.code)]))
     progress.update(task, completed=len(recordings))

@@ -141,7 +141,7 @@ class Case:
         if words[0] == "-c":
             return [sys.executable, *words]
         more = ["--out", str(out), "--overwrite"] if words[0] in ("run", "localize") else []
-        return [sys.executable, "-m", "ggslam.cli.main", *words, *(more if words[0] == "run" else more[:2])]
+        return [sys.executable, "-m", "ggslam", *words, *(more if words[0] == "run" else more[:2])]
 
     def met(self, outcome: Outcome) -> bool:
         """Whether it is."""

@@ -25,6 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ggslam.cli.argument_names import with_options
+from ggslam.errors import plain
 from ggslam.system.foreign import printable
 
 _NO_TERMINAL = 100_000
@@ -34,7 +35,7 @@ _NO_TERMINAL = 100_000
 class PlainConsole(Console):
     """A console that never hands on control characters of what it is given: names in a recording or a run could move
     the cursor, recolour or rename the terminal, or hide what is printed. Where output is no terminal, lines are not
-    wrapped, unless COLUMNS says how wide it is."""
+    wrapped, unless COLUMNS says how wide it is. What tells people nothing (`errors.plain`) is left out."""
 
     @property  # type: ignore[misc]  # it is set nowhere
     def size(self) -> ConsoleDimensions:
@@ -42,6 +43,10 @@ class PlainConsole(Console):
         found = super().size
         asked = self._width is not None or self.is_terminal or "COLUMNS" in os.environ
         return found if asked else ConsoleDimensions(_NO_TERMINAL, found.height)
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        """As `rich.console.Console.print`."""
+        super().print(*(plain(item) if isinstance(item, str) else item for item in objects), **how)
 
     def _render_buffer(self, buffer: Iterable[Segment]) -> str:
         # The only place that all text passes, whatever it was part of; rich's own sequences are added in it.

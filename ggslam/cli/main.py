@@ -39,7 +39,7 @@ from ggslam.cli import (
 from ggslam.cli.argument_names import with_options
 from ggslam.cli.console import PlainConsole
 from ggslam.cli.old_names import Command
-from ggslam.errors import GgslamError, plain
+from ggslam.errors import GgslamError
 from ggslam.system.interrupts import Interrupted, exit_code, stop_like_ctrl_c
 
 
@@ -119,7 +119,7 @@ def main() -> None:
             errors.print("interrupted")
         raise
     except OSError as error:
-        errors.print(f"error: {plain(str(error))}", highlight=False, soft_wrap=True, markup=False)
+        errors.print(f"error: {error}", highlight=False, soft_wrap=True, markup=False)
         sys.exit(1)
     except Exception as error:
         text = _in_words(error)

@@ -14,12 +14,9 @@ from ggslam.errors import GgslamError, RunFolderError
 from ggslam.runs.manifest import files_in, without
 from ggslam.runs.records.mark import RunRecord
 from ggslam.system.atomic import make_folder, reason_of, sync_folder, write_failure
-from ggslam.system.folder_lock import folder_lock
+from ggslam.system.folder_lock import WAIT_S, folder_lock
 from ggslam.system.links import refuse_links_below
 from ggslam.system.staging import make_staging, publish
-
-WAIT_S = 600.0
-"""Seconds that a command which writes files into a finished run waits for another one that does."""
 
 
 def publish_run(target: Path, write: Callable[[Path], RunRecord], old: Sequence[str], failure: str) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One writer at a time in a folder: a file that is locked while it writes, and that says who it is.
+"""One writer at a time in a folder, or of one output: a file that is locked while it writes, and that says who it is.
 
 The system lets go of the lock when the process ends, however it ends: nothing is left that somebody has to remove.
 """
@@ -31,8 +31,13 @@ _QUIET_S = 2.0
 """Seconds to wait without a word."""
 _log = logging.getLogger(__name__)
 
-_held: dict[tuple[int, int], list[int]] = {}
-"""Folders (device and inode) that this process has locked: how many times over, and by which descriptor."""
+WAIT_S = 600.0
+"""Seconds that a command which writes beside others waits for one that is at it."""
+
+_Key = tuple[int, int, str]
+_held: dict[_Key, list[int]] = {}
+"""What this process has locked (device and inode of the folder, name of the file): how many times over, and by which
+descriptor."""
 _guard = threading.Lock()
 
 
@@ -51,19 +56,42 @@ def folder_lock(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
     Raises:
         RunFolderError: another process does, naming it; or the folder cannot be written to.
     """
-    key = _enter_within(folder, wait_s)
+    key = _enter_within(folder, LOCK_FILE, wait_s)
     try:
         yield
     finally:
         _leave(folder, key)
 
 
-def _enter_within(folder: Path, wait_s: float) -> tuple[int, int]:
+@contextmanager
+def output_lock(path: Path, wait_s: float = WAIT_S) -> Iterator[None]:
+    """This process alone writes a file, or the files of a folder, within the block; others of the same name wait.
+
+    Args:
+        path: of the output, which need not exist. Where its folder does not, nobody writes there yet; where nothing
+            can be written beside it, nobody waits.
+        wait_s: seconds to wait for another process.
+
+    Raises:
+        RunFolderError: another process is still at it.
+    """
+    path = path.resolve()
+    if not path.name or not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        yield
+        return
+    key = _enter_within(path.parent, f".{path.name[:200]}.lock", wait_s)
+    try:
+        yield
+    finally:
+        _leave(path.parent, key)
+
+
+def _enter_within(folder: Path, name: str, wait_s: float) -> _Key:
     """As `_enter`, after waiting for the writers before."""
     start, told = time.monotonic(), False
     while True:
         try:
-            return _enter(folder)
+            return _enter(folder, name)
         except FolderInUse as refusal:
             waited = time.monotonic() - start
             if waited >= wait_s:
@@ -79,7 +107,7 @@ def writer_of(folder: Path) -> int | None:
     path = folder / LOCK_FILE
     try:
         stat = folder.stat()
-        if (stat.st_dev, stat.st_ino) in _held or fcntl is None:
+        if (stat.st_dev, stat.st_ino, LOCK_FILE) in _held or fcntl is None:
             return None
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
     except OSError:
@@ -97,31 +125,33 @@ def refuse_other_writers(folder: Path) -> None:
     """Raises RunFolderError if another process has locked a folder."""
     process = writer_of(folder)
     if process is not None:
-        raise _refusal(folder, process)
+        raise _refusal(path=folder / LOCK_FILE, process=process)
 
 
-def _refusal(folder: Path, process: int) -> FolderInUse:
-    who = f"process {process}" if process else "another process"
+def _refusal(path: Path, process: int) -> FolderInUse:
+    who, folder = f"process {process}" if process else "another process", path.parent
+    if path.name != LOCK_FILE:
+        output = folder / path.name.removeprefix(".").removesuffix(".lock")
+        return FolderInUse(f"{output}: {who} is writing it; wait for it, or choose another name")
     return FolderInUse(f"{folder}: {who} is writing a run there; wait for it, or choose another folder")
 
 
-def _enter(folder: Path) -> tuple[int, int]:
+def _enter(folder: Path, name: str) -> _Key:
     with _guard:
         try:
             stat = folder.stat()
-            key = (stat.st_dev, stat.st_ino)
+            key = (stat.st_dev, stat.st_ino, name)
             if key in _held:
                 _held[key][0] += 1
             else:
-                _held[key] = [1, _lock(folder)]
+                _held[key] = [1, _lock(folder / name)]
         except OSError as error:
             raise RunFolderError(f"{folder}: cannot be written to: {error.strerror or error}") from None
         return key
 
 
-def _lock(folder: Path) -> int:
+def _lock(path: Path) -> int:
     """A descriptor that holds the lock."""
-    path = folder / LOCK_FILE
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
@@ -131,7 +161,7 @@ def _lock(folder: Path) -> int:
             if error.errno not in _UNABLE:
                 process = _process(descriptor)
                 os.close(descriptor)
-                raise _refusal(folder, process) from None
+                raise _refusal(path, process) from None
         with suppress(FileNotFoundError):
             if os.path.samestat(path.stat(), os.fstat(descriptor)):  # not removed by the one who had it before
                 os.truncate(descriptor, 0)
@@ -148,13 +178,13 @@ def _process(descriptor: int) -> int:
         return 0
 
 
-def _leave(folder: Path, key: tuple[int, int]) -> None:
+def _leave(folder: Path, key: _Key) -> None:
     with _guard:
         _held[key][0] -= 1
         if _held[key][0]:
             return
         _, descriptor = _held.pop(key)
         with suppress(OSError):
-            if os.path.samestat((folder / LOCK_FILE).stat(), os.fstat(descriptor)):
-                (folder / LOCK_FILE).unlink()
+            if os.path.samestat((folder / key[2]).stat(), os.fstat(descriptor)):
+                (folder / key[2]).unlink()
         os.close(descriptor)

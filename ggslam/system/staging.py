@@ -15,12 +15,13 @@ import re
 import secrets
 import shutil
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.system.atomic import is_machine_error, reason_of, write_text
-from ggslam.system.folder_lock import folder_lock
+from ggslam.system.folder_lock import WAIT_S, folder_lock
 from ggslam.system.foreign import is_plain_name, read_foreign_text
 from ggslam.system.links import first_link_in, refuse_link
 
@@ -84,17 +85,17 @@ def publish(staged: Path, target: Path, marker: str, old: Sequence[str], before:
     """
     stale = [name for name in old if not (staged / name).exists()]
     record = {**before, _SAVING: {"from": staged.name, "stale": stale}}
-    try:
-        _refuse_links(staged, target, marker, stale)
-        write_text(target / marker, json.dumps(record, indent=1) + "\n", follow=False)
-    except BaseException:
-        shutil.rmtree(staged, ignore_errors=True)  # of a link, which it is not, this would remove nothing
-        raise
-    try:
-        _exchange(staged, target, marker, stale)
-    except OSError as error:
-        text = f"not all files could be put into place; the next command on it will go on: {reason_of(error)}"
-        raise _failure(target, text, error) from None
+    with ExitStack() as undone:
+        undone.callback(shutil.rmtree, staged, ignore_errors=True)  # a link is not followed
+        with folder_lock(target, wait_s=WAIT_S):
+            _refuse_links(staged, target, marker, stale)
+            write_text(target / marker, json.dumps(record, indent=1) + "\n", follow=False)
+            undone.pop_all()
+            try:
+                _exchange(staged, target, marker, stale)
+            except OSError as error:
+                text = f"not all files could be put into place; the next command on it will go on: {reason_of(error)}"
+                raise _failure(target, text, error) from None
 
 
 def is_being_saved(target: Path, marker: str) -> bool:

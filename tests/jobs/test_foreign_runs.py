@@ -19,6 +19,7 @@ from ggslam.errors import FormatError, GgslamError
 from ggslam.runs.folder import RunFolder
 from ggslam.submaps.grid import GridStore, SubmapSettings
 
+STAGED = ".staged-1-00000000"
 SECRET = "the content of a file outside"
 
 
@@ -76,7 +77,32 @@ def link(name: str, target: str) -> Callable[[Path, Path], None]:
     return attack
 
 
+def staged_file_from_home(run: Path, home: Path) -> None:
+    staged_files(run)
+    (run / STAGED / "map.ply").symlink_to(home / "map.ply")
+
+
+def staged_folder_from_home(run: Path, home: Path) -> None:
+    staged_files(run)
+    (run / STAGED / "renders").symlink_to(home / "papers")
+
+
+def staged_files(run: Path) -> None:
+    """A saving that was cut off."""
+    (run / STAGED).mkdir()
+    (run / STAGED / "run.json").write_text((run / "run.json").read_text())
+    change_mark(run, saving={"from": STAGED, "stale": []})
+
+
+def cells_from_home(run: Path, home: Path) -> None:
+    for name in ("cells", "cells.new"):
+        (run / name).symlink_to(home)
+
+
 ATTACKS: dict[str, Callable[[Path, Path], None]] = {
+    "a staged file is a link": staged_file_from_home, "a staged folder is a link": staged_folder_from_home,
+    "cells are links": cells_from_home, "a hidden link": link(".staged-1-00000000", ""),
+    "checkpoints are a link": link("checkpoints", ""),
     "stale parent": stale(".."), "stale path": stale("../home/map.ply"), "stale absolute": stale("HOME"),
     "stale dot": stale("."), "stale empty": stale(""), "staging is a link": staged_from_home,
     "staging has a path": staged_elsewhere, "map is a link": link("map.ply", "map.ply"),
@@ -99,7 +125,8 @@ def test_a_run_from_elsewhere_stays_in_its_folder(
     attack(run, home)
     commands: list[tuple[object, ...]] = [
         ("export", run, "--out", tmp_path / "out.ply"), ("edit", run, "--rename", "1", "mug", "--in-place"),
-        ("run", tmp_path / "no-recording", "--out", run, "--overwrite"),
+        ("run", tmp_path / "no-recording", "--out", run, "--overwrite"), ("verify", run), ("verify", run, "--accept"),
+        ("localize", run, tmp_path / "no-recording"), ("eval", run, "--no-lpips"),
     ]  # fmt: skip
     if (run / "report.html").is_symlink() or (run / "plots").is_symlink():
         commands.append(("report", run))
@@ -199,3 +226,69 @@ def test_a_recording_that_names_files_elsewhere(tmp_path: Path, home: Path) -> N
     np.zeros(1).tofile(recording / "depth" / "0.png")
     with pytest.raises(SequenceError, match="outside"):
         open_sequence(recording)
+
+
+def sums(folder: Path) -> dict[str, bytes | str]:
+    """All that is in a folder, where links lead included."""
+    return {
+        str(path.relative_to(folder)): str(path.readlink()) if path.is_symlink() else path.read_bytes()
+        for path in sorted(folder.rglob("*")) if path.is_symlink() or path.is_file()
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("attack", [staged_from_home, staged_file_from_home, staged_folder_from_home],
+                         ids=["folder", "file", "inner folder"])  # fmt: skip
+def test_what_verifies_a_run_from_elsewhere_moves_nothing_through_links(
+    room_run: RunFolder, tmp_path: Path, home: Path, attack: Callable[[Path, Path], None]
+) -> None:
+    run = Path(shutil.copytree(room_run.path, tmp_path / "run"))
+    attack(run, home)
+    before = sums(run)
+    for command in (("verify", run), ("verify", run, "--accept")):
+        done = ggslam(*command)
+        assert done.returncode == 2 and "nothing was moved or deleted" in done.stderr and STAGED in done.stderr
+        assert "may be deleted" in done.stderr and done.stderr.count("error") == 1
+    assert sums(run) == before
+
+
+@pytest.mark.parametrize("place", ["", "map.ply", "mesh.ply"])
+def test_volumes_from_elsewhere_move_nothing_through_links(
+    room_run: RunFolder, tmp_path: Path, home: Path, place: str
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "volumes.json").write_text(json.dumps({"saving": {"from": STAGED, "stale": ["mesh.ply"]}, "files": []}))
+    if place:
+        (out / STAGED).mkdir()
+        (out / STAGED / "volumes.json").write_text("{}")
+        (out / (f"{STAGED}/{place}" if place == "map.ply" else place)).symlink_to(home / "map.ply")
+    else:
+        (out / STAGED).symlink_to(home)
+    before = sums(out)
+    done = ggslam("volumes", room_run.path, "--out", out, "--voxel", "0.1")
+    assert done.returncode == 2 and "nothing was moved or deleted" in done.stderr
+    assert sums(out) == before
+
+
+@pytest.mark.parametrize("inner", [False, True], ids=["the folder", "a state"])
+def test_a_run_is_not_resumed_through_links(
+    room: Path, room_run: RunFolder, tmp_path: Path, inner: bool
+) -> None:
+    """Their states would be replaced by this run's."""
+    other = tmp_path / "other" / "checkpoints"
+    other.mkdir(parents=True)
+    for name in ("start.json", "state-000001.bin"):
+        (other / name).write_text("{}")
+    run, before = tmp_path / "run", sums(other)
+    run.mkdir()
+    if inner:
+        (run / "checkpoints").mkdir()
+        (run / "checkpoints" / "start.json").write_text("{}")
+        (run / "checkpoints" / "state-000001.bin").symlink_to(other / "state-000001.bin")
+    else:
+        (run / "checkpoints").symlink_to(other)
+    done = ggslam("run", "--resume", run)
+    assert done.returncode == 2 and "is a link to" in done.stderr and "may be deleted" in done.stderr
+    again = ggslam("run", room, "--out", run, "--overwrite", "--stop", 2)
+    assert again.returncode == 2 and "is a link to" in again.stderr
+    assert sums(other) == before

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.refine import refine_store as refine_store_module
 from ggslam.jobs.refine.cell_mapper import CellBox
 from ggslam.jobs.refine.cell_training import CellTask, TrainedCell, train_cell
+from ggslam.jobs.refine.cells_done import CellsDone
 from ggslam.jobs.refine.cells_of_store import StoreCells
 from ggslam.jobs.refine.refine_run import refine_run
 from ggslam.jobs.refine.refine_store import refine_store
@@ -168,6 +170,53 @@ def test_putting_cells_into_the_store_goes_on(
     monkeypatch.setattr(refine_store_module, "train_cell", None)  # nothing is trained again
     assert "put into the store" in refine_store(copy, settings=FEW).notes[0]
     assert files_of(copy) == files_of(refined) and not (copy / "refining").exists()
+
+
+class Killed(BaseException):
+    """Stands for a kill that lets nothing be tidied up."""
+
+
+def test_killed_after_its_last_cell_it_does_not_train_again(
+    copy: Path, refined: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def kill(self: CellsDone) -> int:
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(CellsDone, "finish", kill)
+        refine_store(copy, settings=FEW, engine=Engine(workers=1))
+    monkeypatch.setattr(refine_store_module, "train_cell", None)
+    outcome = refine_store(copy, settings=FEW, engine=Engine(workers=1))
+    assert outcome.resumed == outcome.cells > 3 and outcome.trained == 0
+    assert files_of(copy) == files_of(refined) and not list(copy.glob("*refining*"))
+
+
+@pytest.mark.parametrize("gone", ["index.sqlite", "cells"])
+def test_killed_while_it_tidies_up_it_has_nothing_left_to_do(
+    copy: Path, refined: Path, monkeypatch: pytest.MonkeyPatch, gone: str
+) -> None:
+    """A part of what waited is deleted: nobody takes the rest for work to go on with."""
+
+    def half(path: Path, **named: Any) -> None:
+        if "refining" not in path.name:
+            return rmtree(path, **named)
+        if (path / gone).is_dir():
+            rmtree(path / gone)
+        else:
+            (path / gone).unlink()
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        rmtree = shutil.rmtree
+        patch.setattr(shutil, "rmtree", half)
+        refine_store(copy, settings=FEW, engine=Engine(workers=1))
+    assert files_of(copy) == files_of(refined)
+    with monkeypatch.context() as patch:
+        patch.setattr(refine_store_module, "train_cell", None)
+        assert "put into the store" in refine_store(copy, settings=FEW, engine=Engine(workers=1)).notes[0]
+    assert not list(copy.glob("*refining*")) and not list(copy.glob(".refining*"))
+    assert files_of(copy) == files_of(refined)
+    assert refine_store(copy, settings=FEW, engine=Engine(workers=1)).trained > 3  # whoever asks anew gets more
 
 
 def test_other_work_is_not_gone_on_with(copy: Path, refined: Path) -> None:

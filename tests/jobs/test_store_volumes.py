@@ -121,6 +121,8 @@ def test_what_cannot_be_made_of_a_store(store: Path, room_run: RunFolder, tmp_pa
 
 def test_from_the_command_line(store: Path, tmp_path: Path) -> None:
     """Other voxels than before take the place of what is there."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "elsewhere")  # the user's own choice
     for voxel in (0.3, 0.4):
         said = succeed("volumes", store, "--out", tmp_path / "out", "--voxel", voxel, "--workers", 1)
         assert "cells" in said and read_mesh(tmp_path / "out" / "mesh.ply") is not None

@@ -33,6 +33,7 @@ from ggslam.runs.records.mark import RunRecord
 from ggslam.scene.poses import transform_points
 from ggslam.system.atomic import make_folder, write_failure, write_text
 from ggslam.system.json_files import json_ready
+from ggslam.system.links import refuse_links_below
 
 CHANGES_FILE = "changes.json"
 
@@ -115,6 +116,7 @@ def write_changes(outcome: ChangesOutcome, out: Path, old: str | Path, new: str 
         RunFolderError: `out` is a file, cannot be made or cannot be written to.
     """
     make_folder_of_changes(out)
+    refuse_links_below(out, [path.name for path in out.glob("change*")])
     values, written = outcome.table.to_dict(), []
     for number, change in enumerate(outcome.table.found.changes):
         path = out / f"change{number:02d}_{change.kind}.png"

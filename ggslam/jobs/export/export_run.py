@@ -29,6 +29,7 @@ from ggslam.rendering.zoom import ZoomWidening
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import open_map
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.folder_lock import output_lock
 from ggslam.volumes.output_frame import OutputFrame, output_frame
 
 _SCENES = (ExportFormat.gltf, ExportFormat.sog, ExportFormat.usd)
@@ -59,7 +60,7 @@ def export_run(
     observer: Observer | None = None,
 ) -> str:
     """Writes a run in a form that other programs take, as `ggslam export` does; returns a line that says what was
-    written.
+    written. Two that write to one place wait for one another.
 
     Args:
         run: the run, or its folder; a file of Gaussians, see `runs.map_file.open_map`; for streamed-sog also the folder
@@ -99,7 +100,9 @@ def export_run(
     if movers:
         others = (format, voxel, objects, plain, discs, keyframes, recording, rendered, zoom, min_opacity, up)
         _refuse_beside_movers(place, *others, frame != "map")
-        return export_movers(_with_poses(run if isinstance(run, RunFolder) else open_map(run), "`movers`"), place)
+        folder = _with_poses(run if isinstance(run, RunFolder) else open_map(run), "`movers`")
+        with output_lock(place):
+            return export_movers(folder, place)
     kind = choose_format(None if format is None else _format_named(format), place, objects)
     wanted = output_frame(frame)
     _refuse_ignored(kind, objects, keyframes, recording, rendered, zoom, wanted, up)
@@ -117,7 +120,8 @@ def export_run(
     prepare = _both(widen, turn)
     mesh = MeshRequest(voxel, objects, rendered, images, wanted)
     wish = _Wish(place, kind, voxel, objects, min_opacity, plain, discs, keyframes, images, mesh)
-    said = _write(folder, wish, prepare, observer)
+    with output_lock(place):
+        said = _write(folder, wish, prepare, observer)
     return said if turn is None else f"{said}; {turn.text}"
 
 
@@ -173,7 +177,8 @@ def _export_store(
         raise ConfigError(f"{path}: is a grid store, which has no keyframes: leave out `zoom`")
     if objects is not None:
         raise ConfigError(f"{path}: is a grid store, which has no table of objects: leave out `objects`")
-    return stream_store(path, out, min_opacity, observer)
+    with output_lock(out):
+        return stream_store(path, out, min_opacity, observer)
 
 
 def _both(first: Prepare | None, then: Prepare | None) -> Prepare | None:

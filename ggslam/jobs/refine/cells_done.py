@@ -2,23 +2,30 @@
 """Cells that are done, beside a store that is as it was until all of them are: a store of its own within its folder.
 
     map.grid/refining/        its visits: a name made of all that the work depends on, and "finished" at its end
+    map.grid/.refining-*      one that is done with, and being deleted
 
 Whatever ends the program, the next call finds the cells that were done, or goes on putting them into the store.
 """
 
 from __future__ import annotations
 
+import os
+import secrets
 import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
-from ggslam.errors import GgslamError
+from ggslam.errors import GgslamError, RunFolderError
+from ggslam.submaps.cell_files import wait_for_disk
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.grid import GridStore
-from ggslam.system.links import remove_folder
+from ggslam.system.atomic import write_failure
+from ggslam.system.links import refuse_link, remove_folder
 
 FOLDER = "refining"
 _FINISHED = "finished"
+_GONE = f".{FOLDER}-*"
 _CELLS_AT_ONCE = 64
 
 
@@ -34,6 +41,7 @@ class CellsDone:
         self._store, self._part = store, part
         self.path = store.path / FOLDER
         self._done: GridStore | None = None
+        self._cut_off = _tidy(store.path)
         if self.path.is_dir():
             try:
                 self._done = GridStore.open(self.path, write=True)
@@ -47,8 +55,8 @@ class CellsDone:
             self._done = None
 
     def is_finished(self) -> bool:
-        """Whether an earlier call did all cells, and was cut off while they were put into the store."""
-        return self._done is not None and _FINISHED in self._done.visits()
+        """Whether an earlier call did all cells, and was cut off while they were put into the store, or afterwards."""
+        return self._cut_off or (self._done is not None and _FINISHED in self._done.visits())
 
     def begin(self, work: str) -> bool:
         """Begins, or goes on with the same work; False if there was other work, which is thrown away.
@@ -79,6 +87,8 @@ class CellsDone:
             RunFolderError: the store cannot be written; the next call goes on.
             FormatError: a cell that was done is damaged.
         """
+        if self._done is None and self._cut_off:  # they are all there
+            return 0
         assert self._done is not None
         self._done.begin_visit(_FINISHED)
         changed, waiting = 0, list[CellWrite]()
@@ -99,5 +109,32 @@ class CellsDone:
                 yield CellWrite(key, {self._part: done.get(key, self._part)}, counts={self._part: new.count})
 
     def _throw_away(self) -> None:
+        """In one step, so that nobody finds half of it and takes it for work to go on with, or to begin anew."""
         self.close()
-        shutil.rmtree(self.path, ignore_errors=True)
+        refuse_link(self.path)
+        gone = self.path.with_name(f".{FOLDER}-{os.getpid()}-{secrets.token_hex(4)}")
+        try:
+            self.path.rename(gone)
+            wait_for_disk(self.path.parent)
+        except OSError as error:
+            raise write_failure(self.path, error) from error
+        shutil.rmtree(gone, ignore_errors=True)
+
+
+def is_cut_off(store: Path) -> bool:
+    """Whether a call that worked on a store was cut off, be it while it tidied up."""
+    return (store / FOLDER).is_dir() or any(store.glob(_GONE))
+
+
+def _tidy(store: Path) -> bool:
+    """Deletes what an earlier call was about to when it was cut off; whether there was something.
+
+    Raises:
+        RunFolderError: it cannot be deleted.
+    """
+    found = list(store.glob(_GONE))
+    for left in found:
+        remove_folder(left)
+        if left.exists():
+            raise RunFolderError(f"{left}: is not needed any more and cannot be deleted; please delete it")
+    return bool(found)

@@ -20,7 +20,7 @@ from ggslam import __version__
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.refine.cell_training import CellTask, TrainedCell, train_cell
-from ggslam.jobs.refine.cells_done import FOLDER, CellsDone
+from ggslam.jobs.refine.cells_done import CellsDone, is_cut_off
 from ggslam.jobs.refine.cells_of_store import StoreCells
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
@@ -99,7 +99,7 @@ def _target(path: Path, out: Path | None) -> Path:
     if out is None or out.resolve() == path.resolve():
         return path
     if is_store(out):
-        if not (out / FOLDER).is_dir():
+        if not is_cut_off(out):
             raise RunFolderError(f"{out}: is a store already; choose another one with `out`")
         return out
     with GridStore.open(path) as store:

@@ -42,14 +42,14 @@ def save_somewhere(folder: RunFolder, run: RunToWrite) -> tuple[RunFolder, Ggsla
             other = RunFolder(_new_folder(place, folder.path.resolve().name))
             if _write_elsewhere(other, run, least, refusals):
                 part = "its map, poses and settings were" if least else "the run was"
-                also = "" if poses is None else f"; {_kept(poses)} kept in {poses.path}, too"
+                also = "" if poses is None else f"; {_what_is_kept(poses)} kept in {poses.path}, too"
                 return other, _machine_error(f"{failure}; {part} saved to {other.path} instead{also}")
     for place in places() if poses is None else []:
         poses = poses or _keep_poses(RunFolder(_new_folder(place, folder.path.resolve().name)), run, failure, refusals)
     if poses is None:
         raise _machine_error("; ".join(["the run could not be saved anywhere", *refusals[:3]]))
     again = f"; `ggslam run --resume {folder.path}` makes it where it fits" if has_checkpoints(folder.path) else ""
-    text = f"{failure}; {_kept(poses)} kept in {poses.path}, the map was not{again}"
+    text = f"{failure}; {_what_is_kept(poses)} kept in {poses.path}, the map was not{again}"
     return poses, _machine_error(text)
 
 
@@ -67,7 +67,7 @@ def _keep_poses(
         return None
 
 
-def _kept(poses: RunFolder) -> str:
+def _what_is_kept(poses: RunFolder) -> str:
     whole = (poses.path / KeyframesRecord.FILE).is_file()
     return "trajectory, keyframes and records were" if whole else "the trajectory alone was"
 

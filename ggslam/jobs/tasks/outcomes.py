@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-from ggslam.errors import GgslamError
+from ggslam.errors import GgslamError, plain
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -36,7 +36,7 @@ def outcome_of(work: Callable[[Task], Result], task: Task) -> Result | Failure:
     except GgslamError as error:
         return Failure(str(error), error.exit_code)
     except Exception as error:
-        return Failure(f"{type(error).__name__}: {error}")
+        return Failure(plain(f"{type(error).__name__}: {error}"))
 
 
 def worker_died(reason: str = "") -> Failure:

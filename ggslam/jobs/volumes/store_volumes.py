@@ -116,6 +116,7 @@ def make_store_volumes(
 
 def _open_results(out: Path, store: GridStore, work: str) -> GridStore:
     """The results of the same work that was cut off, or new ones in the place of others."""
+    out = out.resolve() if out.is_symlink() else out  # the user's choice; what is there may be replaced as a whole
     if (out / INDEX).is_file():
         results = GridStore.open(out, write=True)
         if results.visits()[:1] in ([], [work]):

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What people read holds no numbers of errors and no names of hidden folders, whoever wrote the message."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+from pathlib import Path
+
+import pytest
+from command_line import ggslam
+
+from ggslam.cli.console import PlainConsole
+from ggslam.errors import CoreMemoryError, FormatError, GgslamError, InputError, plain
+from ggslam.runs.records.mark import RunRecord
+from ggslam.system.staging import new_staging, publish
+
+ERROR = OSError(errno.ENOSPC, "No space left on device", "runs/a/.staged-12-0123abcd/map.ply")
+SAID = "No space left on device: 'runs/a/map.ply'"
+
+
+@pytest.mark.parametrize("kind", [GgslamError, FormatError, InputError, CoreMemoryError])
+def test_errors(kind: type[GgslamError]) -> None:
+    assert str(kind(f"saving: {ERROR}")) == f"saving: {SAID}" and kind(f"{ERROR}").args == (SAID,)
+    moved = OSError(errno.EXDEV, "Invalid link", "a/.staged-1-00000000/x", None, "b")
+    assert str(kind(f"{moved}")) == "Invalid link: 'a/x' -> 'b'"
+    assert str(kind()) == "" and kind("a", 3).args == ("a", 3)
+
+
+def test_printing() -> None:
+    out = io.StringIO()
+    PlainConsole(file=out).print(f"note: {ERROR}", markup=False)
+    assert out.getvalue() == f"note: {SAID}\n"
+
+
+@pytest.mark.parametrize("text", ["[Errno] x", "Errno 5", "a/.staged-1-00000000: is a link", ".staged/x", "[0] a/b"])
+def test_what_is_something_else_stays(text: str) -> None:
+    assert plain(text) == text
+
+
+def test_a_folder_that_cannot_be_written_to(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    done = ggslam("export", tmp_path / "no-run", "--out", tmp_path / "file" / "map.ply")
+    assert done.returncode == 2 and "Errno" not in done.stderr
+
+
+def test_files_that_cannot_change_places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Path, target: Path) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self), None, str(target))
+
+    staged = new_staging(tmp_path)
+    staged.mkdir()
+    (staged / "map.ply").write_text("new")
+    RunRecord(ggslam="1").write(staged)
+    with monkeypatch.context() as patch, pytest.raises(GgslamError) as failed:
+        real = Path.replace
+        patch.setattr(Path, "replace", lambda a, b: refuse(a, b) if ".staged" in str(a) else real(a, b))
+        publish(staged, tmp_path, RunRecord.FILE, [], {})
+    text = str(failed.value)
+    assert text.startswith(f"{tmp_path}: not all files could be put into place; the next command on it will go on: ")
+    assert text.endswith("Read-only file system") and staged.is_dir()  # what waits is kept
