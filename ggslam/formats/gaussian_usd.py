@@ -9,7 +9,6 @@ points. Object ids are `primvars:object_id`, 0 for none; their names are custom 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -22,7 +21,8 @@ from ggslam.formats.optional_package import package_for
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.system.atomic import atomic_write
+from ggslam.system.atomic import atomic_write, make_folder
+from ggslam.system.hidden_folder import hidden_beside
 
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 PRIM = "/map/gaussians"
@@ -73,8 +73,9 @@ def write_gaussian_usd(path: str | Path, gaussians: GaussianMap, objects: Mappin
 
 def _package(pxr: ModuleType, stage: Any, path: Path, temporary: Path) -> None:
     """Writes a stage as a package with one binary layer."""
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".usdz-") as folder:
-        layer = str(Path(folder) / f"{path.stem}.usdc")
+    with hidden_beside(path) as folder:
+        make_folder(folder)
+        layer = str(folder / f"{path.stem}.usdc")
         done = stage.GetRootLayer().Export(layer)
         if not done or not pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(layer), str(temporary)):
             raise RunFolderError(f"cannot write {path}: usd-core says no more")

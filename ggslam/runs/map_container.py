@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import tempfile
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -65,6 +64,7 @@ from ggslam.scene.packed_arrays import pack_arrays, pack_bytes, unpack_arrays, u
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
 from ggslam.system.foreign import open_foreign
+from ggslam.system.hidden_folder import hidden_beside
 
 SUFFIX = ".ggz"
 _HEAD, MAP, _PLACES, _XZ = "container.json", "map.bin", "places.bin", ".xz"
@@ -127,8 +127,9 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
     optional = _PERHAPS if with_objects else [name for name in _PERHAPS if name not in (TABLE, _CLASSIFIER)]
     names = [*_NEEDED, *(name for name in optional if (folder.path / name).is_file())]
     make_folder(out.parent)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as name:
-        stream = Path(name) / MAP
+    with hidden_beside(out) as folder_of_stream:
+        make_folder(folder_of_stream)
+        stream = folder_of_stream / MAP
         count, notes = _encode_map(rows, births, with_objects, rate, settings, stream)
         members = dict(_smallest(n, (folder.path / n).read_bytes()) for n in names)
         members |= {_PLACES: pack_arrays(places), MAP: stream.read_bytes()}

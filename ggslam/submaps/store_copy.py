@@ -3,19 +3,18 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_files import CellFiles, wait_for_disk
+from ggslam.submaps.coming_store import coming_store
 from ggslam.submaps.grid import CELLS, INDEX, GridStore
 from ggslam.submaps.index import CellIndex
 from ggslam.submaps.store_objects import OBJECTS_FILE
 from ggslam.submaps.visit_files import VISITS
-from ggslam.system.atomic import make_folder, write_failure
+from ggslam.system.atomic import make_folder
 
 _TRIES = 20
 """Times that a writer may have replaced files between a look at the index and at them."""
@@ -32,21 +31,12 @@ def copy_store(source: Path, target: Path) -> None:
     """
     if target.exists() or target.is_symlink():
         raise RunFolderError(f"{target}: is there already; choose another folder with `out`")
-    make_folder(target.parent)
-    beside = target.with_name(f".{target.name}-coming-{os.getpid()}-{secrets.token_hex(4)}")
-    try:
-        with GridStore.open(source) as store:
-            for attempt in range(_TRIES):
-                make_folder(beside)
-                if _copy_to(store, beside, last=attempt == _TRIES - 1):
-                    break
-                shutil.rmtree(beside)
-        beside.rename(target)
-        wait_for_disk(target.parent)
-    except OSError as error:
-        raise write_failure(target, error) from error
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
+    with coming_store(target) as beside, GridStore.open(source) as store:
+        for attempt in range(_TRIES):
+            make_folder(beside)
+            if _copy_to(store, beside, last=attempt == _TRIES - 1):
+                break
+            shutil.rmtree(beside)
 
 
 def _copy_to(store: GridStore, folder: Path, last: bool) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes that end with the one that made them."""
+"""Processes and those that made them: which end together, and which are still at work."""
 
 from __future__ import annotations
 
@@ -24,3 +24,15 @@ def die_with(parent: int) -> None:
         ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, int(signal.SIGKILL), 0, 0, 0)
         if os.getppid() != parent:
             sys.exit(1)
+
+
+def is_running(process: int) -> bool:
+    """Whether a process of this number runs on this machine; also if it is somebody else's, or no number of a
+    process."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True

@@ -24,6 +24,7 @@ from ggslam.system.atomic import is_machine_error, reason_of, write_text
 from ggslam.system.folder_lock import WAIT_S, folder_lock
 from ggslam.system.foreign import is_plain_name, read_foreign_text
 from ggslam.system.links import first_link_in, refuse_link
+from ggslam.system.process_tie import is_running
 
 _SAVING = "saving"
 _NAME = re.compile(r"\.staged-(\d+)-[0-9a-f]{8}")
@@ -63,7 +64,7 @@ def leftovers(target: Path) -> list[Path]:
     """Hidden folders in `target` whose writers do not run any more, less one that waits to be put into place."""
     found = [
         path for path in target.iterdir()
-        if (match := _NAME.fullmatch(path.name)) and not path.is_symlink() and not _runs(int(match[1]))
+        if (match := _NAME.fullmatch(path.name)) and not path.is_symlink() and not is_running(int(match[1]))
     ]  # fmt: skip
     waiting = [_trusted_saving(marker) for marker in target.glob("*.json")] if found else []
     return [path for path in found if all(record is None or record["from"] != path.name for record in waiting)]
@@ -197,13 +198,3 @@ def _trusted_saving(marker: Path) -> dict[str, Any] | None:
         return _read_saving(marker)
     except RunFolderError:
         return None
-
-
-def _runs(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True

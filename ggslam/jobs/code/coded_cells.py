@@ -21,6 +21,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.packed_arrays import unpack_bytes
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellWrite
+from ggslam.submaps.coming_store import coming_store
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_objects import StoreObjects, parse_objects, write_objects
 from ggslam.submaps.visit_files import write_visit
@@ -150,7 +151,7 @@ def decode_store(path: Path, out: Path, threads: int | None = None) -> int:
     by_visit: dict[str, list[CellKey]] = {visit: [] for visit in visits}
     for key in sorted(cells.members):
         by_visit.setdefault(cells.of(key).visit or path.name, []).append(key)
-    with GridStore.create(out, settings) as store:
+    with coming_store(out) as beside, GridStore.create(beside, settings) as store:
         for number, (visit, keys) in enumerate(by_visit.items()):
             store.begin_visit(visit)
             record = records[number] if number < len(records) else None

@@ -15,7 +15,6 @@ outermost, at once.
 from __future__ import annotations
 
 import hashlib
-import tempfile
 import time
 import zipfile
 from collections.abc import Iterator
@@ -55,6 +54,7 @@ from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_objects import objects_to_bytes, read_objects
 from ggslam.submaps.visit_files import read_visit
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
+from ggslam.system.hidden_folder import hidden_beside
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,9 @@ def encode_store(
     """
     start, chosen = time.perf_counter(), settings or CodecSettings()
     make_folder(out.parent)
-    with GridStore.open(path) as store, tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as folder:
-        coding = _Coding(store, Path(folder), CodedStore(out), observer or SilentObserver())
+    with GridStore.open(path) as store, hidden_beside(out) as folder:
+        make_folder(folder)
+        coding = _Coding(store, folder, CodedStore(out), observer or SilentObserver())
         if not coding.counts:
             raise ConfigError(f"{path}: has no Gaussians to code; stores made of runs have some")
         fixed = chosen.voxel_size is not None
