@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -192,8 +193,8 @@ def read_container(path: Path, out: Path, overwrite: bool = False, threads: int 
         try:
             return _write_run(path, members, staged, threads)
         except (FormatError, RunFolderError) as error:
-            if error.exit_code == 2 and str(staged) in str(error):  # a member that is not what its name says
-                raise FormatError(str(error).replace(f"{staged}/", f"{path}: ")) from None
+            if error.exit_code == 2 and f"{out}/" in str(error):  # a member that is not what its name says
+                raise FormatError(str(error).replace(f"{out}/", f"{path}: ")) from None
             raise
 
     try:
