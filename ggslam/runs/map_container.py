@@ -64,7 +64,8 @@ from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.packed_arrays import pack_arrays, pack_bytes, unpack_arrays, unpack_bytes
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
-from ggslam.system.foreign import open_foreign
+from ggslam.system.foreign import read_foreign
+from ggslam.system.zip_files import ZIP_DAMAGE, open_zip
 
 SUFFIX = ".ggz"
 _HEAD, MAP, _PLACES, _XZ = "container.json", "map.bin", "places.bin", ".xz"
@@ -130,7 +131,7 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as name:
         stream = Path(name) / MAP
         count, notes = _encode_map(rows, births, with_objects, rate, settings, stream)
-        members = dict(_smallest(n, (folder.path / n).read_bytes()) for n in names)
+        members = dict(_smallest(n, read_foreign(folder.path / n)) for n in names)
         members |= {_PLACES: pack_arrays(places), MAP: stream.read_bytes()}
         head = ContainerRecord(
             format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=count, rate=rate,
@@ -249,7 +250,7 @@ def open_container(path: Path) -> Container:
         FormatError: it is none, damaged, or of a later version.
     """
     try:
-        with open_foreign(path) as file, zipfile.ZipFile(file) as archive:
+        with open_zip(path) as archive:
             found = archive.infolist()
             names = [info.filename for info in found]
             plain = [n.removesuffix(_XZ) for n in names]
@@ -257,7 +258,7 @@ def open_container(path: Path) -> Container:
             if odd or any(info.compress_type != zipfile.ZIP_STORED for info in found):
                 raise FormatError(f"{path}: no map of ggslam: holds {odd[0] if odd else 'compressed members'}")
             members = {info.filename: archive.read(info) for info in found}
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError) as error:
+    except ZIP_DAMAGE as error:
         raise FormatError(f"{path}: no whole container of a map: {error}") from None
     sizes = {name: len(content) for name, content in members.items()}
     head = _head(path, members.pop(_HEAD, b""))

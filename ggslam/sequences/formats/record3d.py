@@ -19,7 +19,7 @@ import numpy as np
 from ggslam.errors import MissingDependency, SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.archive import Archive, ArchiveImage
-from ggslam.sequences.images import decode_color, find_damage
+from ggslam.sequences.images import decode_color
 from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, numbers_of, parse_object
 from ggslam.sequences.pose_files import pose_of_numbers, poses_of_frames
 from ggslam.sequences.recording import (
@@ -31,6 +31,7 @@ from ggslam.sequences.recording import (
     natural_key,
     nominal_timestamps,
 )
+from ggslam.system.images import find_damage
 
 LARGEST_IMAGE = 64_000_000
 """Bytes; what a damaged file may claim is not believed beyond."""
