@@ -42,7 +42,6 @@ from ggslam.cli.old_names import Command
 from ggslam.errors import GgslamError
 from ggslam.system.interrupts import Interrupted, exit_code, stop_like_ctrl_c
 
-
 _TORCH_HAS_NO_MEMORY = "DefaultCPUAllocator: "
 """How torch says so; it has no class of errors for it."""
 

@@ -11,6 +11,7 @@ import numpy as np
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.objects.mask_painting import distinct_masks, paint_segments
 from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Letterbox, MaskCandidates, mask_candidates, yolo_candidates
+from ggslam.system.foreign import open_foreign
 from ggslam.system.settings import setting, settings_class
 
 IMAGENET_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
@@ -145,8 +146,7 @@ def _open_session(path: Path, threads: int) -> Any:
         raise MissingDependency(
             f"to segment with {path} the package onnxruntime is needed: `pip install 'ggslam[masks]'` ({error})"
         ) from None
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such model file")
+    open_foreign(path, ConfigError).close()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads

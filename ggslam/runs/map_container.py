@@ -132,7 +132,7 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
         stream = Path(name) / MAP
         count, notes = _encode_map(rows, births, with_objects, rate, settings, stream)
         members = dict(_smallest(n, read_foreign(folder.path / n)) for n in names)
-        members |= {_PLACES: pack_arrays(places), MAP: stream.read_bytes()}
+        members |= {_PLACES: pack_arrays(places), MAP: read_foreign(stream)}
         head = ContainerRecord(
             format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=count, rate=rate,
             files={n: FileRecord(bytes=len(b), sha256=hashlib.sha256(b).hexdigest()) for n, b in members.items()},

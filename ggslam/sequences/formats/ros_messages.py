@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import GgslamError, MissingDependency, SequenceError
+from ggslam.system.foreign import open_foreign, refuse_links
 
 NO_MESSAGE = "there is none"
 ZSTD_START = b"\x28\xb5\x2f\xfd"
@@ -36,6 +37,10 @@ class Bag:
             raise MissingDependency(f"reading ROS bags needs rosbags: pip install 'ggslam[ros]' ({error})") from None
         if path.suffix.lower() == ".zstd":
             raise SequenceError(f"{path}: a compressed file of a bag cannot be read alone: open the bag's folder")
+        if path.is_dir():
+            refuse_links(path, SequenceError, links=True)
+        else:
+            open_foreign(path, SequenceError).close()
         self.path = path
         self._lock = threading.RLock()
         self._cursors: dict[str, tuple[int, Iterator[Any]]] = {}
