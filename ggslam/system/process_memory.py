@@ -41,12 +41,8 @@ def resident_bytes() -> int:
 
 
 def most_memory_bytes() -> int:
-    """Memory that this process can have at most, however much of it is in use: the machine's, or what a limit (ulimit,
-    a container) leaves of it."""
+    """Memory that this process can have at most, however much of it is in use: the machine's, or its container's."""
     limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
-    soft = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if soft != resource.RLIM_INFINITY:
-        limits.append(soft)
     with suppress(OSError, ValueError):  # no container, or "max"
         limits.append(int(_CONTAINER_LIMIT.read_text()))
     return min(limits)
