@@ -20,7 +20,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats.compressed_ply_reading import quaternions_of_smallest
 from ggslam.formats.sog import LARGEST_COUNT, META
-from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_columns import SplatColumns, check_count
 from ggslam.formats.splat_repair import columns_of, logits_of
 from ggslam.system.foreign import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, is_plain_name, member, read_foreign
 from ggslam.system.images import claimed_size, decode_image
@@ -73,7 +73,11 @@ def read_streamed_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
         used = [files[number] for number in sorted({piece[0] for piece in pieces})]
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
         raise FormatError(f"{path}: not the index of a streamed SOG: {error!r}") from None
+    if len(set(used)) < len(used):
+        raise FormatError(f"{path}: names a file twice")
     found = dict(zip(sorted({piece[0] for piece in pieces}), map(read_sog, used), strict=True))
+    if sum(count for _, _, count in pieces) > sum(len(columns) for columns, _ in found.values()):
+        raise FormatError(f"{path}: names more Gaussians than are in its files")
     parts = [found[file][0].take(np.arange(start, start + count)) for file, start, count in sorted(pieces)
              if start >= 0 and start + count <= len(found[file][0])]  # fmt: skip
     if len(parts) < len(pieces) or not parts:
@@ -89,6 +93,8 @@ def _decode(read: Files) -> tuple[SplatColumns, dict[int, str] | None]:
     count = int(meta["count"])
     if not 0 < count <= LARGEST_COUNT:
         raise ValueError(f"it says that it has {count} Gaussians")
+    # Positions hardly pack; the other images may be of one colour.
+    check_count(count, 8 * sum(len(read(str(name), MAX_IMAGE_BYTES)) for name in meta["means"]["files"][:2]))
 
     def pixels(part: str, number: int = 0, size: int = count) -> np.ndarray:
         return _pixels(read(str(meta[part]["files"][number]), MAX_IMAGE_BYTES), size)
