@@ -97,6 +97,8 @@ class OnnxSegmenter:
         settings = self.settings
         try:
             first, second = self._session.run(self._outputs, {self._input.name: tensor})
+        except MemoryError:
+            raise
         except Exception as error:  # onnxruntime has no common class of errors
             raise ConfigError(f"{self.path}: the model failed on an input {tensor.shape}: {error}") from None
         try:
@@ -154,5 +156,7 @@ def _open_session(path: Path, threads: int) -> Any:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except MemoryError:
+        raise
     except Exception as error:  # onnxruntime has no common class of errors
         raise ConfigError(f"{path}: cannot be loaded as an ONNX model: {error}") from None
