@@ -269,9 +269,9 @@ def open_container(path: Path) -> Container:
     left = max(MAX_EXPANDED_BYTES, MAX_RATIO * sum(sizes.values()))
     expanded = dict[str, bytes]()
     for member, content in members.items():
-        name, plain = _expand(path, member, content, left)
-        left -= len(plain) - len(content)
-        expanded[name] = plain
+        name, inner = _expand(path, member, content, left)
+        left -= len(inner) - len(content)
+        expanded[name] = inner
     members = expanded
     for name in (MAP, _PLACES, *_NEEDED):
         if name not in members and not (name == _PLACES and PLACES_FILE in members):
