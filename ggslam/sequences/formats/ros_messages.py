@@ -49,9 +49,7 @@ class Bag:
             # Old ROS 2 bags do not carry the definitions of their messages.
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
-        except MemoryError:
-            raise
-        except Exception as error:  # the package raises many types for files that are no whole bag
+        except Exception as error:  # the package raises many types, and takes what memory a damaged bag claims
             raise SequenceError(f"{path}: not a whole bag (truncated, or not indexed?): {_text(error)}") from None
         if path.is_file() and self._reader.is2:
             self._check_uncompressed()
@@ -147,7 +145,7 @@ class _told:
         pass
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, (GgslamError, MemoryError)):
+        if isinstance(error, Exception) and not isinstance(error, GgslamError):
             raise SequenceError(f"{self._place}: bag is damaged: {_text(error)}") from None
 
 
