@@ -149,9 +149,7 @@ def _decompress(place: str, content: bytes, most: int) -> bytes:
         if claimed > most:
             raise ValueError(f"it holds {claimed:,} bytes, at most {most:,} are read")
         return decompress(content)
-    except MemoryError:
-        raise
-    except Exception as error:  # the package has an exception type of its own
+    except Exception as error:  # the package has its own type of exception; a block that lies ends in MemoryError
         raise SequenceError(f"{place}: LZFSE stream is damaged: {error}") from None
 
 
