@@ -65,6 +65,12 @@ class DeviceError(RenderError):
     exit_code = 1
 
 
+class MemoryFullError(GgslamError, MemoryError):
+    """Memory is full: a fault of the machine, or of what else runs on it, not of the file that did not fit."""
+
+    exit_code = 1
+
+
 class OpenCvError(GgslamError):
     """OpenCV refused an image on the way through ggslam: a fault of ggslam, which should have looked at it before."""
 

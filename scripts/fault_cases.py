@@ -91,13 +91,17 @@ def images(recording: Path, kind: str, change: Callable[[np.ndarray], np.ndarray
 
 def png_bomb(path: Path) -> None:
     """60,000 x 60,000 pixels of nothing."""
+    head = struct.pack(">IIBBBBB", 60000, 60000, 16, 0, 0, 0, 0)
+    path.write_bytes(png_of(head, zlib.compress(b"\0" * 10_000_000, 9)))
+
+
+def png_of(head: bytes, rows: bytes) -> bytes:
+    """A PNG of what its header says and of deflated rows."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    head = struct.pack(">IIBBBBB", 60000, 60000, 16, 0, 0, 0, 0)
-    rows = zlib.compress(b"\0" * 10_000_000, 9)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 def covered(recording: Path) -> None:
@@ -213,6 +217,34 @@ def far_off(path: Path) -> None:
     path.write_text(json.dumps(record))
 
 
+def black_picture(path: Path, width: int = 30000, height: int = 29000) -> None:
+    """A whole picture of 2.6 GB in 2.5 MB: pieces of zeros are all alike, so one is packed."""
+    size, piece = (1 + 3 * width) * height, 1 << 22
+
+    def pack(count: int, way: int) -> bytes:
+        packer = zlib.compressobj(9, zlib.DEFLATED, -15)
+        return packer.compress(bytes(count)) + packer.flush(way)
+
+    pieces = pack(piece, zlib.Z_FULL_FLUSH) * (size // piece) + pack(size % piece, zlib.Z_FINISH)
+    rows = b"\x78\xda" + pieces + struct.pack(">HH", size % 65521, 1)
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(png_of(struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0), rows))
+
+
+def picture_of_changes(run: Path) -> None:
+    """A folder of changes whose picture is a pipe."""
+    changes = run.parent / "changes"
+    changes.mkdir()
+    change = {"kind": "moved", "name": "mug", "confidence": 0.9, "picture": "0.png"}
+    (changes / "changes.json").write_text(json.dumps({"changes": [change]}))
+    os.mkfifo(changes / "0.png")
+
+
+def instead_below(path: Path, make: Callable[[Path], object]) -> None:
+    path.parent.mkdir(exist_ok=True)
+    instead(path, make)
+
+
 VOLUMES = ("volumes", "RUN", "--esdf", "--voxel", "0.05", "--sequence", "RECORDING")
 MESH = ("export", "RUN", "--format", "mesh", "--sequence", "RECORDING", "--out", "a.ply")
 """The frames are elsewhere than when the run was made."""
@@ -245,6 +277,11 @@ RUNS: dict[str, tuple[Damage, tuple[str, ...]]] = {
                                   ("export", "RUN", "--format", "colmap", "--out", "c")),
     "the report is a link": (lambda r: instead(r / "report.html", lambda p: p.symlink_to(r.parent / "mine.txt")),
                              ("report", "RUN")),
+    "a picture of renders/ has 870 megapixels in 2.5 MB": (
+        lambda r: black_picture(r / "renders" / "compare000000.png"), ("report", "RUN")),
+    "a picture of renders/ is a pipe": (
+        lambda r: instead_below(r / "renders" / "compare000000.png", os.mkfifo), ("report", "RUN")),
+    "a picture of changes is a pipe": (picture_of_changes, ("view", "RUN", "--changes", "CHANGES")),
     "a pose is 100 km off": (lambda r: far_off(r / "keyframes.json"), (*VOLUMES, "--out", "v")),
     "an object is asked for that is not there": (lambda r: None, ("edit", "RUN", "--remove", "unicorn", "--out", "b")),
     "no such format": (lambda r: None, ("export", "RUN", "--format", "dwg", "--out", "a")),
@@ -300,7 +337,8 @@ def damaged_run(name: str, damage: Damage, words: tuple[str, ...]) -> Fault:
         damage(run)
         if name in CONSISTENT:
             accept(run)
-        known = {"RUN": run, "RECORDING": place.recording() if "RECORDING" in words else None}
+        changes = place.folder / "changes"
+        known = {"RUN": run, "CHANGES": changes, "RECORDING": place.recording() if "RECORDING" in words else None}
         outputs = [place.folder / w if i and words[i - 1] in ("--out", "--html") else w for i, w in enumerate(words)]
         place.ggslam(*(known.get(str(word), word) for word in outputs))
 
@@ -373,6 +411,39 @@ def killed_while_overwriting(place: Place) -> None:
         place.keep("the run before")
 
 
+def piped_checkpoint(place: Place) -> None:
+    place.map_recording(
+        place.recording(), "--checkpoint-every", "3", after=lambda k: os.kill(os.getpid(), 9) if k == 8 else None
+    )
+    for state in (place.out / "checkpoints").glob("state-*.bin"):
+        instead(state, os.mkfifo)
+    place.keep("the checkpoints, which are pipes")
+    place.ggslam("run", "--resume", place.out)
+
+
+def piped_part(place: Place) -> None:
+    store = place.folder / "store"
+    if place.ggslam("submaps", place.run(), "--out", store).code:
+        raise AssertionError(place.ended[-1].text)
+    place.ended.clear()
+    instead(sorted(store.rglob("gaussians.npz"))[0], os.mkfifo)
+    place.ggslam("export", store, "--format", "streamed-sog", "--out", place.folder / "sog")
+
+
+def full_memory(place: Place) -> None:
+    """A file of 64 MB, and 48 MB that are left."""
+    (place.folder / "map.splat").write_bytes(bytes(64 << 20))
+    place.ggslam("export", place.folder / "map.splat", "--out", place.folder / "a.ply", memory=48 << 20)
+
+
+def larger_than_memory(place: Place) -> None:
+    path = place.folder / "disk" / "map.splat"  # nobody adds up what is there
+    path.parent.mkdir()
+    with path.open("wb") as file:
+        file.truncate(1 << 42)
+    place.ggslam("export", path, "--out", place.folder / "a.ply")
+
+
 def out_is_there(place: Place) -> None:
     place.out = place.run()
     place.map_recording(place.recording())
@@ -396,6 +467,10 @@ FAULTS: dict[str, Fault] = {
     "SIGHUP (a dropped connection), then resumed": cut_off(signal.SIGHUP),
     "kill -9, then resumed": cut_off(signal.SIGKILL),
     "kill -9 and a damaged checkpoint, then resumed": damaged_checkpoint,
+    "the checkpoints are pipes": piped_checkpoint,
+    "a part of a store is a pipe": piped_part,
+    "memory is full while a small file is read": full_memory,
+    "a file claims 4 TB": larger_than_memory,
     "kill -9 of a run that overwrites another": killed_while_overwriting,
     "there is a run at --out": out_is_there,
     "--out is a file": out_is_a_file,

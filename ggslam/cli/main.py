@@ -42,6 +42,9 @@ from ggslam.cli.old_names import Command
 from ggslam.errors import GgslamError
 from ggslam.system.interrupts import Interrupted, exit_code, stop_like_ctrl_c
 
+_TORCH_HAS_NO_MEMORY = "DefaultCPUAllocator: "
+"""How torch says so; it has no class of errors for it."""
+
 
 class _Commands(TyperGroup):
     def invoke(self, context: Any) -> Any:
@@ -135,6 +138,9 @@ def _in_words(error: Exception) -> str | None:
     kind = type(error)
     if isinstance(error, RuntimeError) and kind.__name__ == "OutOfMemoryError":  # torch's, of a GPU
         return f"the GPU's memory is full: {error}; smaller images (--scale 0.5) take less, --device cpu takes none"
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _TORCH_HAS_NO_MEMORY in str(error)):
+        reason = str(error).strip().splitlines()
+        return f"memory is full{f': {reason[-1]}' if reason else ''}; smaller images (--scale 0.5) take less"
     if (kind.__module__, kind.__name__) == ("cv2", "error"):
         from ggslam.system.opencv import opencv_reason
 

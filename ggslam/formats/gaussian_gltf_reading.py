@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_columns import SplatColumns, check_count
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
 from ggslam.formats.spz_reading import spz_columns
 from ggslam.scene.poses import quaternion_to_matrix
@@ -75,9 +75,12 @@ def read_gaussian_gltf(path: Path) -> tuple[SplatColumns, dict[int, str] | None]
     """
     try:
         document = _open(path)
-        parts, names = [], dict[int, str]()
+        parts, names, count = [], dict[int, str](), 0
+        held = sum(map(len, document.buffers))
         for T, primitive, mesh in _primitives(document.gltf):
             columns = _columns(document, primitive)
+            count += len(columns)
+            check_count(count, held)
             columns.move_by(T)
             parts.append(columns)
             names |= {int(k): str(v) for k, v in mesh.get("extras", {}).get("objects", {}).items()}

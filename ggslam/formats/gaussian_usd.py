@@ -38,7 +38,7 @@ def usd_package(path: str | Path, verb: str = "write") -> ModuleType:
     schemas = package_for(path, "pxr.UsdVol", "usd", "usd-core", verb=verb)
     if not hasattr(schemas, "ParticleField3DGaussianSplat"):
         raise MissingDependency(f"to {verb} {path} usd-core 26.3 or later is needed: `pip install -U 'ggslam[usd]'`")
-    for name in ("Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
+    for name in ("Ar", "Gf", "Sdf", "Tf", "Usd", "UsdGeom", "UsdUtils", "Vt"):
         package_for(path, f"pxr.{name}", "usd", "usd-core", verb=verb)
     return pxr
 

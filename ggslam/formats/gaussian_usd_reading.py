@@ -14,8 +14,9 @@ from ggslam.errors import FormatError
 from ggslam.formats.gaussian_usd import usd_package
 from ggslam.formats.splat_columns import UPRIGHT, SplatColumns
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
-from ggslam.system.foreign import open_foreign
+from ggslam.system.foreign import member, open_foreign
 
+_MOST_LAYERS = 1000
 _Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation from x right, z up, y forward to x right, y down, z forward."""
 
@@ -30,7 +31,10 @@ def read_gaussian_usd(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
     open_foreign(path).close()
     pxr = usd_package(path, "read")
     try:
+        _check_layers(pxr, path)
         stage = pxr.Usd.Stage.Open(str(path))
+        if any(prim.HasMetadata("clips") for prim in stage.TraverseAll()):
+            raise ValueError("value clips, which name further files, are not read")
         prims = [p for p in stage.Traverse() if p.IsA(pxr.UsdVol.ParticleField3DGaussianSplat)]
         R = _Z_UP if pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z else UPRIGHT
         metres, parts, names = float(pxr.UsdGeom.GetStageMetersPerUnit(stage)), [], dict[int, str]()
@@ -48,6 +52,29 @@ def read_gaussian_usd(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
     except (ValueError, TypeError, RuntimeError, KeyError, pxr.Tf.ErrorException) as error:
         reason = str(error).strip().splitlines()
         raise FormatError(f"{path}: not an OpenUSD file that can be read: {reason[-1] if reason else error}") from None
+
+
+def _check_layers(pxr: ModuleType, path: Path) -> None:
+    """Looks at all layers that a stage would open before it does.
+
+    Raises:
+        FormatError: a layer lies outside the file's folder, is missing, or is no regular file.
+        ValueError: there are too many.
+    """
+    waiting, seen = [str(path.resolve())], set[str]()
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        if len(seen) > _MOST_LAYERS:
+            raise ValueError(f"it has more than {_MOST_LAYERS} layers")
+        if not pxr.Ar.IsPackageRelativePath(name):  # a layer inside a .usdz is in a file that was looked at
+            open_foreign(member(path.parent, name)).close()
+        layer = pxr.Sdf.Layer.FindOrOpen(name)
+        if layer is None:
+            raise ValueError(f"no layer of OpenUSD: {name}")
+        waiting += [layer.ComputeAbsolutePath(other) for other in layer.GetCompositionAssetDependencies()]
 
 
 def _columns(pxr: ModuleType, prim: Any) -> tuple[SplatColumns, bool]:

@@ -48,7 +48,9 @@ class PlyRows:
         """
         try:
             offset = self._begin + start * self._stored.itemsize
-            rows = np.fromfile(self.path, self._stored, count, offset=offset)
+            with open_foreign(self.path) as file:
+                file.seek(offset)
+                rows = np.fromfile(file, self._stored, count)
         except OSError as error:
             raise FormatError(f"cannot read {self.path}: {error.strerror or error}") from error
         if len(rows) < count:

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,17 +20,18 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats.compressed_ply_reading import quaternions_of_smallest
 from ggslam.formats.sog import LARGEST_COUNT, META
-from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_columns import SplatColumns, check_count
 from ggslam.formats.splat_repair import columns_of, logits_of
-from ggslam.system.foreign import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, is_plain_name, member, open_foreign, read_foreign
+from ggslam.system.foreign import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, is_plain_name, member, read_foreign
+from ggslam.system.images import claimed_size, decode_image
+from ggslam.system.zip_files import ZIP_DAMAGE, open_zip, read_member
 
 LEVELS = "lod-meta.json"
 """Index of a streamed SOG."""
 _PALETTE_COLUMNS = 64
 _MOST_SPARE = 1 << 20
 """Pixels that an image may have beyond twice those that are needed."""
-_DAMAGE = (OSError, ValueError, KeyError, IndexError, TypeError, EOFError, RuntimeError, NotImplementedError,
-           OverflowError, MemoryError, RecursionError, zipfile.BadZipFile, zlib.error, cv2.error)  # fmt: skip
+_DAMAGE = (*ZIP_DAMAGE, KeyError, IndexError, TypeError, RecursionError)
 Files = Callable[[str, int], bytes]
 """Gives a file by name, of at most so many bytes."""
 
@@ -47,17 +46,10 @@ def read_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
     try:
         if path.name.lower() == META:
             return _decode(lambda name, limit: read_foreign(member(path.parent, _plain(name)), limit))
-        with open_foreign(path) as file, zipfile.ZipFile(file) as archive:
+        with open_zip(path) as archive:
             inner = {Path(info.filename).name: info for info in archive.infolist()}
 
-            def read(name: str, limit: int) -> bytes:
-                with archive.open(inner[_plain(name)]) as opened:
-                    data = opened.read(limit + 1)
-                if len(data) > limit:
-                    raise ValueError(f"{name} has more than {limit:,} bytes")
-                return data
-
-            return _decode(read)
+            return _decode(lambda name, limit: read_member(archive, inner[_plain(name)], limit))
     except FormatError as error:
         raise (error if str(path) in str(error) else FormatError(f"{path}: {error}")) from None
     except _DAMAGE as error:
@@ -81,7 +73,11 @@ def read_streamed_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
         used = [files[number] for number in sorted({piece[0] for piece in pieces})]
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
         raise FormatError(f"{path}: not the index of a streamed SOG: {error!r}") from None
+    if len(set(used)) < len(used):
+        raise FormatError(f"{path}: names a file twice")
     found = dict(zip(sorted({piece[0] for piece in pieces}), map(read_sog, used), strict=True))
+    if sum(count for _, _, count in pieces) > sum(len(columns) for columns, _ in found.values()):
+        raise FormatError(f"{path}: names more Gaussians than are in its files")
     parts = [found[file][0].take(np.arange(start, start + count)) for file, start, count in sorted(pieces)
              if start >= 0 and start + count <= len(found[file][0])]  # fmt: skip
     if len(parts) < len(pieces) or not parts:
@@ -97,6 +93,8 @@ def _decode(read: Files) -> tuple[SplatColumns, dict[int, str] | None]:
     count = int(meta["count"])
     if not 0 < count <= LARGEST_COUNT:
         raise ValueError(f"it says that it has {count} Gaussians")
+    # Positions hardly pack; the other images may be of one colour.
+    check_count(count, 8 * sum(len(read(str(name), MAX_IMAGE_BYTES)) for name in meta["means"]["files"][:2]))
 
     def pixels(part: str, number: int = 0, size: int = count) -> np.ndarray:
         return _pixels(read(str(meta[part]["files"][number]), MAX_IMAGE_BYTES), size)
@@ -150,26 +148,16 @@ def _table(meta: Any, part: str) -> np.ndarray:
 
 def _pixels(data: bytes, count: int) -> np.ndarray:
     """The first pixels of a WebP image, row by row, RGBA int64 [count, 4]."""
-    width, height = webp_size(data)
-    if not count <= width * height <= 2 * count + _MOST_SPARE:
-        raise ValueError(f"an image of {width}x{height} pixels for {count} numbers")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None or image.ndim != 3 or image.dtype != np.uint8:
-        raise ValueError("an image cannot be decoded")
+    size = claimed_size(data)
+    if size is None or data[12:16] not in (b"VP8L", b"VP8X"):
+        raise ValueError("no WebP image that is lossless")
+    if not count <= size[0] * size[1] <= 2 * count + _MOST_SPARE:
+        raise ValueError(f"an image of {size[0]}x{size[1]} pixels for {count} numbers")
+    image = decode_image("WebP", data, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 3 or image.dtype != np.uint8:
+        raise ValueError("an image that is not of colours")
     rgba = cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGBA)
     return rgba.reshape(-1, 4)[:count].astype(np.int64)
-
-
-def webp_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a lossless or extended WebP image, by its first bytes; ValueError: it is none."""
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
-        raise ValueError("no WebP image")
-    if data[12:16] == b"VP8L":
-        bits = int.from_bytes(data[21:25], "little")
-        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-    if data[12:16] == b"VP8X":
-        return 1 + int.from_bytes(data[24:27], "little"), 1 + int.from_bytes(data[27:30], "little")
-    raise ValueError("a WebP image that is not lossless")
 
 
 def _plain(name: str) -> str:

@@ -20,6 +20,14 @@ UPRIGHT = np.diag([1.0, -1.0, -1.0])
 
 
 _STRETCH = 1e-3
+MOST_SPARE = 1 << 20
+"""Gaussians that a file of any size may hold; beyond them, as many as it has bytes."""
+
+
+def check_count(count: int, held: int) -> None:
+    """Raises ValueError if a file of `held` bytes claims, or repeats, more Gaussians than it can hold."""
+    if count > max(MOST_SPARE, held):
+        raise ValueError(f"it claims {count:,} Gaussians, which {held:,} bytes cannot hold")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import struct
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +29,7 @@ from ggslam.formats.splat_repair import SplatFaults, map_of_columns, mend
 from ggslam.formats.spz_reading import read_spz
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.foreign import open_foreign
+from ggslam.system.zip_files import ZIP_DAMAGE, open_zip
 
 Names = dict[int, str]
 """Names of objects by id, empty where an object has none."""
@@ -97,9 +97,9 @@ def _is_zip_with(path: Path, head: bytes, *endings: str) -> bool:
     if head[:2] != b"PK":
         return False
     try:
-        with open_foreign(path) as file, zipfile.ZipFile(file) as archive:
+        with open_zip(path) as archive:
             return any(name.lower().endswith(endings) for name in archive.namelist())
-    except (OSError, ValueError, RuntimeError, NotImplementedError, zipfile.BadZipFile):
+    except (*ZIP_DAMAGE, FormatError):
         return False
 
 

@@ -98,6 +98,8 @@ def _expand(decoder: object, frame: bytes, size: int) -> bytes:
         try:
             while len(out) <= size and (more := reader.read(size + 1 - len(out))):
                 out += more
+        except MemoryError:
+            raise
         except Exception as error:  # zstandard's own class, which is not there without the package
             raise ValueError(f"zstandard: {error}") from None
     if len(out) != size:

@@ -11,6 +11,7 @@ import numpy as np
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.objects.mask_painting import distinct_masks, paint_segments
 from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Letterbox, MaskCandidates, mask_candidates, yolo_candidates
+from ggslam.system.foreign import open_foreign
 from ggslam.system.settings import setting, settings_class
 
 IMAGENET_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
@@ -96,6 +97,8 @@ class OnnxSegmenter:
         settings = self.settings
         try:
             first, second = self._session.run(self._outputs, {self._input.name: tensor})
+        except MemoryError:
+            raise
         except Exception as error:  # onnxruntime has no common class of errors
             raise ConfigError(f"{self.path}: the model failed on an input {tensor.shape}: {error}") from None
         try:
@@ -145,8 +148,7 @@ def _open_session(path: Path, threads: int) -> Any:
         raise MissingDependency(
             f"to segment with {path} the package onnxruntime is needed: `pip install 'ggslam[masks]'` ({error})"
         ) from None
-    if not path.is_file():
-        raise ConfigError(f"{path}: no such model file")
+    open_foreign(path, ConfigError).close()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads
@@ -154,5 +156,7 @@ def _open_session(path: Path, threads: int) -> Any:
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except MemoryError:
+        raise
     except Exception as error:  # onnxruntime has no common class of errors
         raise ConfigError(f"{path}: cannot be loaded as an ONNX model: {error}") from None

@@ -409,7 +409,7 @@ def _why_no_run(path: Path) -> str:
     if path.is_dir():
         return "is not a run of ggslam (no run.json)"
     if not path.is_file():
-        return "no such folder"
+        return "is neither a folder nor a regular file (a pipe or a device?)" if path.exists() else "no such folder"
     if path.suffix in (".ggz", ".ggc"):
         return "is a file, and a run is a folder; `ggslam decode` makes one of it"
     taken = "view, render, export, edit, encode and compare take files of Gaussians"

@@ -58,14 +58,15 @@ from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
-from ggslam.scene.arrays import arrays_of, arrays_to_bytes, read_all_arrays
+from ggslam.scene.arrays import MAX_EXPANDED_BYTES, MAX_RATIO, arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.packed_arrays import pack_arrays, pack_bytes, unpack_arrays, unpack_bytes
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
-from ggslam.system.foreign import open_foreign
+from ggslam.system.foreign import read_foreign
 from ggslam.system.hidden_folder import hidden_beside
+from ggslam.system.zip_files import ZIP_DAMAGE, open_zip
 
 SUFFIX = ".ggz"
 _HEAD, MAP, _PLACES, _XZ = "container.json", "map.bin", "places.bin", ".xz"
@@ -132,8 +133,8 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
         make_folder(folder_of_stream)
         stream = folder_of_stream / MAP
         count, notes = _encode_map(rows, births, with_objects, rate, settings, stream)
-        members = dict(_smallest(n, (folder.path / n).read_bytes()) for n in names)
-        members |= {_PLACES: pack_arrays(places), MAP: stream.read_bytes()}
+        members = dict(_smallest(n, read_foreign(folder.path / n)) for n in names)
+        members |= {_PLACES: pack_arrays(places), MAP: read_foreign(stream)}
         head = ContainerRecord(
             format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=count, rate=rate,
             files={n: FileRecord(bytes=len(b), sha256=hashlib.sha256(b).hexdigest()) for n, b in members.items()},
@@ -251,7 +252,7 @@ def open_container(path: Path) -> Container:
         FormatError: it is none, damaged, or of a later version.
     """
     try:
-        with open_foreign(path) as file, zipfile.ZipFile(file) as archive:
+        with open_zip(path) as archive:
             found = archive.infolist()
             names = [info.filename for info in found]
             plain = [n.removesuffix(_XZ) for n in names]
@@ -259,7 +260,7 @@ def open_container(path: Path) -> Container:
             if odd or any(info.compress_type != zipfile.ZIP_STORED for info in found):
                 raise FormatError(f"{path}: no map of ggslam: holds {odd[0] if odd else 'compressed members'}")
             members = {info.filename: archive.read(info) for info in found}
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError) as error:
+    except ZIP_DAMAGE as error:
         raise FormatError(f"{path}: no whole container of a map: {error}") from None
     sizes = {name: len(content) for name, content in members.items()}
     head = _head(path, members.pop(_HEAD, b""))
@@ -267,18 +268,25 @@ def open_container(path: Path) -> Container:
         told = head.files.get(name)
         if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
             raise FormatError(f"{path}: {name} is damaged: not the content that {_HEAD} tells the checksum of")
-    members = dict(_expand(path, name, content) for name, content in members.items())
+    left = max(MAX_EXPANDED_BYTES, MAX_RATIO * sum(sizes.values()))
+    expanded = dict[str, bytes]()
+    for member, content in members.items():
+        name, inner = _expand(path, member, content, left)
+        left -= len(inner) - len(content)
+        expanded[name] = inner
+    members = expanded
     for name in (MAP, _PLACES, *_NEEDED):
         if name not in members and not (name == _PLACES and PLACES_FILE in members):
             raise FormatError(f"{path}: holds no {name}")
     return Container(head, sizes, members)
 
 
-def _expand(path: Path, name: str, content: bytes) -> tuple[str, bytes]:
+def _expand(path: Path, name: str, content: bytes, left: int) -> tuple[str, bytes]:
+    """The name and bytes of a member, of at most `left` bytes."""
     if not name.endswith(_XZ):
         return name, content
     try:
-        return name.removesuffix(_XZ), unpack_bytes(content)
+        return name.removesuffix(_XZ), unpack_bytes(content, min(MAX_EXPANDED_BYTES, left))
     except FormatError as error:
         raise FormatError(f"{path}: {name}: {error}") from None
 

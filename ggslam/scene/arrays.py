@@ -8,7 +8,6 @@ import math
 import os
 import tokenize
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,6 +18,7 @@ from numpy.lib import format as npy
 
 from ggslam.errors import FormatError, GgslamError
 from ggslam.system.foreign import open_foreign
+from ggslam.system.zip_files import ZIP_DAMAGE, check_zip, open_zip
 
 T = TypeVar("T")
 MAX_EXPANDED_BYTES = 64 << 20
@@ -74,7 +74,7 @@ def array_blocks(path: str | Path, content: str, *names: str, rows: int) -> Iter
     """The arrays of these names, as many rows of each at a time; arguments and errors as of `read_arrays`. They end
     with the shortest."""
     try:
-        with open_foreign(path) as opened, zipfile.ZipFile(opened) as archive, ExitStack() as stack:
+        with open_zip(path) as archive, ExitStack() as stack:
             members = [_Member(stack.enter_context(archive.open(f"{name}.npy"))) for name in names]
             for _ in range(0, min(member.rows for member in members), rows):
                 yield [member.read(rows) for member in members]
@@ -118,6 +118,7 @@ def arrays_of(file: IO[bytes], what: str, chosen: Callable[[Any], T]) -> T:
     """
     try:
         with zipfile.ZipFile(file) as archive:
+            check_zip(archive)
             members = archive.infolist()
             held = sum(member.compress_size for member in members)
             _check_claim(sum(member.file_size for member in members), max(MAX_EXPANDED_BYTES, MAX_RATIO * held))
@@ -131,8 +132,6 @@ def arrays_of(file: IO[bytes], what: str, chosen: Callable[[Any], T]) -> T:
 
 
 def _check_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
-    if member.flag_bits & 1:
-        raise ValueError(f"{member.filename} is encrypted")
     with archive.open(member) as file:
         shape, _, dtype = _read_header(file)
     if dtype.kind not in "biufUS" or min(shape, default=0) < 0:
@@ -154,6 +153,5 @@ def _check_claim(claimed: int, held: int) -> None:
         raise ValueError(f"it claims {claimed:,} bytes of arrays, {held:,} can be there")
 
 
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, TypeError, SyntaxError, RuntimeError, NotImplementedError,
-           OverflowError, MemoryError, RecursionError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+_DAMAGE = (*ZIP_DAMAGE, KeyError, TypeError, SyntaxError, RecursionError, tokenize.TokenError)
 """What Python's and NumPy's readers raise for damaged, encrypted or strange files."""

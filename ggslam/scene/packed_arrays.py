@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.scene.arrays import MAX_EXPANDED_BYTES
+from ggslam.scene.arrays import MAX_EXPANDED_BYTES, MAX_RATIO
 
 _MAGIC = b"ggslam-arrays-1\n"
 _MEMORY = 128 << 20
@@ -65,16 +65,19 @@ def unpack_arrays(data: bytes) -> dict[str, np.ndarray]:
     """The arrays that `pack_arrays` was given.
 
     Raises:
-        FormatError: damaged, or arrays of more than `MAX_EXPANDED_BYTES` each.
+        FormatError: damaged, or arrays of more than `MAX_EXPANDED_BYTES` each, or of four times that or `MAX_RATIO`
+            times what is packed together.
     """
     begin = len(_MAGIC) + 4
     if data[: len(_MAGIC)] != _MAGIC or len(data) < begin:
         raise FormatError("no packed arrays of ggslam")
     at = begin + int.from_bytes(data[begin - 4 : begin], "little")
     arrays: dict[str, np.ndarray] = {}
+    left = max(4 * MAX_EXPANDED_BYTES, MAX_RATIO * len(data))
     try:
         for name, kind, shape, way, size in json.loads(data[begin:at]):
-            arrays[str(name)] = _array(data[at : at + size], np.dtype(kind), shape, way)
+            arrays[str(name)] = _array(data[at : at + size], np.dtype(kind), shape, way, left)
+            left -= arrays[str(name)].nbytes
             at += size
     except (ValueError, TypeError, RecursionError, OverflowError) as error:
         raise FormatError(f"damaged: {error}") from None
@@ -83,11 +86,11 @@ def unpack_arrays(data: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _array(data: bytes, kind: np.dtype, shape: Any, way: str) -> np.ndarray:
+def _array(data: bytes, kind: np.dtype, shape: Any, way: str, left: int) -> np.ndarray:
     if kind.kind not in "biuf" or any(not isinstance(n, int) or n < 0 for n in shape):
         raise FormatError(f"damaged: an array of {kind}")
     size = math.prod(shape) * kind.itemsize
-    if size > MAX_EXPANDED_BYTES:
+    if size > min(MAX_EXPANDED_BYTES, left):
         raise FormatError(f"damaged: an array of {size} bytes")
     content = unpack_bytes(data, size)
     if size == 0:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.system.foreign import MAX_IMAGE_BYTES, open_foreign
+from ggslam.system.zip_files import ZIP_DAMAGE, check_zip, read_member
 
 
 class Archive:
@@ -25,19 +26,22 @@ class Archive:
     def __init__(self, path: Path) -> None:
         """Raises SequenceError if the file is no whole zip archive."""
         self.path = path
+        file = open_foreign(path, SequenceError)
         try:
-            self._zip = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError) as error:
+            self._zip = zipfile.ZipFile(file)
+            check_zip(self._zip)
+        except ZIP_DAMAGE as error:
+            file.close()
             raise SequenceError(f"{path}: not a whole zip archive (truncated?): {error}") from None
         self.names = frozenset(self._zip.namelist())
 
     def read(self, name: str) -> bytes:
         """Content of a member. Raises SequenceError if it is missing or damaged."""
         try:
-            return self._zip.read(name)
+            return read_member(self._zip, name, MAX_IMAGE_BYTES)
         except KeyError:
             raise SequenceError(f"{self.path}: holds no {name}") from None
-        except (OSError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
+        except ZIP_DAMAGE as error:
             raise SequenceError(f"{self.path}, {name}: cannot be read: {error}") from None
 
 

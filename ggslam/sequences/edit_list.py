@@ -7,12 +7,16 @@ after it: the file counts one frame more than anybody who plays it gets.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.system.foreign import open_foreign
 
 LARGEST_TABLE = 1 << 26
 """Bytes of a table; what a damaged file may claim is not believed beyond."""
@@ -25,9 +29,9 @@ def count_hidden_frames(path: Path) -> int:
     """Frames of the first video track that come before the beginning of its edit list; 0 without one, and for files
     that are no MP4."""
     try:
-        with path.open("rb") as file:
-            return _count_hidden(file, path.stat().st_size)
-    except (OSError, struct.error, ValueError):
+        with open_foreign(path, SequenceError) as file:
+            return _count_hidden(file, os.fstat(file.fileno()).st_size)
+    except (OSError, struct.error, ValueError, SequenceError):
         return 0
 
 

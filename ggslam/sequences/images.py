@@ -1,13 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading image files, with damage found rather than decoded.
-
-OpenCV returns a half-grey picture for many truncated files and only prints a warning, so the containers are checked
-first: every PNG chunk by its length and checksum, a JPEG by its end marker.
-"""
+"""Colour, depth and confidence of a recording's image files."""
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,14 +12,11 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.arrays import read_array
 from ggslam.sequences.recording import ImageFile, ImageSource
-from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
+from ggslam.system.images import decode_image, read_image_bytes
 from ggslam.system.opencv import opencv_errors
 
-MAX_PIXELS = 100_000_000
-"""Of one image: more than any camera of a recording has, and 300 MB in memory."""
 LARGEST_CODE = 65535
 """Of 16-bit depth images: "nothing measured", or cut off there."""
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def read_color(file: ImageFile, upright: bool = False) -> np.ndarray:
@@ -34,14 +26,16 @@ def read_color(file: ImageFile, upright: bool = False) -> np.ndarray:
     Raises:
         SequenceError: missing, truncated, or not an image.
     """
-    return decode_color(file, read_content(file), upright) if isinstance(file, Path) else _read_source(file)
+    if not isinstance(file, Path):
+        return _read_source(file)
+    return decode_color(file, read_image_bytes(file, SequenceError), upright)
 
 
 def decode_color(name: object, content: bytes, upright: bool = False) -> np.ndarray:
     """Colour image uint8 [H, W, 3] RGB of the bytes of a PNG or JPEG file (`name` is for errors)."""
     # The orientation tag is ignored unless asked for: depth and calibration mostly refer to the pixels as stored.
     orientation = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
-    image = decode(name, content, cv2.IMREAD_COLOR | orientation)
+    image = decode_image(name, content, cv2.IMREAD_COLOR | orientation, error=SequenceError)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -56,7 +50,7 @@ def read_stored_depth(file: ImageFile) -> np.ndarray:
     elif file.suffix.lower() == ".npy":
         raw = _read_array(file)
     else:
-        raw = decode(file, read_content(file), cv2.IMREAD_UNCHANGED)
+        raw = _decode_file(file)
     if raw.ndim != 2 or (raw.dtype != np.uint16 and raw.dtype.kind != "f"):
         raise SequenceError(f"{file}: expected a 16-bit depth image with one channel, found {describe_channels(raw)}")
     return raw
@@ -92,10 +86,15 @@ def read_confidence(file: ImageFile) -> np.ndarray:
     Raises:
         SequenceError: missing, damaged, or not 8-bit with one channel.
     """
-    image = decode(file, read_content(file), cv2.IMREAD_UNCHANGED) if isinstance(file, Path) else _read_source(file)
+    image = _decode_file(file) if isinstance(file, Path) else _read_source(file)
     if image.ndim != 2 or image.dtype != np.uint8:
         raise SequenceError(f"{file}: expected an 8-bit confidence image, found {describe_channels(image)}")
     return image
+
+
+def _decode_file(path: Path) -> np.ndarray:
+    """The pixels of a PNG or JPEG file as they are stored."""
+    return decode_image(path, read_image_bytes(path, SequenceError), cv2.IMREAD_UNCHANGED, error=SequenceError)
 
 
 def _read_source(source: ImageSource) -> np.ndarray:
@@ -116,95 +115,3 @@ def describe_channels(image: np.ndarray) -> str:
     channels = 1 if image.ndim == 2 else image.shape[2]
     kind = {"u": "integers", "i": "signed integers", "f": "floats"}.get(image.dtype.kind, str(image.dtype))
     return f"{channels} channel{'s' if channels > 1 else ''} of {8 * image.dtype.itemsize}-bit {kind}"
-
-
-def read_content(path: Path) -> bytes:
-    """The bytes of a PNG or JPEG file, whole.
-
-    Raises:
-        SequenceError: missing, truncated, damaged, or not an image.
-    """
-    content = read_foreign(path, MAX_IMAGE_BYTES, SequenceError)
-    damage = find_damage(content)
-    if damage:
-        raise SequenceError(f"{path}: {damage}")
-    return content
-
-
-def decode(path: object, content: bytes, flags: int) -> np.ndarray:
-    """Image of the bytes `content`, as OpenCV decodes it with `flags`; `path` is for errors.
-
-    Raises:
-        SequenceError: OpenCV cannot decode it.
-    """
-    size = claimed_size(content)
-    if size is not None and size[0] * size[1] > MAX_PIXELS:
-        raise SequenceError(f"{path}: claims {size[0]}x{size[1]} pixels; at most {MAX_PIXELS:,} are read")
-    with opencv_errors(path, SequenceError):
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    if image is None:
-        raise SequenceError(f"{path}: cannot be decoded as an image ({len(content)} bytes)")
-    return image
-
-
-def claimed_size(content: bytes) -> tuple[int, int] | None:
-    """(width, height) that the header of a PNG or JPEG file claims; None where it has none."""
-    if content.startswith(PNG_SIGNATURE):
-        return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
-    position = 2
-    while content.startswith(b"\xff\xd8") and position + 9 <= len(content) and content[position] == 0xFF:
-        marker = content[position + 1]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a frame's header
-            height, width = content[position + 5 : position + 7], content[position + 7 : position + 9]
-            return int.from_bytes(width, "big"), int.from_bytes(height, "big")
-        padding = marker == 0xFF
-        position += 1 if padding else 2 + int.from_bytes(content[position + 2 : position + 4], "big")
-    return None
-
-
-def find_damage(content: bytes) -> str | None:
-    """What is wrong with the bytes of a PNG or JPEG file; None when nothing was found."""
-    if not content:
-        return "file is empty"
-    if content.startswith(PNG_SIGNATURE):
-        return _find_png_damage(content)
-    if content.startswith(b"\xff\xd8"):
-        return _find_jpeg_damage(content)
-    return f"expected a PNG or JPEG image, found a file that starts with {content[:8]!r}"
-
-
-def _find_png_damage(content: bytes) -> str | None:
-    view, position = memoryview(content), len(PNG_SIGNATURE)
-    while position + 12 <= len(content):
-        length = int.from_bytes(view[position : position + 4], "big")
-        kind = bytes(view[position + 4 : position + 8])
-        end = position + 12 + length
-        if end > len(content):
-            return f"PNG is truncated: its {kind.decode('latin1')} chunk needs {end} bytes, found {len(content)}"
-        checksum = int.from_bytes(view[end - 4 : end], "big")
-        if zlib.crc32(view[position + 4 : end - 4]) != checksum:
-            return f"PNG is damaged: wrong checksum in its {kind.decode('latin1')} chunk"
-        if kind == b"IEND":
-            return None
-        position = end
-    return f"PNG is truncated: no end marker in its {len(content)} bytes"
-
-
-def _find_jpeg_damage(content: bytes) -> str | None:
-    position = 2
-    while position + 4 <= len(content):
-        if content[position] != 0xFF:
-            return f"JPEG is damaged at byte {position}"
-        marker = content[position + 1]
-        if marker == 0xFF:  # padding
-            position += 1
-            continue
-        length = int.from_bytes(content[position + 2 : position + 4], "big")
-        if marker == 0xDA:
-            # Inside the scans 0xFF is always followed by 0 or a restart marker, so this is the true end, not the end
-            # of an embedded preview.
-            if content.rfind(b"\xff\xd9") > position:
-                return None
-            break
-        position += 2 + length
-    return f"JPEG is truncated: no end marker in its {len(content)} bytes"

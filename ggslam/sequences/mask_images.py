@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.images import PNG_SIGNATURE, decode, describe_channels, read_content
+from ggslam.sequences.images import describe_channels
 from ggslam.system.foreign import open_foreign
+from ggslam.system.images import PNG_SIGNATURE, decode_image, read_image_bytes
 
 MaskKind = Literal["grey", "palette", "RGB"]
 
@@ -65,11 +66,12 @@ def read_mask_image(path: Path) -> MaskImage:
     Raises:
         SequenceError: missing, damaged, no PNG, RGB of more than 8 bits, or partly transparent.
     """
-    content = read_content(path)
+    content = read_image_bytes(path, SequenceError)
     bits, kind = _format(content)
     if kind is None:
         raise SequenceError(f"{path}: expected a PNG mask (a JPEG does not keep ids), found another kind of image")
-    raw = decode(path, _pixels_only(content, as_grey=kind == "palette"), cv2.IMREAD_UNCHANGED)
+    pixels = _pixels_only(content, as_grey=kind == "palette")
+    raw = decode_image(path, pixels, cv2.IMREAD_UNCHANGED, error=SequenceError)
     if kind != "RGB":
         if raw.ndim != 2 or raw.dtype not in (np.uint8, np.uint16):
             raise SequenceError(f"{path}: expected one channel of ids, found {describe_channels(raw)}")

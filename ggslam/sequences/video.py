@@ -13,6 +13,8 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.edit_list import count_hidden_frames
 from ggslam.sequences.recording import NumberedImage
+from ggslam.system.foreign import open_foreign
+from ggslam.system.images import MAX_PIXELS
 
 FORWARD = 90
 """So many frames are decoded and dropped rather than sought past: seeking starts at a key frame anyway."""
@@ -39,13 +41,15 @@ class Video:
         self.rate = float(self._capture.get(cv2.CAP_PROP_FPS)) or 30.0
 
     def _open(self) -> cv2.VideoCapture:
-        if not self.path.is_file():
-            raise SequenceError(f"{self.path}: file is missing")
+        open_foreign(self.path, SequenceError).close()
         # The orientation tag is ignored: depth and calibration refer to the pixels as stored.
         capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         if not capture.isOpened() or capture.get(cv2.CAP_PROP_FRAME_COUNT) < 1:
             raise SequenceError(f"{self.path}: cannot be opened as a video (truncated, or a codec that is not known)")
+        width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if width * height > MAX_PIXELS:
+            raise SequenceError(f"{self.path}: claims {width}x{height} pixels; at most {MAX_PIXELS:,} are read")
         return capture
 
     def frame(self, index: int) -> np.ndarray:

@@ -109,7 +109,7 @@ def writer_of(folder: Path) -> int | None:
         stat = folder.stat()
         if (stat.st_dev, stat.st_ino, LOCK_FILE) in _held or fcntl is None:
             return None
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | getattr(os, "O_NOFOLLOW", 0))  # of a pipe, too
     except OSError:
         return None
     try:

@@ -13,7 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from ggslam.errors import FormatError, GgslamError
+from ggslam.errors import FormatError, GgslamError, MemoryFullError
+from ggslam.system.process_memory import most_memory_bytes
 
 MAX_TEXT_BYTES = 256 << 20
 """Descriptions, tables and trajectories in text: a trajectory of a day at 30 frames/s has 200 MB."""
@@ -39,38 +40,48 @@ def open_foreign(path: str | Path, error: type[GgslamError] = FormatError) -> Bi
         error: it is missing, no regular file, or cannot be read; names it and the reason.
     """
     try:
+        _refuse_other_kinds(path, Path(path).stat().st_mode, error)  # opening a device may already do something
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
         raise error(f"{path}: file is missing") from None
     except (OSError, ValueError) as reason:  # ValueError: a name with a zero byte
         raise error(f"{path}: cannot be read: {getattr(reason, 'strerror', None) or reason}") from None
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
+    try:
+        _refuse_other_kinds(path, os.fstat(handle).st_mode, error)
+        return os.fdopen(handle, "rb")
+    except BaseException:
         os.close(handle)
-        raise error(f"{path}: is not a regular file")
-    return os.fdopen(handle, "rb")
+        raise
+
+
+def _refuse_other_kinds(path: str | Path, mode: int, error: type[GgslamError]) -> None:
+    if not stat.S_ISREG(mode):
+        raise error(f"{path}: is {'a folder, ' if stat.S_ISDIR(mode) else ''}not a regular file")
 
 
 def read_foreign(path: str | Path, limit: int | None = None, error: type[GgslamError] = FormatError) -> bytes:
-    """The bytes of a regular file.
+    """The bytes of a regular file, as many as it has when it is opened.
 
     Args:
         path: of the file.
-        limit: bytes it may have; None: as many as there are.
+        limit: bytes it may have; None: as many as this machine can hold.
         error: class of the error to raise.
 
     Raises:
         error: as `open_foreign`, or larger than `limit`.
+        MemoryFullError: a file that could be held was not, for memory is full.
     """
     with open_foreign(path, error) as file:
         size = os.fstat(file.fileno()).st_size
-        if limit is not None and size > limit:
-            raise error(f"{path}: too large for what it is: {size:,} bytes, at most {limit:,} are read")
+        most = most_memory_bytes() if limit is None else limit
+        if size > most:
+            raise error(f"{path}: too large for what it is: {size:,} bytes, at most {most:,} are read")
         try:
-            return file.read() if limit is None else file.read(limit + 1)[:limit]
+            return file.read(size) or b""  # None: of some files in /proc, without a size
         except OSError as reason:
             raise error(f"{path}: cannot be read: {reason.strerror or reason}") from None
         except MemoryError:
-            raise error(f"{path}: {size:,} bytes do not fit into memory") from None
+            raise MemoryFullError(f"{path}: memory is full: no room for its {size:,} bytes") from None
 
 
 def read_foreign_text(path: str | Path, error: type[GgslamError] = FormatError, limit: int = MAX_TEXT_BYTES) -> str:

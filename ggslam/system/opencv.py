@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import cv2
 
-from ggslam.errors import GgslamError, OpenCvError
+from ggslam.errors import GgslamError, MemoryFullError, OpenCvError
 
 
 @contextmanager
@@ -17,10 +17,13 @@ def opencv_errors(place: object, kind: type[GgslamError] = OpenCvError) -> Itera
 
     Raises:
         GgslamError: of `kind`; where the pixels of a file may be the reason, that is `SequenceError`.
+        MemoryFullError: memory is full.
     """
     try:
         yield
     except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryFullError(f"{place}: memory is full: {opencv_reason(error)}") from None
         raise kind(f"{place}: OpenCV: {opencv_reason(error)}") from error
 
 

@@ -7,11 +7,13 @@ import ctypes
 import os
 import resource
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Numbers of glibc's `mallopt`."""
 _LARGE = 1 << 18
+_CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 def peak_memory_bytes() -> int:
@@ -36,6 +38,14 @@ def resident_bytes() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
         return peak_memory_bytes()
+
+
+def most_memory_bytes() -> int:
+    """Memory that this process can have at most, however much of it is in use: the machine's, or its container's."""
+    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    with suppress(OSError, ValueError):  # no container, or "max"
+        limits.append(int(_CONTAINER_LIMIT.read_text()))
+    return min(limits)
 
 
 def trim() -> None:

@@ -239,7 +239,7 @@ def test_detections_of_another_layout(tmp_path: Path) -> None:
 
 def test_files_that_are_no_models(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed")
-    with pytest.raises(ConfigError, match=r"none\.onnx: no such model file"):
+    with pytest.raises(ConfigError, match=r"none\.onnx: file is missing"):
         OnnxSegmenter(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("hello")
     with pytest.raises(ConfigError, match=r"text\.onnx: cannot be loaded as an ONNX model"):

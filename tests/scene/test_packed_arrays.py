@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import lzma
 
 import numpy as np
@@ -62,3 +63,13 @@ def test_files_expand_to_no_more_than_is_allowed() -> None:
     for damaged, most in ((packed, 99_999), (packed[:-3], 200_000), (packed + b"x", 200_000), (b"x" * 60, 100)):
         with pytest.raises(FormatError, match="damaged"):
             unpack_bytes(damaged, most)
+
+
+def test_many_large_arrays_are_not_unpacked() -> None:
+    """60 arrays of 60 MB in 0.6 MB: 3.6 GB."""
+    body = lzma.compress(bytes(60_000_000), preset=1)
+    head = json.dumps([[f"a{k}", "|u1", [60_000_000], "plain", len(body)] for k in range(60)]).encode()
+    data = b"ggslam-arrays-1\n" + len(head).to_bytes(4, "little") + head + 60 * body
+    assert len(data) < 1_000_000
+    with pytest.raises(FormatError, match="an array of 60000000 bytes"):
+        unpack_arrays(data)

@@ -2,9 +2,11 @@
 from __future__ import annotations
 
 import os
+import socket
 from pathlib import Path
 
 import pytest
+from little_memory import with_little_memory
 
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.system.foreign import is_plain_name, member, printable, read_foreign, read_foreign_text, refuse_links
@@ -18,7 +20,7 @@ def test_a_file_is_read_within_its_limit(tmp_path: Path) -> None:
         read_foreign(path, 4)
 
 
-@pytest.mark.parametrize("kind", ["missing", "folder", "pipe", "device"])
+@pytest.mark.parametrize("kind", ["missing", "folder", "pipe", "device", "socket", "linked pipe"])
 def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a"
     if kind == "folder":
@@ -27,8 +29,38 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, kind: str) -
         os.mkfifo(path)  # reading it would wait for ever
     elif kind == "device":
         path.symlink_to("/dev/zero")
+    elif kind == "socket":
+        socket.socket(socket.AF_UNIX).bind(str(path))
+    elif kind == "linked pipe":
+        os.mkfifo(tmp_path / "b")
+        path.symlink_to("b")
     with pytest.raises(RunFolderError, match="missing" if kind == "missing" else "not a regular file"):
         read_foreign(path, 10, RunFolderError)
+
+
+@pytest.mark.parametrize(("room", "kind", "exit_code"), [(40, "MemoryFullError", 1), (200, "nothing", 0)])
+def test_full_memory_is_no_fault_of_a_small_file(tmp_path: Path, room: int, kind: str, exit_code: int) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(bytes(60 << 20))
+    ended = with_little_memory("from ggslam.system.foreign import read_foreign", "read_foreign(path)", path, room << 20)
+    assert (ended.kind, ended.exit_code) == (kind, exit_code)
+    if exit_code:
+        assert ended.message == f"{path}: memory is full: no room for its 62,914,560 bytes"
+        assert ended.taken < 5 << 20
+
+
+def test_a_file_that_no_machine_holds_is_the_fault_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    with path.open("wb") as file:
+        file.truncate(1 << 42)
+    with pytest.raises(FormatError, match=r"too large for what it is: 4,398,046,511,104 bytes, at most"):
+        read_foreign(path)
+
+
+def test_no_more_is_read_than_there_was(tmp_path: Path) -> None:
+    """Files in /proc have no size and may go on for ever."""
+    if Path("/proc/self/pagemap").exists():
+        assert read_foreign("/proc/self/pagemap") == b""
 
 
 def test_text_may_have_any_line_ends_and_a_mark(tmp_path: Path) -> None:

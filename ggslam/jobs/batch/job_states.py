@@ -5,19 +5,20 @@ from __future__ import annotations
 
 import enum
 import logging
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from ggslam.errors import GgslamError
+from ggslam.errors import FormatError, GgslamError
 from ggslam.jobs.batch.manifest import BatchJob, Manifest, option
 from ggslam.runs.checkpoints import has_checkpoints
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.record import RecordFile
 from ggslam.system.atomic import make_folder
-from ggslam.system.foreign import printable
+from ggslam.system.foreign import open_foreign, printable
 
 _log = logging.getLogger(__name__)
 _TAIL, _LINE = 8192, 300
@@ -82,10 +83,10 @@ class JobState:
     def last_line(self) -> str:
         """The error that the run printed, or else the last thing it said."""
         try:
-            with self.log.open("rb") as file:
-                file.seek(max(0, self.log.stat().st_size - _TAIL))
-                text = file.read().decode(errors="replace")
-        except OSError:
+            with open_foreign(self.log) as file:
+                file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
+                text = file.read(_TAIL).decode(errors="replace")
+        except (OSError, FormatError):
             return ""
         lines = [line.strip() for line in text.splitlines()]
         errors = [line.removeprefix("error:").strip() for line in lines if line.startswith("error:")]

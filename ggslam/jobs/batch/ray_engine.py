@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ggslam.errors import GgslamError
+from ggslam.errors import FormatError, GgslamError
 from ggslam.jobs.batch.job_process import make_job
 from ggslam.jobs.batch.job_states import JobState, State
 from ggslam.jobs.batch.manifest import BatchJob
@@ -23,6 +23,7 @@ from ggslam.jobs.tasks.outcomes import Failure
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.jobs.tasks.ray_cluster import RayCluster
 from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.foreign import read_foreign, read_foreign_text
 from ggslam.system.links import remove_folder
 
 _TOKEN = ".shared-by"
@@ -133,14 +134,14 @@ def _make_in_folder(state: JobState, root: Path | None) -> Made:
     files = None
     if root is not None:
         paths = [path for top in (state.run, state.log) for path in (top.rglob("*") if top.is_dir() else [top])]
-        files = {path.relative_to(root).as_posix(): path.read_bytes() for path in paths if path.is_file()}
+        files = {path.relative_to(root).as_posix(): read_foreign(path) for path in paths if path.is_file()}
     return Made(record.exit_code, record.seconds, record.line, files)
 
 
 def _is_shared(out: Path, token: str) -> bool:
     try:
-        return (out / _TOKEN).read_text() == token
-    except OSError:
+        return read_foreign_text(out / _TOKEN) == token
+    except FormatError:
         return False
 
 

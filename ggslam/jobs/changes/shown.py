@@ -6,18 +6,21 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, RunFolderError
 from ggslam.objects.history import History
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.changes import ChangeRecord, ChangesRecord
 from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.oriented_box import Vector
+from ggslam.system.foreign import refuse_links
+from ggslam.system.images import MAX_PIXELS, read_picture
 
 MOST_PICTURES = 12
 """Pictures that a page shows."""
+_MOST_PIXELS = 16_000_000
+"""Of one of them: two views of 8 megapixels. All of a page together have `MAX_PIXELS` at most."""
 
 
 @dataclass(frozen=True)
@@ -63,20 +66,22 @@ def read_changes(place: Path, most: int = MOST_PICTURES) -> ChangesShown:
 
     Raises:
         ConfigError: there is no changes.json.
-        RunFolderError: it is damaged.
+        RunFolderError: it is damaged, or holds a link out of it or what is no regular file.
     """
+    refuse_links(place, RunFolderError)
     record = ChangesRecord.read_if_there(place)
     if record is None:
         raise ConfigError(f"{place}: holds no {ChangesRecord.FILE}; `ggslam changes OLD NEW --out FOLDER` writes one")
     named = [number for number, change in enumerate(record.changes) if change.picture]
-    found, unreadable = dict[int, np.ndarray](), list[str]()
+    found, unreadable, left = dict[int, np.ndarray](), list[str](), MAX_PIXELS
     for number in named[:most]:
         name = Path(record.changes[number].picture).name
-        picture = cv2.imread(str(place / name), cv2.IMREAD_COLOR)
-        if picture is None:  # without it the table still tells
-            unreadable.append(name)
+        try:
+            found[number] = read_picture(place / name, min(_MOST_PIXELS, left), RunFolderError)
+        except RunFolderError:
+            unreadable.append(name)  # without it the table still tells
         else:
-            found[number] = np.ascontiguousarray(picture[..., ::-1])
+            left -= found[number].shape[0] * found[number].shape[1]
     return ChangesShown(record, found, left_out=len(named[most:]), unreadable=unreadable)
 
 

@@ -25,13 +25,13 @@ from ggslam.submaps.coming_store import coming_store
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_objects import StoreObjects, parse_objects, write_objects
 from ggslam.submaps.visit_files import write_visit
-from ggslam.system.foreign import open_foreign
+from ggslam.system.zip_files import ZIP_DAMAGE, open_zip
 
 SUFFIX = ".ggc"
 HEAD, OBJECTS, VISIT = "cells.json", "objects.json.xz", "visits/{}.json.xz"
 _MEMBER = re.compile(r"cells/(-?\d+)_(-?\d+)_(-?\d+)\.bin")
 _CELLS_AT_ONCE = 64
-_DAMAGE = (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, KeyError)
+_DAMAGE = (*ZIP_DAMAGE, KeyError)
 
 
 def is_cells_file(path: str | Path) -> bool:
@@ -52,7 +52,7 @@ class CodedCells:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            with open_foreign(path) as file, zipfile.ZipFile(file) as archive:
+            with open_zip(path) as archive:
                 infos = {info.filename: info for info in archive.infolist()}
                 if any(info.compress_type != zipfile.ZIP_STORED for info in infos.values()):
                     raise ValueError("holds compressed members")
@@ -112,7 +112,7 @@ class CodedCells:
 
     def _content(self, name: str, told: FileRecord) -> bytes:
         try:
-            with open_foreign(self.path) as file, zipfile.ZipFile(file) as archive:
+            with open_zip(self.path) as archive:
                 content = archive.read(name)
         except _DAMAGE as error:
             raise FormatError(f"{self.path}: {name}: {error}") from None

@@ -195,7 +195,7 @@ def decode_file(
     if out.suffix.lower() not in (".ply", ".pcd"):
         raise ConfigError(f"{out}: expected a name that ends in .ply or .pcd")
     _refuse_itself(source, out)
-    data = read_bytes(source)
+    data = read_foreign(source)
     try:
         if slice_id is None and box is None and (splats := _splats_in_parts(data, threads)) is not None:
             return _write_splats(splats, out)
@@ -238,15 +238,10 @@ def list_stream(path: Path) -> StreamListing:
     Raises:
         FormatError: the file cannot be read or is no G-PCC stream at all.
     """
-    listing = list_units(read_bytes(path))
+    listing = list_units(read_foreign(path))
     if not listing.units:
         raise FormatError(f"{path}: not a G-PCC stream: {listing.problems[0] if listing.problems else 'it is empty'}")
     return listing
-
-
-def read_bytes(path: Path) -> bytes:
-    """A whole file; FormatError if it cannot be read."""
-    return read_foreign(path)
 
 
 def _input_file(source: Path, preset: str) -> Path:

@@ -20,6 +20,7 @@ from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
+from ggslam.system.images import read_picture
 
 VIEWS = 4
 """Frames that a report shows, spread over the recording."""
@@ -50,9 +51,7 @@ def saved_views(folder: RunFolder) -> list[FrameView]:
 
 
 def _cut(path: Path, height: int, width: int) -> dict[str, np.ndarray]:
-    sheet = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if sheet is None:
-        raise FormatError(f"{path}: not an image")
+    sheet = read_picture(path, 3 * (width + _GAP) * 3 * (height + _GAP))
     rows = (sheet.shape[0] + _GAP) // (height + _GAP)
     if rows not in (2, 3) or sheet.shape[1] != 3 * width + 2 * _GAP:
         raise FormatError(f"{path}: not a comparison of images of {width}x{height}")
@@ -60,7 +59,7 @@ def _cut(path: Path, height: int, width: int) -> dict[str, np.ndarray]:
     for r in range(rows):
         for c in range(3):
             top, left = r * (height + _GAP), c * (width + _GAP)
-            pictures[_CAPTIONS[r][c]] = small(sheet[top : top + height, left : left + width, ::-1])
+            pictures[_CAPTIONS[r][c]] = small(sheet[top : top + height, left : left + width])
     return pictures
 
 

@@ -32,7 +32,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
-from ggslam.system.foreign import is_plain_name
+from ggslam.system.foreign import is_plain_name, read_foreign
 from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover
 from ggslam.viewer.splats import Splats, most_visible, splats_of
 from ggslam.viewer.static_page import static_page
@@ -299,7 +299,7 @@ class ViewedRun:
                          if "." not in k})  # fmt: skip
             path = Path(folder) / object_file_name(record)
             write_gaussian_ply(path, part, OBJECT_EXTRAS)
-            return path.name, path.read_bytes()
+            return path.name, read_foreign(path)
 
     def default_target(self) -> str:
         """See `EditableMap`."""

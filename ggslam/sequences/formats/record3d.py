@@ -19,8 +19,9 @@ import numpy as np
 from ggslam.errors import MissingDependency, SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.archive import Archive, ArchiveImage
-from ggslam.sequences.images import decode_color, find_damage
+from ggslam.sequences.images import decode_color
 from ggslam.sequences.json_files import OPENCV_FROM_OPENGL, camera_of, number_of, numbers_of, parse_object
+from ggslam.sequences.lzfse_blocks import END, claimed_bytes
 from ggslam.sequences.pose_files import pose_of_numbers, poses_of_frames
 from ggslam.sequences.recording import (
     NO_OPTIONS,
@@ -31,6 +32,7 @@ from ggslam.sequences.recording import (
     natural_key,
     nominal_timestamps,
 )
+from ggslam.system.images import find_damage
 
 LARGEST_IMAGE = 64_000_000
 """Bytes; what a damaged file may claim is not believed beyond."""
@@ -77,8 +79,8 @@ def _depth_size(archive: Archive, metadata: dict[str, Any], place: str, colors: 
     reason = "none can be read"
     for name in (f"{color.removesuffix('.jpg')}.depth" for color in colors):
         try:
-            content = archive.read(name)
-            count = len(content if _is_plain(content) else _decompress(f"{archive.path}, {name}", content)) // 4
+            content, image = archive.read(name), f"{archive.path}, {name}"
+            count = len(content if _is_plain(content) else _decompress(image, content, LARGEST_IMAGE)) // 4
         except SequenceError as error:
             reason = str(error)
             continue
@@ -122,7 +124,7 @@ def _decode_array(place: str, content: bytes, *, size: tuple[int, int], dtype: n
     expected = size[0] * size[1] * dtype.itemsize
     if not 0 < expected <= LARGEST_IMAGE:
         raise SequenceError(f"{place}: impossible size {size[1]}x{size[0]}")
-    raw = content if len(content) == expected else _decompress(place, content)
+    raw = content if len(content) == expected else _decompress(place, content, expected)
     if len(raw) != expected:
         raise SequenceError(f"{place}: expected {expected} bytes for {size[1]}x{size[0]} pixels, found {len(raw)}")
     return np.frombuffer(raw, dtype).reshape(size)
@@ -137,14 +139,17 @@ def lzfse_decompress() -> Any:
     return liblzfse.decompress
 
 
-def _decompress(place: str, content: bytes) -> bytes:
+def _decompress(place: str, content: bytes, most: int) -> bytes:
     decompress = lzfse_decompress()
-    # The decompressor grows its memory without end for streams that do not end: the end marker is looked for first.
-    if not content.endswith(b"bvx$"):
+    # The decompressor grows its memory without end for streams that do not end, and for as much as the others hold.
+    if not content.endswith(END):
         raise SequenceError(f"{place}: LZFSE stream is truncated or none ({len(content)} bytes)")
     try:
+        claimed = claimed_bytes(content)
+        if claimed > most:
+            raise ValueError(f"it holds {claimed:,} bytes, at most {most:,} are read")
         return decompress(content)
-    except Exception as error:  # the package has an exception type of its own beside MemoryError
+    except Exception as error:  # the package has its own type of exception; a block that lies ends in MemoryError
         raise SequenceError(f"{place}: LZFSE stream is damaged: {error}") from None
 
 

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.images import PNG_SIGNATURE, decode, decode_color, find_damage
+from ggslam.sequences.images import decode_color
+from ggslam.system.images import PNG_SIGNATURE, decode_image, find_damage
 
 COLOR: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None), "8uc3": (3, cv2.COLOR_BGR2RGB), "bgr8": (3, cv2.COLOR_BGR2RGB),
@@ -132,7 +133,7 @@ def _compressed_depth(place: str, message: Any) -> np.ndarray:
     damage = find_damage(content[head:])
     if damage:
         raise SequenceError(f"{place}: {damage}")
-    raw = decode(place, content[head:], cv2.IMREAD_UNCHANGED)
+    raw = decode_image(place, content[head:], cv2.IMREAD_UNCHANGED, error=SequenceError)
     if raw.ndim != 2 or raw.dtype != np.uint16:
         raise SequenceError(f"{place}: expected a 16-bit image in compressed depth")
     if "32fc1" not in form or not head:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import GgslamError, MissingDependency, SequenceError
+from ggslam.system.foreign import open_foreign, refuse_links
 
 NO_MESSAGE = "there is none"
 ZSTD_START = b"\x28\xb5\x2f\xfd"
@@ -36,6 +37,10 @@ class Bag:
             raise MissingDependency(f"reading ROS bags needs rosbags: pip install 'ggslam[ros]' ({error})") from None
         if path.suffix.lower() == ".zstd":
             raise SequenceError(f"{path}: a compressed file of a bag cannot be read alone: open the bag's folder")
+        if path.is_dir():
+            refuse_links(path, SequenceError, links=True)
+        else:
+            open_foreign(path, SequenceError).close()
         self.path = path
         self._lock = threading.RLock()
         self._cursors: dict[str, tuple[int, Iterator[Any]]] = {}
@@ -44,7 +49,7 @@ class Bag:
             # Old ROS 2 bags do not carry the definitions of their messages.
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
-        except Exception as error:  # the package raises many types for files that are no whole bag
+        except Exception as error:  # the package raises many types, and takes what memory a damaged bag claims
             raise SequenceError(f"{path}: not a whole bag (truncated, or not indexed?): {_text(error)}") from None
         if path.is_file() and self._reader.is2:
             self._check_uncompressed()
