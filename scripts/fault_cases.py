@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import fault_disk
 import fault_moving
+import fault_numbers
 import numpy as np
 from fault_bench import FEW, Place
 from fault_disk import NotHere
@@ -474,6 +475,7 @@ FAULTS: dict[str, Fault] = {
     "kill -9 of a run that overwrites another": killed_while_overwriting,
     "there is a run at --out": out_is_there,
     "--out is a file": out_is_a_file,
+    **fault_numbers.FAULTS,
     **fault_disk.FAULTS,
     **fault_moving.FAULTS,
 }

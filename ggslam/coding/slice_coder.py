@@ -228,7 +228,7 @@ def rgb_to_ycbcr(rgb: np.ndarray, order: np.ndarray) -> np.ndarray:
     rgb = np.ascontiguousarray(rgb, np.uint8)
     out = np.empty((len(order), 3), np.int32)
     load_library().ggslam_gpcc_to_ycbcr(
-        _context().handle, rgb.ctypes.data, order.ctypes.data, len(order), out.ctypes.data
+        _context().handle, rgb.ctypes.data, len(rgb), order.ctypes.data, len(order), out.ctypes.data
     )
     return out
 

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
+from ggslam.system.array_forms import ColorImage, DepthImage, Form, Points32, Pose
 from ggslam.system.settings import setting, settings_class
 
 
@@ -48,8 +50,8 @@ class Landmarks:
         points: float32 [n, 3], in the view's camera frame, metres.
     """
 
-    descriptors: np.ndarray
-    points: np.ndarray
+    descriptors: Annotated[np.ndarray, Form("u1", "n", 32)]
+    points: Points32
 
     def __len__(self) -> int:
         return len(self.points)
@@ -65,9 +67,9 @@ class FeatureView:
         T_world_camera: float64 [4, 4].
     """
 
-    color: np.ndarray
-    depth: np.ndarray
-    T_world_camera: np.ndarray
+    color: ColorImage
+    depth: DepthImage
+    T_world_camera: Pose
     _features: Features | None = None
 
     def features(self, settings: FeatureSettings) -> Features:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ggslam.scene.poses import transform_points
+from ggslam.system.array_forms import Points64
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -24,9 +25,9 @@ class ColoredSurface:
         normals: float64 [n, 3], unit vectors to the side that was seen.
     """
 
-    points: np.ndarray
-    colors: np.ndarray
-    normals: np.ndarray
+    points: Points64
+    colors: Points64
+    normals: Points64
 
     def __len__(self) -> int:
         return len(self.points)

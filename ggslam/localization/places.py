@@ -23,8 +23,15 @@ from ggslam.scene.arrays import arrays_of, arrays_to_bytes
 from ggslam.scene.camera import Camera
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
+from ggslam.system.array_forms import Form, PoseForm, check_arrays
 
 PLACES = "places.npz"
+_FORMS = {
+    "poses": PoseForm("f8", "views"), "counts": Form("int", "views", below=2**31 - 1),
+    "codes": Form("u1", "views", None), "descriptors": Form("u1", "landmarks", 32),
+    "points": Form("f4", "landmarks", 3, finite=True),
+    "camera": Form("f8", 6, finite=True),
+}  # fmt: skip
 _NAMES = ("poses", "counts", "codes", "descriptors", "points", "camera")
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 _SAME = 1e-3
@@ -118,17 +125,16 @@ def _arrays(store: GridStore, key: CellKey) -> Mapping[str, np.ndarray]:
     where = f"{store.path}: cell {key}: {PLACES}"
     file = io.BytesIO(store.get(key, PLACES))
     arrays = arrays_of(file, f"{where}: damaged", lambda held: {name: held[name] for name in _NAMES})
-    views, landmarks = len(arrays["poses"]), int(arrays["counts"].sum())
-    fits = len(arrays["counts"]) == len(arrays["codes"]) == views and arrays["poses"].shape[1:] == (4, 4)
-    if not fits or not len(arrays["descriptors"]) == len(arrays["points"]) == landmarks:
-        raise FormatError(f"{where}: damaged: its arrays do not fit each other")
+    check_arrays(arrays, _FORMS, f"{where}: damaged")
+    if int(arrays["counts"].astype(np.int64).sum()) != len(arrays["points"]):
+        raise FormatError(f"{where}: damaged: its landmarks do not fit their numbers")
     return arrays
 
 
 def _check_camera(store: GridStore, key: CellKey, found: np.ndarray, camera: Camera) -> None:
     expected = np.array([getattr(camera, name) for name in _CAMERA], float)
-    if found.shape != (6,) or (np.abs(found - expected) > _SAME * camera.width).any():
-        seen, own = (f"{int(c[0])}x{int(c[1])} pixels, fx {c[2]:.1f}" for c in (found, expected) if c.shape == (6,))
+    if (np.abs(found - expected) > _SAME * camera.width).any():
+        seen, own = (f"{int(c[0])}x{int(c[1])} pixels, fx {c[2]:.1f}" for c in (found, expected))
         raise ConfigError(
             f"{store.path}: cell {key}: its places were seen by a camera of {seen}, the images have {own}; see `scale`"
         )

@@ -11,8 +11,11 @@ all of it.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
+from ggslam.system.array_forms import Form, Points64, check_indices
 from ggslam.system.settings import setting, settings_class
 
 _SHARE = 8
@@ -47,10 +50,17 @@ class ActiveKeyframes:
         settings: limits.
     """
 
+    active: set[int]
+    spare: set[int]
+    _depths: Annotated[np.ndarray, Form("f8", "n", finite=True)]
+    _cameras: Points64
+    _middles: Points64
+    _seen: Annotated[np.ndarray, Form("f8", "n")]
+
     def __init__(self, settings: ActivitySettings | None = None) -> None:
         self.settings = settings or ActivitySettings()
-        self.active: set[int] = set()
-        self.spare: set[int] = set()
+        self.active = set()
+        self.spare = set()
         """Put aside only because there are enough: they lie right to the active ones, and no loop leads to them."""
         self._depths = np.empty(0)
         self._cameras = np.empty((0, 3))
@@ -59,6 +69,10 @@ class ActiveKeyframes:
         self._path = 0.0
         self._waiting = 0
         """Keyframes made since there are some to take back."""
+
+    def check(self) -> None:
+        """Raises FormatError if keyframes are active that are not there: it may come from a file."""
+        check_indices("active keyframes", self.active | self.spare, len(self))
 
     def __len__(self) -> int:
         return len(self._depths)

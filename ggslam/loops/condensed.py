@@ -17,6 +17,7 @@ from scipy.special import gammaincinv  # scipy.stats takes a second to load
 from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.uncertainty import adjoint, covariance_in_frame
 from ggslam.scene.poses import inverse, orthonormalize, se3_exp, se3_log
+from ggslam.system.array_forms import Covariance6, Pose
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,8 @@ class Link:
 
     i: int
     j: int
-    T_i_j: np.ndarray
-    covariance: np.ndarray
+    T_i_j: Pose
+    covariance: Covariance6
 
 
 class CondensedGraph:

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ggslam.errors import FormatError
 from ggslam.loops.uncertainty import covariance_in_frame
 from ggslam.scene.poses import inverse, orthonormalize
+from ggslam.system.array_forms import Covariance6, Pose
 
 
 @dataclass
@@ -20,14 +22,24 @@ class OdometryTree:
     """
 
     parents: list[int] = field(default_factory=list)
-    poses: list[np.ndarray] = field(default_factory=list)
-    covariances: list[np.ndarray] = field(default_factory=list)
-    steps: list[np.ndarray] = field(default_factory=list)
+    poses: list[Pose] = field(default_factory=list)
+    covariances: list[Covariance6] = field(default_factory=list)
+    steps: list[Covariance6] = field(default_factory=list)
 
     @classmethod
     def root(cls) -> OdometryTree:
         """The first node alone."""
         return cls([-1], [np.eye(4)], [np.zeros((6, 6))], [np.zeros((6, 6))])
+
+    def check(self) -> None:
+        """Raises FormatError if nodes do not hang on earlier ones: it may come from a file."""
+        count = len(self.poses)
+        if not len(self.parents) == len(self.covariances) == len(self.steps) == count:
+            raise FormatError("odometry: numbers of poses and of motions that do not agree")
+        if any(not 0 <= parent < node for node, parent in enumerate(self.parents) if node) or self.parents[:1] not in (
+            [], [-1],
+        ):  # fmt: skip
+            raise FormatError("odometry: a keyframe that hangs on a later one")
 
     def __len__(self) -> int:
         return len(self.poses)

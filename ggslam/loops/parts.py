@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from ggslam.system.array_forms import check_indices
+
 
 @dataclass
 class KeyframeParts:
@@ -22,6 +24,12 @@ class KeyframeParts:
 
     of: list[int] = field(default_factory=list)
     begun: list[int] = field(default_factory=list)
+
+    def check(self) -> None:
+        """Raises FormatError if a keyframe is of a part that a later one began: it may come from a file."""
+        check_indices("parts of keyframes", self.begun, len(self.of))
+        for keyframe, part in enumerate(self.of):
+            check_indices("parts of keyframes", [part], keyframe + 1)
 
     def begin(self) -> None:
         """The next keyframe begins a part."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from ggslam.features.orb import FeatureView, Landmarks
 from ggslam.loops.settings import PlaceSettings
 from ggslam.loops.word_lists import WordLists
 from ggslam.scene.camera import Camera
+from ggslam.system.array_forms import Form, check_arrays
 
 _SEED = 0
 _THUMBNAIL = (40, 30)
@@ -37,8 +39,8 @@ class Place:
     """
 
     landmarks: Landmarks
-    words: np.ndarray
-    codes: np.ndarray
+    words: Annotated[np.ndarray, Form("i8", None)]
+    codes: Annotated[np.ndarray, Form("u1", None)]
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,12 @@ class PlaceIndex:
         settings: see `PlaceSettings`.
     """
 
+    _numbers: list[int]
+    _positions: dict[int, int]
+    _places: list[Place]
+    _codes: Annotated[np.ndarray, Form("u1", "places", None)]
+    _sizes: Annotated[np.ndarray, Form("f8", "places", finite=True)]
+
     def __init__(self, camera: Camera, settings: PlaceSettings | None = None) -> None:
         self.camera = camera
         self.settings = s = settings or PlaceSettings()
@@ -66,9 +74,9 @@ class PlaceIndex:
         self._fern_pixels = random.randint(0, _THUMBNAIL[0] * _THUMBNAIL[1], s.ferns)
         self._fern_colors = random.randint(30, 226, (s.ferns, 3))
         self._fern_depths = random.uniform(s.near, s.far, s.ferns)
-        self._numbers: list[int] = []
-        self._positions: dict[int, int] = {}
-        self._places: list[Place] = []
+        self._numbers = []
+        self._positions = {}
+        self._places = []
         self._codes, self._sizes = np.zeros((16, s.ferns), np.uint8), np.zeros(16)
         self._lists = WordLists(s.tables << s.bits)
 
@@ -80,6 +88,15 @@ class PlaceIndex:
         """Memory that the places take, about."""
         marks = sum(place.landmarks.descriptors.nbytes + place.landmarks.points.nbytes for place in self._places)
         return marks + self._lists.held_bytes + self._codes.nbytes
+
+    def check(self) -> None:
+        """Raises FormatError if places and their numbers do not fit together: it may come from a file."""
+        count, ferns = len(self._numbers), self.settings.ferns
+        sized = len(self._places) == count <= len(self._codes) and self._codes.shape[1] == ferns
+        if not sized or self._positions != {number: position for position, number in enumerate(self._numbers)}:
+            raise FormatError("places: not those of their keyframes")
+        if any(len(place.codes) != ferns or len(place.words) for place in self._places):
+            raise FormatError("places: not of this program's features")
 
     def __contains__(self, number: int) -> bool:
         return number in self._positions
@@ -205,14 +222,15 @@ class PlaceIndex:
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], ferns: int) -> None:
-    expected = {"numbers": (1,), "counts": (1,), "descriptors": (2, 32), "points": (2, 3), "codes": (2, ferns)}
-    for name, (dimensions, *columns) in expected.items():
-        if name not in arrays:
-            raise FormatError(f"places: no array '{name}'")
-        shape = arrays[name].shape
-        if len(shape) != dimensions or list(shape[1:]) != columns:
-            raise FormatError(f"places: '{name}' is {list(shape)}, expected [n{''.join(f', {c}' for c in columns)}]")
-    rows, landmarks = len(arrays["numbers"]), int(arrays["counts"].sum())
-    for name, length in (("counts", rows), ("codes", rows), ("descriptors", landmarks), ("points", landmarks)):
-        if len(arrays[name]) != length:
-            raise FormatError(f"places: '{name}' has {len(arrays[name])} rows, expected {length}")
+    """Raises FormatError if these are not the arrays of an index."""
+    forms = {
+        "numbers": Form("int", "n", below=2**31 - 1), "counts": Form("int", "n", below=2**31 - 1),
+        "codes": Form("u1", "n", ferns), "descriptors": Form("u1", "landmarks", 32),
+        "points": Form("float", "landmarks", 3, finite=True),
+    }  # fmt: skip
+    check_arrays(arrays, forms, "places")
+    landmarks = int(arrays["counts"].astype(np.int64).sum())
+    if len(arrays["points"]) != landmarks:
+        raise FormatError(f"places: 'points' has {len(arrays['points'])} rows, expected {landmarks}")
+    if len(np.unique(arrays["numbers"])) != len(arrays["numbers"]):
+        raise FormatError("places: a keyframe has two")

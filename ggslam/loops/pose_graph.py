@@ -17,12 +17,13 @@ from types import ModuleType
 
 import numpy as np
 
-from ggslam.errors import MissingDependency
+from ggslam.errors import FormatError, MissingDependency
 from ggslam.loops.condensed import CondensedGraph, Link, chi_squared_limit
 from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.settings import GraphSettings
 from ggslam.loops.uncertainty import covariance_in_frame, covariance_of
 from ggslam.scene.poses import inverse, se3_log, so3_log
+from ggslam.system.array_forms import Pose, check_indices
 
 _SHORTEST = 0.01
 """Metres: standing still counts as a path of this length, so that no motion is held to be exact."""
@@ -81,12 +82,24 @@ class PoseGraph:
         settings: see `GraphSettings`.
     """
 
+    poses: list[Pose]
+    loops: list[Link]
+
     def __init__(self, settings: GraphSettings | None = None) -> None:
         self.settings = settings or GraphSettings()
-        self.poses: list[np.ndarray] = []
+        self.poses = []
         """T_world_camera of every node as last known; `optimise` starts from them and replaces them."""
-        self.loops: list[Link] = []
+        self.loops = []
         self._tree = OdometryTree()
+
+    def check(self) -> None:
+        """Raises FormatError if links lead to nodes that are not there: it may come from a file."""
+        if len(self._tree) != len(self.poses):
+            raise FormatError(f"pose graph: {len(self.poses)} nodes, odometry of {len(self._tree)}")
+        for link in self.loops:
+            check_indices("pose graph", (link.i, link.j), len(self.poses))
+            if link.i == link.j:
+                raise FormatError(f"pose graph: node {link.i} is linked to itself")
 
     def add_node(self, T_world_camera: np.ndarray) -> int:
         """A keyframe; returns its number. Every node but the first then needs an `add_odometry` of its own."""

@@ -9,9 +9,12 @@ comparison that found nothing wrong ties its two ends together.
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
 from ggslam.scene.poses import so3_log
+from ggslam.system.array_forms import Form
 from ggslam.system.settings import setting, settings_class
 
 
@@ -45,6 +48,9 @@ class Revisits:
         settings: limits.
     """
 
+    _way: Annotated[np.ndarray, Form("f8", "n", finite=True)]
+    _tied_at: Annotated[np.ndarray, Form("f8", "n")]
+
     def __init__(self, settings: RevisitSettings | None = None) -> None:
         self.settings = settings or RevisitSettings()
         self._way = np.zeros(0)
@@ -52,6 +58,10 @@ class Revisits:
         self._tied_at = np.zeros(0)
         """The same at the newest keyframe that each was compared with as the older one; -inf: with none."""
         self._rests_until = 0
+
+    def __len__(self) -> int:
+        """Keyframes so far."""
+        return len(self._way)
 
     def add(self, T_before_new: np.ndarray) -> None:
         """The next keyframe, after a motion [4, 4] since the one before it."""

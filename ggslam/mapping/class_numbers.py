@@ -3,7 +3,12 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.system.array_forms import Form
 
 FIRST_CLASSES = 100
 """Rows allocated to begin with."""
@@ -15,10 +20,21 @@ CODE_LENGTH = 2.0
 class ClassNumbers:
     """Which class each object id has: numbers from 0 on, without gaps."""
 
+    _ids: Annotated[np.ndarray, Form("u2", None)]
+    _class_of: Annotated[np.ndarray, Form("i4", 65536)]
+
     def __init__(self) -> None:
         self._ids = np.zeros(FIRST_CLASSES, np.uint16)
         self._class_of = np.full(65536, -1, np.int32)
         self.count = 0
+
+    def check(self) -> None:
+        """Raises FormatError if ids and numbers do not belong to each other: it may come from a file."""
+        known = self._class_of >= 0
+        if not 0 <= self.count <= len(self._ids) or known.sum() != self.count or self._class_of.min() < -1:
+            raise FormatError(f"classes of objects: expected numbers from 0 to below {self.count}")
+        if not np.array_equal(self._class_of[self.ids], np.arange(self.count)):
+            raise FormatError("classes of objects: an id that has another class")
 
     @property
     def ids(self) -> np.ndarray:

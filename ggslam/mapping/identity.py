@@ -20,11 +20,12 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
 import torch
 
+from ggslam.errors import FormatError
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_grid import PixelGrid
 from ggslam.mapping.pixel_pool import PixelPool
@@ -32,6 +33,7 @@ from ggslam.mapping.votes import vote_labels, vote_shares
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.system.array_forms import Form, check_indices
 
 POOL_STEPS = 4
 """Steps' worth of pixels that are drawn from a keyframe at once."""
@@ -43,6 +45,7 @@ BIRTH_VOTE = 0.1
 """Weight of the vote that a Gaussian gets for the pixel it is born from."""
 IDS = 65536
 """Object ids there can be, 0 (none) among them."""
+_OfEachId = Annotated[np.ndarray, Form("u2", IDS)]
 
 
 @dataclass
@@ -112,15 +115,29 @@ class IdentityLearner(ABC):
     kept_pools: ClassVar[int | None] = None
     """Keyframes whose pixels drawn ahead are kept; beyond, those drawn first go. None: all."""
 
+    _alias: _OfEachId = field(init=False, repr=False, compare=False)
+    _whole_of: _OfEachId = field(init=False, repr=False, compare=False)
+    _pools: dict[int, PixelPool[Any]] = field(init=False, repr=False, compare=False)
+    _shown: torch.Tensor | None = field(init=False, repr=False, compare=False)
+
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng([self.seed, 16])
         self._alias = np.arange(IDS, dtype=np.uint16)
         self._whole_of = np.zeros(IDS, np.uint16)
-        self._pools: dict[int, PixelPool[Any]] = {}
+        self._pools = {}
         self._iterations = 0
-        self._shown: torch.Tensor | None = None  # labels by votes, of the last keyframe's time
+        self._shown = None  # labels by votes, of the last keyframe's time
         self._shown_order = -1
         self.table: Classes
+
+    def check(self, keyframes: Sequence[MaskedKeyframe]) -> None:
+        """Raises FormatError if pixels are drawn ahead of masks that do not have them: it may come from a file."""
+        check_indices("pixels drawn ahead", self._pools, len(keyframes))
+        for number, pool in self._pools.items():
+            mask = keyframes[number].mask
+            pool.check(0 if mask is None else mask.size)
+        if self._shown is not None and not (self._shown.dtype == torch.int32 and self._shown.ndim == 1):
+            raise FormatError("labels of the map: expected int32")
 
     @property
     def classifier(self) -> IdentityClassifier:

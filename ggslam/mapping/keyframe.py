@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
+from ggslam.errors import FormatError
 from ggslam.formats.array_archive import ArrayArchive
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
+from ggslam.system.array_forms import ColorImage, Form, IdImage, Mask, MaybeNan, Pose
 
 ELSEWHERE = -1
 """Frame index of keyframes that are of another recording than the run's: of the map that it began with."""
@@ -21,6 +24,9 @@ FAR_SHARE = 0.02
 """Of the pixels with depth: as few beyond the range of `DEPTH_UNIT` are taken for errors of a room's sensor."""
 _MOST_UNITS = 65535
 _IMAGES = ("color", "depth", "mask", "moving")
+
+
+Exposure = Annotated[np.ndarray, Form("f8", 3, 2, finite=True)]
 
 
 @dataclass
@@ -40,22 +46,31 @@ class Keyframe:
 
     index: int
     frame_index: int
-    timestamp: float
+    timestamp: MaybeNan
     camera: Camera
-    color: np.ndarray
-    depth: np.ndarray
-    T_camera_world: np.ndarray
-    mask: np.ndarray | None = field(default_factory=lambda: None)
-    exposure: np.ndarray = field(default_factory=lambda: np.tile([1.0, 0.0], (3, 1)))
+    color: ColorImage
+    depth: Annotated[np.ndarray, Form("u2", "h", "w")]
+    T_camera_world: Pose
+    mask: IdImage | None = field(default_factory=lambda: None)
+    exposure: Exposure = field(default_factory=lambda: np.tile([1.0, 0.0], (3, 1)))
     iterations: int = 0
     archive: ArrayArchive | None = None
     """Has the images once they were put away; they are read from there."""
     camera_number: int = 0
     instant: int | None = None
     """Of a rig, see `Frame`."""
-    moving: np.ndarray | None = field(default_factory=lambda: None)
+    moving: Mask | None = field(default_factory=lambda: None)
     depth_unit: float = DEPTH_UNIT
     """Metres."""
+
+    def check(self) -> None:
+        """Raises FormatError if its images are not of its camera: it may come from a file. It may have none."""
+        height, width = self.camera.height, self.camera.width
+        images = [image for image in (self.color, self.depth, self.mask, self.moving) if image is not None]
+        if any(image.size and image.shape[:2] != (height, width) for image in images):
+            raise FormatError(f"keyframe {self.index}: images of another size than its camera's, {width}x{height}")
+        if not self.depth_unit > 0 or self.iterations < 0:
+            raise FormatError(f"keyframe {self.index}: {self.iterations} iterations, depth in {self.depth_unit} m")
 
     def put_away(self, archive: ArrayArchive) -> None:
         """Hands the images to an archive, which keeps them in memory or not. They must not be changed any more."""
@@ -109,6 +124,12 @@ def depth_unit_for(depth: np.ndarray) -> float:
 
 class PoseAdam:
     """Adam on the 6-D twist of one keyframe's pose (left perturbation in the camera frame, translation first)."""
+
+    beta1: float
+    beta2: float
+    first: Annotated[np.ndarray, Form("f8", 6, finite=True)]
+    second: Annotated[np.ndarray, Form("f8", 6, finite=True)]
+    steps: int
 
     def __init__(self, beta1: float = 0.9, beta2: float = 0.99) -> None:
         self.beta1, self.beta2 = beta1, beta2

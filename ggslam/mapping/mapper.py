@@ -32,6 +32,7 @@ from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, orthonormalize
+from ggslam.system.array_forms import Mask
 
 BOUND_EVERY = 4
 """Iterations after which sizes and colours are bounded: free colours overshoot (13 % of a young map's Gaussians, by up
@@ -123,13 +124,17 @@ class Mapper(ABC):
         identity: learns objects from the keyframes' masks, into the map's feature channels; None: no objects.
     """
 
+    keyframes: list[Keyframe]
+    left_out: set[int]
+    _valid: dict[int, Mask | None]
+
     def __init__(
         self, gaussians: GaussianMap, settings: MapperSettings, seed: int = 0, identity: IdentityLearner | None = None
     ) -> None:
         self.map = gaussians
         self.settings = settings
         self.identity: IdentityLearner | None = identity
-        self.keyframes: list[Keyframe] = []
+        self.keyframes = []
         self.times = MapperTimes()
         self.depth_sigma = 0.004
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
@@ -141,9 +146,9 @@ class Mapper(ABC):
         """Whether frames come at a camera's pace: keyframes do not wait then while one looks for what surfaces hide."""
         self.residency: Residency | None = None
         """Keeps a part of the map on disk; None: all of it is in memory."""
-        self.left_out: set[int] = set()
+        self.left_out = set()
         """Numbers of the keyframes that neither train the map nor have Gaussians in it any more."""
-        self._valid: dict[int, np.ndarray | None] = {}
+        self._valid = {}
         self.extra_loss: ExtraLoss | None = None
         """A loss of the user's own, added to the mapper's; on the CPU only."""
         self._rasterizer: TrainingRasterizer

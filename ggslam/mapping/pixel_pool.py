@@ -9,6 +9,9 @@ from typing import Generic, TypeVar
 import numpy as np
 import torch
 
+from ggslam.errors import FormatError
+from ggslam.system.array_forms import Form
+
 Array = TypeVar("Array", np.ndarray, torch.Tensor)
 
 
@@ -25,6 +28,16 @@ class PixelPool(Generic[Array]):
     pixels: Array
     vote_weights: Array
     used: int = 0
+
+    def check(self, pixels: int) -> None:
+        """Raises FormatError if these are not pixels of an image with so many: they may come from a file."""
+        lengths: dict[str, int] = {}
+        forms = (Form("i4", "n", below=pixels), Form("f4", "n", finite=True))
+        for array, form in zip((self.pixels, self.vote_weights), forms, strict=True):
+            if found := form.check(np.asarray(array), lengths):
+                raise FormatError(f"pixels drawn ahead: {found}")
+        if not 0 <= self.used <= len(self.pixels):
+            raise FormatError(f"pixels drawn ahead: {self.used} of {len(self.pixels)} are used")
 
     def has(self, count: int) -> bool:
         """Whether so many pixels are left."""

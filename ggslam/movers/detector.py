@@ -9,6 +9,7 @@ connected; what is seen once, or is too small, is noise.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
+from ggslam.system.array_forms import Form, Mask
 
 AGES = (1, 2, 4, 8, 16, 32, 48)
 """Each frame is compared with those so many frames before it."""
@@ -51,12 +53,12 @@ class MoverDetector:
     """
 
     settings: MoverSettings
-    mask: np.ndarray | None = None
+    mask: Mask | None = None
     views: list[CoarseView] = field(default_factory=list)
-    found: np.ndarray | None = None
-    small: np.ndarray | None = None
-    things: np.ndarray | None = None
-    expected: np.ndarray | None = None
+    found: Annotated[np.ndarray, Form("?", None, None)] | None = None
+    small: Annotated[np.ndarray, Form("?", None, None)] | None = None
+    things: Annotated[np.ndarray, Form("i4", None, None)] | None = None
+    expected: Mask | None = None
     segments: frozenset[int] = frozenset()
     trail: Trail = field(default_factory=Trail)
 

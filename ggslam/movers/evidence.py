@@ -22,6 +22,7 @@ from ggslam.interface.core.movers import DepthPlacesJob, OtherPlacesView, Places
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
+from ggslam.system.array_forms import DepthImage, Mask, Pose
 
 SMOOTH = 2.5
 """Where depth varies by no more standard deviations of the camera than this its mean is compared."""
@@ -80,12 +81,12 @@ class CoarseView:
     """
 
     camera: Camera
-    T_world_camera: np.ndarray
-    depth: np.ndarray
-    near: np.ndarray
-    far: np.ndarray
-    whole: np.ndarray
-    smooth: np.ndarray
+    T_world_camera: Pose
+    depth: DepthImage
+    near: DepthImage
+    far: DepthImage
+    whole: Mask
+    smooth: Mask
 
     def fits(self, *more: np.ndarray) -> bool:
         """Whether its images, and some more about its places, are of its camera's size."""

@@ -8,6 +8,8 @@ from typing import Literal
 
 import numpy as np
 
+from ggslam.system.array_forms import Pose, Vector3
+
 Kind = Literal["rigid", "not rigid", "unknown"]
 
 
@@ -23,9 +25,9 @@ class MoverSight:
     """
 
     frame: int
-    T_camera_mover: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    T_camera_mover: Pose
+    low: Vector3
+    high: Vector3
     share: float
 
 

@@ -10,6 +10,7 @@ see what was there.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from ggslam.movers.segments import grow_places, large_parts
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
+from ggslam.system.array_forms import Form, Mask
 
 COLUMNS = 160
 """Pixels: width of the images that are compared, about; small things count."""
@@ -68,11 +70,11 @@ class EarlierView:
     """
 
     view: CoarseView
-    through: np.ndarray
-    same: np.ndarray
-    before: np.ndarray
-    gone: np.ndarray
-    hidden: np.ndarray
+    through: Annotated[np.ndarray, Form("i2", "h", "w")]
+    same: Annotated[np.ndarray, Form("i2", "h", "w")]
+    before: Annotated[np.ndarray, Form("i2", "h", "w")]
+    gone: Mask
+    hidden: Mask
     looks: int = 0
     fresh: bool = False
 

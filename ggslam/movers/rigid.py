@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from ggslam.movers.found import Kind
 from ggslam.movers.patches import Patch
 from ggslam.movers.surface import MoverSurface, PatchFit
 from ggslam.scene.poses import inverse, orthonormalize, se3_exp, so3_log
+from ggslam.system.array_forms import Form, Pose
 
 AS_GOOD = 1.2
 """A mover stands still as long as the pose that it had explains what is seen that well against the best one."""
@@ -54,15 +56,15 @@ class RigidTracker:
         stands: whether it stands where it stood the frame before.
     """
 
-    T_world_mover: np.ndarray = field(default_factory=lambda: np.eye(4))
+    T_world_mover: Pose = field(default_factory=lambda: np.eye(4))
     surface: MoverSurface = field(default_factory=MoverSurface)
     frame: int = -1
     size: float = 0.0
     shares: list[float] = field(default_factory=list)
-    velocity: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    velocity: Annotated[np.ndarray, Form("f8", 6, finite=True)] = field(default_factory=lambda: np.zeros(6))
     stands: bool = False
     flexible: bool = False
-    scatter: list[np.ndarray] = field(default_factory=list)
+    scatter: list[Pose] = field(default_factory=list)
 
     @property
     def kind(self) -> Kind:

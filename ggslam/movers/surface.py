@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,6 +13,7 @@ from ggslam.geometry.plane_steps import plane_step
 from ggslam.geometry.voxels import voxel_keys
 from ggslam.movers.patches import Patch
 from ggslam.scene.poses import inverse, orthonormalize, transform_points
+from ggslam.system.array_forms import Form, Points64
 
 VOXEL = 0.006
 """Metres, of points that are kept."""
@@ -57,10 +59,10 @@ class MoverSurface:
         seen: float64 [n], how often each was seen.
     """
 
-    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    colors: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    normals: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    seen: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    points: Points64 = field(default_factory=lambda: np.zeros((0, 3)))
+    colors: Points64 = field(default_factory=lambda: np.zeros((0, 3)))
+    normals: Points64 = field(default_factory=lambda: np.zeros((0, 3)))
+    seen: Annotated[np.ndarray, Form("f8", "n")] = field(default_factory=lambda: np.zeros(0))
     _tree: cKDTree | None = None
 
     def __len__(self) -> int:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from ggslam.movers.patches import Patch
 from ggslam.movers.recent import RecentFrame, Sight
 from ggslam.movers.rigid import RigidTracker
 from ggslam.scene.poses import inverse, transform_points, turning_angle
+from ggslam.system.array_forms import Form
 
 REMEMBERED = 16
 """Frames that are looked back at when something begins to move."""
@@ -56,8 +58,8 @@ class Track:
     pending: list[MoverSight] = field(default_factory=list)
     before: MoverSight | None = None
     after: MoverSight | None = None
-    scatter: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))
-    stood: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    scatter: Annotated[np.ndarray, Form("f8", 2, 2, finite=True)] = field(default_factory=lambda: np.zeros((2, 2)))
+    stood: Annotated[np.ndarray, Form("f8", 2, finite=True)] = field(default_factory=lambda: np.zeros(2))
     latest: Patch | None = None
     settled: bool = False
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ggslam.movers.segments import Gathering, gather
 from ggslam.movers.settings import MoverSettings
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points
+from ggslam.system.array_forms import Form
 
 VOXEL = 0.05
 """Metres."""
@@ -31,7 +33,7 @@ class Trail:
         growths: how many times it has grown.
     """
 
-    keys: np.ndarray = field(default_factory=lambda: np.empty(0, np.int64))
+    keys: Annotated[np.ndarray, Form("i8", None)] = field(default_factory=lambda: np.empty(0, np.int64))
     growths: int = 0
 
     def add(self, view: CoarseView, places: np.ndarray) -> None:

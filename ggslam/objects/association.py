@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from ggslam.objects.fragments import Fragment, FragmentMemory
 from ggslam.objects.overlap import MapView, SegmentOverlap, number_ids, overlap_of
 from ggslam.objects.settings import AssociationSettings
 from ggslam.scene.camera import Camera
+from ggslam.system.array_forms import Form, ObjectId
 
 __all__ = ["Association", "Associator", "MapView"]
 
@@ -63,6 +65,12 @@ class Associator:
             segmenter.
     """
 
+    _current: Annotated[np.ndarray, Form("u2", 65536)]
+    _used: Annotated[np.ndarray, Form("?", 65536)]
+    _blocked: Annotated[np.ndarray, Form("?", 65536)]
+    _doubted: list[tuple[int, list[ObjectId]]]
+    sightings: dict[ObjectId, int]
+
     def __init__(self, settings: AssociationSettings | None = None, reserved: Collection[int] = ()) -> None:
         self._settings = settings or AssociationSettings()
         self._judge = ConsistencyJudge()
@@ -77,9 +85,9 @@ class Associator:
         self._highest = 0
         self._ran_out = False
         self._keyframes = 0
-        self._doubted: list[tuple[int, list[int]]] = []
+        self._doubted = []
         """Keyframes that created objects, and these, until it shows whether they are found again."""
-        self.sightings: dict[int, int] = {}
+        self.sightings = {}
 
     @property
     def uses_own_ids(self) -> bool | None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ggslam.objects.overlap import SegmentOverlap
 from ggslam.scene.camera import Camera
+from ggslam.system.array_forms import ObjectId, Vector3
 
 _STRIDE = 4
 _LEAST = 0.02
@@ -30,16 +31,18 @@ _SAME_DIRECTION, _SAME_PLACE = 0.995, 0.04
 class BoundingPlane:
     """Unit normal [3] towards the camera, offset n . x, and the middle [3] of what was seen of it; world, metres."""
 
-    normal: np.ndarray
+    normal: Vector3
     offset: float
-    middle: np.ndarray
+    middle: Vector3
 
 
 class BoundingPlanes:
     """Remembers which objects are floors and walls."""
 
+    _of: dict[ObjectId, BoundingPlane]
+
     def __init__(self) -> None:
-        self._of: dict[int, BoundingPlane] = {}
+        self._of = {}
 
     def look(
         self, overlap: SegmentOverlap, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray

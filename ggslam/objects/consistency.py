@@ -7,6 +7,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ggslam.objects.overlap import SegmentOverlap
+from ggslam.system.array_forms import IdImage
 
 _MIN_PIXELS = 20
 _MIN_CHANGE = 0.02
@@ -25,10 +26,14 @@ class ConsistencyJudge:
         consistent: the verdict; None: not settled. True may be taken back, False is final.
     """
 
+    consistent: bool | None
+    _agreement: list[float]
+    _previous: IdImage | None
+
     def __init__(self) -> None:
-        self.consistent: bool | None = None
-        self._agreement: list[float] = []
-        self._previous: np.ndarray | None = None
+        self.consistent = None
+        self._agreement = []
+        self._previous = None
 
     def observe(self, segments: np.ndarray, overlap: SegmentOverlap) -> bool | None:
         """Takes one keyframe into account; returns the verdict.

@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.objects.overlap import SegmentOverlap
 from ggslam.objects.settings import AssociationSettings
+from ggslam.system.array_forms import ObjectId
 
 _MIN_WEIGHT = 0.05
 _FULLY_VISIBLE = 0.5
@@ -37,10 +38,13 @@ class PairEvidence:
     or by a sliver at the border of the image, much looks like one.
     """
 
+    _pairs: dict[tuple[ObjectId, ObjectId], _Pair]
+    _largest: dict[ObjectId, int]
+
     def __init__(self, settings: AssociationSettings) -> None:
         self._settings = settings
-        self._pairs: dict[tuple[int, int], _Pair] = {}
-        self._largest: dict[int, int] = {}
+        self._pairs = {}
+        self._largest = {}
         self._keyframe = 0
 
     def observe(self, overlap: SegmentOverlap, neighbours: set[tuple[int, int]]) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from ggslam.objects.overlap import SegmentOverlap
 from ggslam.objects.settings import AssociationSettings
 from ggslam.scene.camera import Camera
+from ggslam.system.array_forms import ObjectId, Vector3
 
 _INSIDE = 0.6
 _MINOR = 0.5
@@ -36,12 +37,12 @@ class Fragment:
         object_id: the id it got when it became an object; 0 before.
     """
 
-    parent: int
-    centre: np.ndarray
+    parent: ObjectId
+    centre: Vector3
     radius: float
     apart: int = 1
     together: int = 0
-    object_id: int = 0
+    object_id: ObjectId = 0
 
     def is_like(self, other: Fragment) -> bool:
         """Whether both are the same part of the same object."""
@@ -53,9 +54,11 @@ class Fragment:
 class FragmentMemory:
     """Collects fragments over keyframes."""
 
+    _of: dict[ObjectId, list[Fragment]]
+
     def __init__(self, settings: AssociationSettings) -> None:
         self._settings = settings
-        self._of: dict[int, list[Fragment]] = {}
+        self._of = {}
         """Parent -> its fragments."""
 
     def observe(

@@ -111,8 +111,9 @@ class CpuPixelTerms:
         channels = _checked_channels(gaussians)
         out = np.empty((len(self), channels), np.float32)
         load_library().ggslam_terms_blend(
-            self.context.handle, ctypes.byref(self.native()), address(gaussians.features), channels, out.ctypes.data
-        )
+            self.context.handle, ctypes.byref(self.native()), address(gaussians.features), len(gaussians), channels,
+            out.ctypes.data,
+        )  # fmt: skip
         return out
 
     def step(self, gaussians: GaussianMap, gradient: np.ndarray, optimizer: FeatureAdamSettings) -> None:

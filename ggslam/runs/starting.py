@@ -24,6 +24,7 @@ from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.result import LearnedObjects
 from ggslam.slam.saved_places import KEYFRAME_CAMERAS, PLACES_FILE
 from ggslam.slam.slam import Slam
+from ggslam.system.array_forms import Form, PoseForm, check_arrays
 from ggslam.tracking.settings import DepthNoise
 
 _NEEDED = "to grow its map, the images of its keyframes are needed"
@@ -35,7 +36,8 @@ class OtherImagesError(Exception):
 
 
 def camera_of(row: np.ndarray) -> Camera:
-    """The camera of a row of places.npz."""
+    """The camera of a row of places.npz. Raises FormatError if it is none."""
+    check_arrays({"camera": row}, {"camera": Form("float", 6, finite=True)}, "places")
     return Camera(int(row[0]), int(row[1]), *(float(value) for value in row[2:]))
 
 
@@ -75,10 +77,13 @@ def _load(
 ) -> tuple[GaussianMap, list[Keyframe]]:
     """Fills surface and loops; gives the map and its keyframes without images."""
     gaussians, birth, poses = folder.gaussians(with_moments=True), arrays["birth"], arrays["keyframe_poses"]
-    if birth.shape != (len(gaussians),):
-        raise ValueError(f"expected {len(gaussians)} Gaussians as in map.ply, found {len(birth)}")
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or not np.isfinite(poses).all():
-        raise ValueError(f"keyframe_poses: expected numbers [K, 4, 4], found {list(poses.shape)}")
+    forms = {
+        "keyframe_poses": PoseForm("float", "n"), "birth": Form("int", len(gaussians)),
+        "noise": Form("float", 2, finite=True),
+    }  # fmt: skip
+    if KEYFRAME_CAMERAS in arrays:
+        forms[KEYFRAME_CAMERAS] = Form("float", "n", 6, finite=True)
+    check_arrays(arrays, forms, "places")
     if birth.max(initial=-1) >= len(poses) or birth.min(initial=0) < -1:
         raise ValueError(f"birth: expected keyframes up to {len(poses) - 1}, found {birth.min()} to {birth.max()}")
     camera, (constant, square) = camera_of(arrays["camera"]), arrays["noise"].tolist()
@@ -102,7 +107,7 @@ def _load(
 
 def scale_of(arrays: dict[str, Any]) -> float:
     """Size of the scene; runs of before it was measured lack it."""
-    scale = float(arrays.get("scale", 1.0))
+    scale = float(np.asarray(arrays.get("scale", 1.0)).item())
     if not 1e-3 <= scale <= 1e3:
         raise ValueError(f"scale: expected 0.001 to 1000, found {scale:g}")
     return scale

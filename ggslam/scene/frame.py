@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from ggslam.scene.camera import Camera
+from ggslam.system.array_forms import ColorImage, DepthImage, Form, Mask, Pose
 
 
 @dataclass(frozen=True)
@@ -39,14 +41,14 @@ class Frame:
     index: int
     source_index: int
     timestamp: float
-    color: np.ndarray
-    depth: np.ndarray
+    color: ColorImage
+    depth: DepthImage
     camera: Camera
-    mask: np.ndarray | None = None
-    T_world_camera: np.ndarray | None = None
+    mask: Annotated[np.ndarray, Form("u2", None, None)] | None = None
+    T_world_camera: Pose | None = None
     mask_loader: Callable[[], np.ndarray | None] | None = field(default=None, repr=False, compare=False)
-    valid: np.ndarray | None = field(default=None, repr=False, compare=False)
-    moving: np.ndarray | None = field(default=None, repr=False, compare=False)
+    valid: Mask | None = field(default=None, repr=False, compare=False)
+    moving: Mask | None = field(default=None, repr=False, compare=False)
     depth_delay: float = 0.0
     camera_number: int = 0
     instant: int | None = None

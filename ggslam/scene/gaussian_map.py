@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from ggslam.errors import InputError
+from ggslam.errors import FormatError, InputError
 from ggslam.scene.harmonics import harmonic_rotations
 
 SH_C0 = 0.28209479177387814
@@ -18,6 +18,8 @@ SH_C0 = 0.28209479177387814
 
 _PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
 _BOOKKEEPING = ("birth_keyframe", "object_id", "updates", "feature_updates", "vote_ids", "vote_weights")
+MOST_UPDATES = 2**30
+"""Steps of an optimizer that a Gaussian may have seen: counters of 32 bits go on from there."""
 _ZERO_AT_BIRTH = ("updates", "feature_updates", "vote_ids", "vote_weights")
 _MOMENTS = ("first", "second")
 VOTE_SLOTS = 4
@@ -80,6 +82,24 @@ class GaussianMap:
         self._views: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
         self._moments: tuple[tuple[int, int], dict[str, tuple[torch.Tensor, torch.Tensor]]] = ((-1, -1), {})
         self._allocate(0)
+
+    def check(self, keyframes: int) -> None:
+        """Raises FormatError if numbers of objects, keyframes or steps cannot be, or a Gaussian is nowhere: it may
+        come from a file.
+
+        Args:
+            keyframes: how many there are.
+        """
+        ranges = {
+            "birth_keyframe": (-1, keyframes - 1), "object_id": (0, 65535), "vote_ids": (0, 65535),
+            "updates": (0, MOST_UPDATES), "feature_updates": (0, MOST_UPDATES),
+        }  # fmt: skip
+        for name, (low, high) in ranges.items():
+            rows = self._storage[name][: self.count]
+            if rows.numel() and not (low <= int(rows.min()) and int(rows.max()) <= high):
+                raise FormatError(f"{name} of Gaussians: expected {low} to {high}")
+        if not bool(torch.isfinite(self._storage["means"][: self.count]).all()):
+            raise FormatError("means of Gaussians: expected finite numbers")
 
     # --- storage -------------------------------------------------------------------------------------------------
 

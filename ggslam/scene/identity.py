@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.scene.arrays import arrays_to_bytes, read_arrays
+from ggslam.system.array_forms import Form
 
 IDENTITY_CHANNELS = 16
 """Length of an identity vector."""
@@ -32,9 +34,9 @@ class IdentityClassifier:
         bias: float32 [C].
     """
 
-    class_ids: np.ndarray
-    weight: np.ndarray
-    bias: np.ndarray
+    class_ids: Annotated[np.ndarray, Form("u2", "c")]
+    weight: Annotated[np.ndarray, Form("f4", "c", "f", finite=True)]
+    bias: Annotated[np.ndarray, Form("f4", "c", finite=True)]
 
     @staticmethod
     def empty(channels: int = IDENTITY_CHANNELS) -> IdentityClassifier:

@@ -13,12 +13,14 @@ import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Annotated
 
 import cv2
 import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.scene.frame import Frame
+from ggslam.system.array_forms import Form
 
 MOVERS_FILE = "movers.npz"
 """Of runs in which something was found to move."""
@@ -37,7 +39,7 @@ class MovingPixels:
     """
 
     frames: list[int] = field(default_factory=list)
-    masks: list[np.ndarray] = field(default_factory=list)
+    masks: list[Annotated[np.ndarray, Form("u1", None)]] = field(default_factory=list)
     size: tuple[int, int] = (0, 0)
 
     def __len__(self) -> int:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from ggslam.geometry.fixed_to_camera import compare_views, parts_with_seeds, shr
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
+from ggslam.system.array_forms import DepthImage, Form, Mask, Pose
 
 COLUMNS = 80
 """Of the images that are compared, about."""
@@ -50,14 +52,14 @@ class CameraFixtures:
         latest: depth as compared, and pose, of the latest views.
     """
 
-    mask: np.ndarray | None = None
+    mask: Mask | None = None
     nearest: float = 0.0
     changes: int = 0
     views: int = 0
     comparisons: int = 0
-    counts: np.ndarray | None = None
-    latest: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
-    _depth: np.ndarray | None = None
+    counts: Annotated[np.ndarray, Form("i4", 3, None, None)] | None = None
+    latest: list[tuple[Annotated[np.ndarray, Form("f4", None, None)], Pose]] = field(default_factory=list)
+    _depth: DepthImage | None = None
     """Of the frame at hand, as the camera gave it."""
 
     def notes(self) -> list[str]:

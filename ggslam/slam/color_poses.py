@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.result import TrackedFrame
+from ggslam.system.array_forms import Form
 from ggslam.tracking.tracker import TrackerState, TrackingResult, TrackingStatus
 
 UNDECIDED = 32
@@ -37,6 +39,8 @@ the time."""
 REPORT_EVERY = 20
 HIDDEN_MARGIN = 9
 """Pixels across, around those that show something else."""
+
+_Coded = Annotated[np.ndarray, Form("u1", None)]
 
 
 @dataclass
@@ -60,7 +64,7 @@ class ColorPoses:
     mapper: Mapper
     poses: FramePoses
     state: TrackerState
-    images: list[tuple[int, float, np.ndarray, np.ndarray]] = field(default_factory=list)
+    images: list[tuple[int, float, _Coded, _Coded]] = field(default_factory=list)
     held_bytes: int = 0
     active: bool = field(init=False)
     live: bool = False

@@ -25,6 +25,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points, turning_angle
 from ggslam.slam.run_movers import SURE
+from ggslam.system.array_forms import Pose
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult
 
@@ -48,7 +49,7 @@ class EarlierViews:
     """
 
     views: dict[int, EarlierView] = field(default_factory=dict)
-    counted: list[np.ndarray] = field(default_factory=list)
+    counted: list[Pose] = field(default_factory=list)
     gaussians: int = 0
 
     def look(

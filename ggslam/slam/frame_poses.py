@@ -12,17 +12,26 @@ from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.slam.result import TrackedFrame
+from ggslam.system.array_forms import Pose, check_indices
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 
 class FramePoses:
     """Where the frames so far were located."""
 
+    frames: list[TrackedFrame]
+    _T_world_anchor: Pose
+
     def __init__(self) -> None:
-        self.frames: list[TrackedFrame] = []
+        self.frames = []
         self.keyframes_made = 0
         """Keyframes so far, those included that still wait for the mapper."""
         self._anchor, self._T_world_anchor = -1, np.eye(4)  # number of a keyframe, its pose as tracked
+
+    def check(self) -> None:
+        """Raises FormatError if a frame hangs on a keyframe that is not there: it may come from a file."""
+        check_indices("frames", (frame.keyframe for frame in self.frames), max(1, self.keyframes_made))
+        check_indices("the frame's keyframe", [self._anchor + 1], self.keyframes_made + 1)
 
     def add_keyframe(self, T_world_camera: np.ndarray) -> None:
         """From now on poses are remembered relative to this keyframe, the newest."""

@@ -14,6 +14,7 @@ import numpy as np
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.slam.loop_closing import LoopCloser
+from ggslam.system.array_forms import Pose
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
@@ -34,7 +35,7 @@ class LeftPart:
     """
 
     keyframe: int
-    T_world_keyframe: np.ndarray
+    T_world_keyframe: Pose
     motion: CameraMotion
     target: GicpTarget | None = None
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import FormatError
 from ggslam.features.orb import FeatureView
 from ggslam.loops.activity import ActiveKeyframes
 from ggslam.loops.agreement import GroundLink
@@ -28,6 +29,7 @@ from ggslam.scene.poses import inverse, separation
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.part_joining import find_links, links_between
 from ggslam.slam.place_comparison import PlaceComparison
+from ggslam.system.array_forms import Form, Pose, PoseForm, check_arrays, check_indices
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.surface import MeasuredSurface
@@ -82,8 +84,8 @@ class _Found:
 
     keyframe: int
     old_keyframe: int
-    T_correction: np.ndarray
-    T_world_camera: np.ndarray
+    T_correction: Pose
+    T_world_camera: Pose
 
 
 class LoopCloser:
@@ -99,17 +101,24 @@ class LoopCloser:
         context: threads.
     """
 
+    events: list[LoopEvent]
+    poses: list[Pose]
+    _verified: list[_Found]
+    _found_at: tuple[int, int] | None
+    _parts_begin: set[int]
+    _taken: list[tuple[int | None, int]]
+
     def __init__(
         self, camera: Camera, settings: LoopSettings, surface: MeasuredSurface, tracker: Tracker, context: NativeContext
     ) -> None:
         self.settings = settings
-        self.events: list[LoopEvent] = []
+        self.events = []
         self.seconds = 0.0
         """Spent here, verification and graph included."""
         self.graph = PoseGraph(settings.graph)
         self.places = PlaceIndex(camera, settings.places)
         self.activity = ActiveKeyframes(settings.activity)
-        self.poses: list[np.ndarray] = []
+        self.poses = []
         """T_world_camera of the keyframes as tracked and corrected (the mapper refines its own on top)."""
         self.parts = KeyframeParts()
         self.revisits = Revisits(settings.revisits)
@@ -117,18 +126,29 @@ class LoopCloser:
             settings.verification, settings.neighbourhood, surface, tracker, context
         )
         self._camera, self._surface, self._tracker = camera, surface, tracker
-        self._verified: list[_Found] = []
-        self._found_at: tuple[int, int] | None = None
+        self._verified = []
+        self._found_at = None
         """When a lost camera was found (see `_moment`), and the keyframe it was found at; until its first keyframe is
         in."""
-        self._parts_begin: set[int] = set()
+        self._parts_begin = set()
         """Moments of the frames that begin a part, until their keyframes are in."""
-        self._taken: list[tuple[int | None, int]] = []
+        self._taken = []
         """Instant and camera number of each keyframe of a rig; instants are None without one."""
         self._lock = threading.RLock()
         self._helper: ThreadPoolExecutor | None = None
         self._begun: tuple[int, Future[Place]] | None = None
         """Of a frame that will be added: its index, and its place as soon as it is described."""
+
+    def check(self) -> None:
+        """Raises FormatError if its parts are not of the same keyframes: it may come from a file."""
+        count = len(self.poses)
+        counts = [count, len(self.graph.poses), len(self.places), len(self.activity), len(self.revisits)]
+        counts += [len(self.parts.of), len(self._taken)]
+        if len(set(counts)) > 1:
+            raise FormatError(f"loops: numbers of keyframes that do not agree: {counts}")
+        named = [keyframe for found in self._verified for keyframe in (found.keyframe, found.old_keyframe)]
+        named += [] if self._found_at is None else [self._found_at[1]]
+        check_indices("loops", named, count)
 
     # --- keyframes ---------------------------------------------------------------------------------------------------
 
@@ -465,8 +485,10 @@ class LoopCloser:
         """Takes over what `to_arrays` gave, before any keyframe was added. All of it is put aside until found.
 
         Raises:
-            FormatError, ValueError: arrays that do not fit together.
+            FormatError: arrays that do not fit together.
         """
+        forms = {"poses": PoseForm("float", "n"), "median_depths": Form("float", "n", finite=True)}
+        check_arrays(arrays, forms, "loops")
         places = {name.removeprefix("places_"): a for name, a in arrays.items() if name.startswith("places_")}
         self.places = PlaceIndex.from_arrays(self._camera, places, self.settings.places)
         for number, (T, depth) in enumerate(zip(arrays["poses"], arrays["median_depths"], strict=True)):
@@ -479,7 +501,7 @@ class LoopCloser:
             self._taken.append((None, 0))
             self.activity.add(T, float(depth))
         if not len(self.poses) == len(self.places) == len(self._surface):
-            raise ValueError("places, poses and surfaces are not of the same keyframes")
+            raise FormatError("places, poses and surfaces are not of the same keyframes")
         self.activity.active = set()
 
 

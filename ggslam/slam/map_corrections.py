@@ -20,6 +20,7 @@ from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.slam.run_movers import RunMovers
+from ggslam.system.array_forms import Pose
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
@@ -39,11 +40,13 @@ class MapCorrections:
         masks: of objects; None: objects that both ends of a loop have mapped stay two.
     """
 
+    _moves: list[Pose]
+
     def __init__(
         self, surface: MeasuredSurface, mapper: Mapper, pager: MapPager | None, masks: ObjectMasks | None = None
     ) -> None:
         self._surface, self._mapper, self._pager, self._masks = surface, mapper, pager, masks
-        self._moves: list[np.ndarray] = []
+        self._moves = []
         self._left_out = 0  # changes of what is fixed to the camera that the map knows of
         self._publishing = threading.Lock()
 

@@ -73,15 +73,19 @@ class ObjectMasks:
         MissingDependency: onnxruntime is not installed.
     """
 
+    _source: Source | None
+    _segmented: dict[int, int]
+    _associator: Associator
+
     def __init__(self, settings: MaskSettings, has_masks: bool | None = None) -> None:
         self.settings = settings
-        self._source: Source | None = _choose(settings, has_masks)
+        self._source = _choose(settings, has_masks)
         self._segment: Callable[[Frame], np.ndarray] | None = None
         if self._source == "model":
             model = OnnxSegmenter(settings.model, settings.onnx)
             self._segment = lambda frame: model.segment(frame.color)
         self._associator = self._make_associator()
-        self._segmented: dict[int, int] = {}  # of each camera the last frame, or instant, that was
+        self._segmented = {}  # of each camera the last frame, or instant, that was
 
     def _make_associator(self) -> Associator:
         """A segmenter's ids mean nothing from one frame to the next; a recording's may."""

@@ -14,6 +14,7 @@ import numpy as np
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize
+from ggslam.system.array_forms import Pose
 from ggslam.tracking.gicp import AlignmentStatus, GicpTarget, align
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
@@ -60,12 +61,12 @@ class PartStart:
         target: what frames are aligned to until that is in.
     """
 
-    poses: list[np.ndarray] = field(default_factory=list)
+    poses: list[Pose] = field(default_factory=list)
     first: int = 0
     since: float = 0.0
     reference: tuple[int, FramePoints] | None = None
     before: FramePoints | None = None
-    turned: np.ndarray = field(default_factory=lambda: np.eye(4))
+    turned: Pose = field(default_factory=lambda: np.eye(4))
     kept: list[tuple[int, Frame, FramePoints]] = field(default_factory=list)
     keyframe: int = -1
     target: GicpTarget | None = None

@@ -22,6 +22,7 @@ from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.config import Config
 from ggslam.slam.loop_closing import LoopEvent
 from ggslam.submaps.gaussian_cells import GaussianCells
+from ggslam.system.array_forms import Pose
 from ggslam.tracking.tracker import TrackingStatus
 
 
@@ -43,7 +44,7 @@ class TrackedFrame:
     source_index: int
     timestamp: float
     keyframe: int
-    T_keyframe_camera: np.ndarray
+    T_keyframe_camera: Pose
     overlap: float
     rmse_m: float
     status: str

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.scene.poses import inverse, se3_exp, se3_log
+from ggslam.system.array_forms import Pose
 
 LONGEST_S = 0.5
 """Seconds between two instants beyond which the motion between them says nothing of that within one."""
@@ -26,9 +27,9 @@ class RigClock:
         interval: the time that took, seconds.
     """
 
-    T_world_first: np.ndarray | None = None
+    T_world_first: Pose | None = None
     time: float = 0.0
-    motion: np.ndarray | None = None
+    motion: Pose | None = None
     interval: float = 0.0
 
     def knows(self, seconds: float) -> bool:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, FormatError
 from ggslam.features.orb import FeatureView
 from ggslam.geometry.scene_size import scene_scale
 from ggslam.scene.camera import Camera
@@ -61,6 +61,9 @@ class RigSlam(Slam):
         ConfigError: settings that a rig does not go with.
     """
 
+    _edges_of: list[DepthEdges]
+    _shutters_of: list[ShutterTimes]
+
     def __init__(self, rig: Rig, config: Config | None = None, has_masks: bool | None = None) -> None:
         settings = _settings_for(rig, config or Config())
         super().__init__(rig.cameras[0], settings, has_masks)
@@ -70,6 +73,12 @@ class RigSlam(Slam):
         self.tracker.engine = self._engine
         self._clock = RigClock()
         self._edges_of, self._shutters_of = [DepthEdges() for _ in rig.names], [ShutterTimes() for _ in rig.names]
+
+    def check(self) -> None:
+        """Raises FormatError if it has not what it must have of each camera: its state may come from a file."""
+        for kept in (self._edges_of, self._shutters_of):
+            if len(kept) != len(self.rig.names):
+                raise FormatError(f"cameras: expected {len(self.rig.names)}, found the state of {len(kept)}")
 
     def step(self, frame: Frame) -> StepReport:
         """An instant of which there is one frame only; see `step_together`."""

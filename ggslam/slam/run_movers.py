@@ -19,6 +19,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
+from ggslam.system.array_forms import Pose
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
@@ -41,6 +42,8 @@ class RunMovers:
         context: that evidence is computed in; it may be replaced.
     """
 
+    _before: tuple[float, Pose] | None
+
     def __init__(self, settings: MoverSettings, reads_masks: bool, context: NativeContext) -> None:
         self.detector = MoverDetector(settings)
         self._reads_masks, self.context = reads_masks, context
@@ -49,7 +52,7 @@ class RunMovers:
         self.tracks = MoverTracks()
         """The movers one by one."""
         self._margin = _margin(settings, DepthNoise())
-        self._before: tuple[float, np.ndarray] | None = None
+        self._before = None
         """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
 
     @property

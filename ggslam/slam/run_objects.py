@@ -19,9 +19,11 @@ class RunObjects:
         masks: of its keyframes.
     """
 
+    learned: LearnedObjects | None
+
     def __init__(self, masks: ObjectMasks) -> None:
         self._masks = masks
-        self.learned: LearnedObjects | None = None
+        self.learned = None
         """Of the map that the run began with; after `settle` of the run."""
         self._settled = False
 

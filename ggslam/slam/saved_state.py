@@ -145,14 +145,10 @@ def check_state(slam: Slam) -> None:
         raise FormatError("views of what may move: not of their camera")
     if not slam.earlier_views.check():
         raise FormatError("views of the map that the run began with: not of their cameras")
-    if not mapper._mean.fits(mapper.map):
-        raise FormatError("the mean of the map: not of its Gaussians")
     slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
     if slam.loops is not None:
         counts += [len(slam.loops.poses), len(slam.loops.places), len(slam.loops.parts.of)]
-    if not mapper.left_out <= set(range(len(mapper.keyframes))):
-        raise FormatError("keyframes that were left out: not of this run")
     if len(set(counts)) > 1:
         raise FormatError(f"numbers of keyframes that do not agree: {counts}")
 
@@ -237,11 +233,12 @@ RULES: Rules = {
     **dict.fromkeys(_settings_classes(Config) - {Config}, Rule(checked=True)),
     Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device", after=_fit_to_scene),
     RigSlam: _but(
-        "camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine", after=_fit_to_scene
+        "camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine", after=_fit_to_scene,
+        check=RigSlam.check,
     ),
     SlamTimes: _but("_started", growing=_names("tracking_by_frame"), after=_go_on),
     ColorPoses: _but("mapper", "poses", "state", growing=_names("images")),
-    FramePoses: Rule(growing=_names("frames")),
+    FramePoses: Rule(growing=_names("frames"), check=FramePoses.check),
     MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "_publishing"),
     MapParts: _but("_mapper", "_poses", "_corrections", "_loops"),
     RunObjects: _but("_masks"),
@@ -260,43 +257,50 @@ RULES: Rules = {
     FeatureView: _but("_features"),
     KeyframePolicy: _but("settings"),
     MeasuredSurface: _but(
-        "_context", "_archive", "target", "finish", "_helper", "_begun", after=MeasuredSurface.gather_again
+        "_context", "_archive", "target", "finish", "_helper", "_begun", after=MeasuredSurface.gather_again,
+        check=MeasuredSurface.check,
     ),
-    _Part: Rule(fixed=_names("_arrays")),
+    _Part: Rule(fixed=_names("_arrays"), check=_Part.check),
     LocalFeatureMap: _but("settings", "clock", "_aligner"),
-    FeatureMap: _but("settings", "_shift", "_mask", "_corners", "_ones", "_isotropic"),
+    FeatureMap: _but("settings", "_shift", "_mask", "_corners", "_ones", "_isotropic", check=FeatureMap.check),
     # loops
     LoopCloser: _but(
         "settings", "comparison", "_camera", "_surface", "_tracker", "_lock", "_helper", "_begun",
-        growing=_names("events"),
+        growing=_names("events"), check=LoopCloser.check,
     ),
-    PoseGraph: _but("settings", growing=_names("loops")),
+    PoseGraph: _but("settings", growing=_names("loops"), check=PoseGraph.check),
     PartStart: _but("target"),
     LeftPart: _but("target"),
-    OdometryTree: Rule(growing=_names("parents", "poses", "covariances", "steps")),
+    OdometryTree: Rule(growing=_names("parents", "poses", "covariances", "steps"), check=OdometryTree.check),
     PlaceIndex: _but(
         "camera", "settings", "_bits", "_fern_pixels", "_fern_colors", "_fern_depths", "_lists",
-        growing=_names("_places"), after=PlaceIndex.list_again,
+        growing=_names("_places"), after=PlaceIndex.list_again, check=PlaceIndex.check,
     ),
-    ActiveKeyframes: _but("settings"),
+    ActiveKeyframes: _but("settings", check=ActiveKeyframes.check),
     Revisits: _but("settings"),
     # mapping
-    CpuMapper: _but("settings", "residency", "extra_loss", "_rasterizer", "_loss", "_adam_of_pixel"),
+    CpuMapper: _but(
+        "settings", "residency", "extra_loss", "_rasterizer", "_loss", "_adam_of_pixel", check=CpuMapper.check
+    ),
     GaussianMap: Rule(save=_save_map, take=_take_map),
-    Keyframe: Rule(fixed=_names("color", "depth", "mask", "moving")),
+    Keyframe: Rule(fixed=_names("color", "depth", "mask", "moving"), check=Keyframe.check),
+    CpuClassTable: Rule(check=CpuClassTable.check),
+    ClassNumbers: Rule(check=ClassNumbers.check),
+    KeyframeParts: Rule(check=KeyframeParts.check),
+    StepLog: Rule(check=StepLog.check),
+    Camera: Rule(checked=True),
     CpuIdentityLearner: _but("settings", "seed"),
     PixelPool: Rule(save=_save_pool),
     NeighbourIndex: Rule(save=_save_index, take=_take_index),
     # plain values
     **dict.fromkeys(
-        (Camera, CameraFixtures, Trail, Track, MoverSight, Patch, RigidTracker, DepthEdges, DepthNoise,
+        (CameraFixtures, Trail, Track, MoverSight, Patch, RigidTracker, DepthEdges, DepthNoise,
          ResidualNoise, StillCamera, SmallFrame, KeyframeKind,
-         FeatureCounts, TrackedFrame, StepLog, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
-         KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, KeyframeExposures, IdentityTimes, CpuClassTable,
-         ClassNumbers, IdentityClassifier,
+         FeatureCounts, TrackedFrame, LoopEvent, _Found, Link, Place, Landmarks, LossSums, MapperTimes,
+         KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, KeyframeExposures, IdentityTimes, IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
-         ShutterTimes, RigClock, EarlierViews, EarlierView, KeyframeParts, FramePoints,
+         ShutterTimes, RigClock, EarlierViews, EarlierView, FramePoints,
          LeftParts, Frame),
         Rule(),
     ),

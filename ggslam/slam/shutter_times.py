@@ -10,6 +10,7 @@ import numpy as np
 from ggslam.geometry.moved_depth import largest_shift, moved_depth
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
+from ggslam.system.array_forms import Pose
 
 LEAST_SHIFT = 0.5
 """Pixels by which depth and colour have to be apart in a corner of the image."""
@@ -31,11 +32,11 @@ class ShutterTimes:
         T_world_depth: where the depth camera was before, None if it was not located; `time_before` when.
     """
 
-    motion: np.ndarray | None = None
+    motion: Pose | None = None
     interval: float = 0.0
-    T_color_depth: np.ndarray = field(default_factory=lambda: np.eye(4))
+    T_color_depth: Pose = field(default_factory=lambda: np.eye(4))
     time: float = 0.0
-    T_world_depth: np.ndarray | None = None
+    T_world_depth: Pose | None = None
     time_before: float = 0.0
 
     def bring(self, frame: Frame) -> Frame:

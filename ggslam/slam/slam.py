@@ -81,6 +81,12 @@ class Slam:
             GPU.
     """
 
+    scale: float
+    _noise: DepthNoise | None
+    dropped_frames: list[int]
+    _early: list[tuple[Frame, TrackingResult]]
+    refine_iterations: int
+
     def __init__(
         self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None,
         library: CudaLibrary | None = None, extra_loss: ExtraLoss | None = None,
@@ -99,7 +105,7 @@ class Slam:
         self.scale = 1.0
         """Size of the scene against a room's, see `geometry.scene_size`."""
         self.poses = FramePoses()
-        self.dropped_frames: list[int] = []
+        self.dropped_frames = []
         self.refine_iterations = 0
         self.times = SlamTimes()
         self.steps = StepLog()
@@ -108,13 +114,13 @@ class Slam:
         self._corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
         self._parts = MapParts(self.mapper, self.poses, self._corrections, self.loops)
         self._moves_followed = 0
-        self._noise: DepthNoise | None = None
+        self._noise = None
         self._objects = RunObjects(self.masks)
         self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
         self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
         self.earlier_views = EarlierViews()
         self.part_start, self.left_parts = PartStart(), LeftParts()
-        self._early: list[tuple[Frame, TrackingResult]] = []
+        self._early = []
         self.takes_keyframes = True
         """Whether the next keyframe would be taken now; in real time none is while too many wait."""
         self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"), self.context)

@@ -7,12 +7,14 @@ import io
 from array import array
 from dataclasses import astuple, fields
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.mapping.mapper import LossSums, Mapper, MapperTimes
 from ggslam.slam.result import SlamTimes, StepReport, TrackedFrame
+from ggslam.system.array_forms import Form
 from ggslam.system.foreign import read_foreign_text
 from ggslam.system.process_memory import resident_bytes
 
@@ -33,10 +35,18 @@ there were none."""
 class StepLog:
     """Rows of `COLUMNS`, one for each step."""
 
+    _times: Annotated[np.ndarray, Form("f8", 2 + len(_PARTS))]
+    _losses: Annotated[np.ndarray, Form("f8", len(_LOSSES))]
+
     def __init__(self) -> None:
         self._rows = array("d")
         self._times, self._losses = np.zeros(2 + len(_PARTS)), np.zeros(len(_LOSSES))
         self._iterations = self._steps = 0
+
+    def check(self) -> None:
+        """Raises FormatError if it has no whole rows: it may come from a file."""
+        if len(self._rows) % len(COLUMNS):
+            raise FormatError(f"table of steps: {len(self._rows)} numbers in rows of {len(COLUMNS)}")
 
     def __len__(self) -> int:
         return len(self._rows) // len(COLUMNS)

@@ -22,9 +22,10 @@ import numpy as np
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.system.atomic import write_failure
+from ggslam.system.foreign import read_foreign
 
 _WAITING_THREADS = 8
-_CELL = re.compile(r"(-?\d+)_(-?\d+)_(-?\d+)")
+_CELL = re.compile(r"(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})", re.ASCII)
 _PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
@@ -172,13 +173,22 @@ def read_current(find: Callable[[], Path], attempts: int = 5) -> tuple[Path, byt
     path = find()
     for _ in range(attempts):
         try:
-            return path, path.read_bytes()
+            return path, _content(path)
         except FileNotFoundError:
             found = find()
             if found == path:
                 raise
             path = found
-    return path, path.read_bytes()
+    return path, _content(path)
+
+
+def _content(path: Path) -> bytes:
+    """Of a part. Raises FormatError if it is no regular file, FileNotFoundError if there is none."""
+    try:
+        return read_foreign(path)
+    except FormatError:
+        path.lstat()
+        raise
 
 
 def wait_for_disk(path: Path) -> None:

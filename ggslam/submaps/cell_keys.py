@@ -15,7 +15,13 @@ from ggslam.submaps.settings import GridAxes
 CellKey = tuple[int, int, int]
 """Whole coordinates of a cell along x, y, z; 0 along an axis that the grid does not span."""
 
-_LIMIT = 2**31
+LIMIT = 2**31
+"""Coordinates reach no farther: differences and sums of them stay exact."""
+
+
+def is_coordinate(value: object) -> bool:
+    """Whether this may be a coordinate of a cell; keys out of files may be anything."""
+    return type(value) is int and abs(value) <= LIMIT
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ class Grid:
             ConfigError: a coordinate is not finite or more than 2^31 cells away.
         """
         cells = np.floor(np.asarray(points, np.float64) / self.spacing + 0.5) * self.spans
-        if not (np.abs(cells) < _LIMIT).all():  # NaN is not
+        if not (np.abs(cells) < LIMIT).all():  # NaN is not
             raise ConfigError(f"positions must be finite and within 2^31 cells of {self.spacing:g} m of the origin")
         return cells.astype(np.int64)
 
@@ -45,7 +51,7 @@ class Grid:
         """The cell of a position [3] in metres; see `keys_of`."""
         # Asked for at every frame, where arrays of one row cost more than the arithmetic.
         places = [at / self.spacing + 0.5 for at in np.asarray(position, np.float64).reshape(3).tolist()]
-        if not all(abs(at) < (_LIMIT if n in self.axes else math.inf) for at, n in zip(places, "xyz", strict=True)):
+        if not all(abs(at) < (LIMIT if n in self.axes else math.inf) for at, n in zip(places, "xyz", strict=True)):
             raise ConfigError(f"positions must be finite and within 2^31 cells of {self.spacing:g} m of the origin")
         x, y, z = (math.floor(at) if name in self.axes else 0 for at, name in zip(places, "xyz", strict=True))
         return x, y, z
@@ -62,8 +68,8 @@ class Grid:
         """Least and greatest coordinates of the cells whose centres can lie within `radius` metres of a position."""
         position = np.asarray(position, np.float64) * self.spans
         reach = radius * self.spans
-        low = np.ceil((position - reach) / self.spacing - 1e-9).clip(-_LIMIT, _LIMIT)
-        high = np.floor((position + reach) / self.spacing + 1e-9).clip(-_LIMIT, _LIMIT)
+        low = np.ceil((position - reach) / self.spacing - 1e-9).clip(-LIMIT, LIMIT)
+        high = np.floor((position + reach) / self.spacing + 1e-9).clip(-LIMIT, LIMIT)
         (x, y, z), (u, v, w) = low.astype(np.int64).tolist(), high.astype(np.int64).tolist()
         return (x, y, z), (u, v, w)
 

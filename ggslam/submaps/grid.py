@@ -179,9 +179,10 @@ class GridStore:
         return self._index.keys()
 
     def cell(self, key: CellKey) -> CellRecord:
-        """What is known of a cell. Raises KeyError if there is none."""
+        """What is known of a cell. Raises KeyError if there is none, FormatError if one that is listed is not found."""
         record = self._index.record(key)
         if record is None:
+            self._index.check_absent(key)
             raise KeyError(f"{self.path} has no cell {key}")
         return record
 
@@ -213,6 +214,8 @@ class GridStore:
         def find() -> Path:
             record = self._index.part(key, part)
             if record is None:
+                if part in self.cell(key).parts:
+                    raise FormatError(f"{self.path / INDEX}: damaged: cell {key}: its part {part!r} is not found")
                 raise KeyError(f"{self.path}: cell {key} has no part {part!r}")
             found.append(record)
             return self._files.path(key, record.version, part)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The index of a grid store: an SQLite file with write-ahead log (one writer and many readers, no half transactions).
 
-Tables (format version 1):
+Tables (format version 2; version 1 has them without strict types, and is read and written still):
     store    one row: the settings as JSON, the number of the last version
     visits   number, name
     cells    x y z, version of the last write, recorded_at (seconds or NULL), visit (number or NULL)
@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import stat
+import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -25,21 +27,16 @@ from typing import Any
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellChange, CellRecord, CellWrite, PartRecord
+from ggslam.submaps.index_schema import NEWEST, SCHEMAS, check_rows, check_schema
 from ggslam.submaps.settings import SubmapSettings
 
-FORMAT_VERSION = 1
 _APPLICATION = 0x67677367  # "ggsg": how SQLite files tell whose they are
-_SCHEMA = """
-CREATE TABLE store (settings TEXT NOT NULL, last_version INTEGER NOT NULL);
-CREATE TABLE visits (number INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE);
-CREATE TABLE cells (x INTEGER, y INTEGER, z INTEGER, version INTEGER NOT NULL, recorded_at REAL, visit INTEGER,
-                    PRIMARY KEY (x, y, z)) WITHOUT ROWID;
-CREATE TABLE parts (x INTEGER, y INTEGER, z INTEGER, name TEXT, version INTEGER NOT NULL, count INTEGER NOT NULL,
-                    bytes INTEGER NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (x, y, z, name)) WITHOUT ROWID;
-CREATE TABLE changes (visit INTEGER, x INTEGER, y INTEGER, z INTEGER, added INTEGER NOT NULL, changed REAL,
-                      PRIMARY KEY (visit, x, y, z)) WITHOUT ROWID;
-"""
 _BUSY_SECONDS = 10.0
+_LONGEST_VALUE = 1 << 20
+"""Bytes: the settings of a store are a page of text."""
+_LEAST_STEPS, _STEPS_A_BYTE, _STEPS_AT_ONCE = 20_000_000, 64, 100_000
+"""Steps of SQLite's machine that a call may take, a tenth of a second's for the range with most columns."""
+_PART = ("version", "count", "bytes", "crc")
 _MOST_COLUMNS = 1 << 14
 """A range with more (x, y) columns than this is looked up by x alone."""
 
@@ -50,6 +47,7 @@ class CellIndex:
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
         self._connection = connection
+        self._steps = _Steps(path, connection)
         self._lock = threading.RLock()
 
     @staticmethod
@@ -60,8 +58,8 @@ class CellIndex:
             try:
                 connection.execute("PRAGMA journal_mode = WAL")
                 connection.executescript(
-                    f"PRAGMA synchronous = FULL; BEGIN; {_SCHEMA} PRAGMA application_id = {_APPLICATION};"
-                    f"PRAGMA user_version = {FORMAT_VERSION};"
+                    f"PRAGMA synchronous = FULL; BEGIN; {SCHEMAS[NEWEST]} PRAGMA application_id = {_APPLICATION};"
+                    f"PRAGMA user_version = {NEWEST};"
                 )
                 connection.execute("INSERT INTO store VALUES (?, 0)", (json.dumps(asdict(settings)),))
                 connection.execute("COMMIT")
@@ -78,6 +76,7 @@ class CellIndex:
         """
         if not path.is_file():
             raise FormatError(f"{path.parent}: no grid store: there is no file {path.name}")
+        _refuse_other_files(path)
         with _explain_errors(path):
             connection = _connect(path, write)
             try:
@@ -102,27 +101,33 @@ class CellIndex:
 
     def keys(self) -> list[CellKey]:
         """Every cell, sorted."""
-        return self._rows("SELECT x, y, z FROM cells ORDER BY x, y, z")
+        return self._rows("SELECT x, y, z FROM cells ORDER BY x, y, z", (), "x", "y", "z")
 
     def record(self, key: CellKey) -> CellRecord | None:
         """What is known of a cell; None: there is none."""
         with self._lock:
             rows = self._rows(
                 "SELECT c.recorded_at, v.name, c.version FROM cells c LEFT JOIN visits v ON v.number = c.visit "
-                "WHERE c.x = ? AND c.y = ? AND c.z = ?", key,
+                "WHERE c.x = ? AND c.y = ? AND c.z = ?", key, "recorded_at", "visit_name", "version",
             )  # fmt: skip
             parts = self._rows(
-                "SELECT name, version, count, bytes, crc FROM parts WHERE x = ? AND y = ? AND z = ?", key
-            )
+                "SELECT name, version, count, bytes, crc FROM parts WHERE x = ? AND y = ? AND z = ?", key,
+                "name", *_PART,
+            )  # fmt: skip
         if not rows:
             return None
         recorded_at, visit, version = rows[0]
         return CellRecord(key, recorded_at, visit, version, {part[0]: PartRecord(*part[1:]) for part in parts})
 
+    def check_absent(self, key: CellKey) -> None:
+        """Raises FormatError if a cell without record is among all cells: the file's order is damaged."""
+        if key in self.keys() and self.record(key) is None:
+            raise FormatError(f"{self.path}: damaged: cell {key} is listed, but not found")
+
     def part(self, key: CellKey, name: str) -> PartRecord | None:
         """What is known of a part; None: there is none."""
         query = "SELECT version, count, bytes, crc FROM parts WHERE x = ? AND y = ? AND z = ? AND name = ?"
-        rows = self._rows(query, (*key, name))
+        rows = self._rows(query, (*key, name), *_PART)
         return PartRecord(*rows[0]) if rows else None
 
     def in_box(self, low: CellKey, high: CellKey, part: str | None = None) -> dict[CellKey, int]:
@@ -141,32 +146,36 @@ class CellIndex:
                 "WHERE c.x = xs.v AND c.y = ys.v"
             )
         bounds = (low[0], high[0], low[1], high[1], low[2], high[2])
-        rows = self._rows(f"{query} AND c.z BETWEEN ? AND ? {where}", (*bounds, *values))
+        rows = self._rows(f"{query} AND c.z BETWEEN ? AND ? {where}", (*bounds, *values), "x", "y", "z", "version")
         return {(x, y, z): version for x, y, z, version in rows}
 
     def last_version(self) -> int:
-        return int(self._rows("SELECT last_version FROM store")[0][0])
+        rows = self._rows("SELECT last_version FROM store", (), "version")
+        if len(rows) != 1:
+            raise FormatError(f"{self.path}: damaged: {len(rows)} settings of a store")
+        return int(rows[0][0])
 
     def visit_number(self, name: str) -> int | None:
-        rows = self._rows("SELECT number FROM visits WHERE name = ?", (name,))
+        rows = self._rows("SELECT number FROM visits WHERE name = ?", (name,), "number")
         return rows[0][0] if rows else None
 
     def add_visit(self, name: str) -> int:
         """The number of a visit, which is made if it is new."""
         with self._transaction() as connection:
             connection.execute("INSERT INTO visits (name) VALUES (?) ON CONFLICT DO NOTHING", (name,))
-        return int(self._rows("SELECT number FROM visits WHERE name = ?", (name,))[0][0])
+        return int(self._rows("SELECT number FROM visits WHERE name = ?", (name,), "number")[0][0])
 
     def visits(self) -> list[str]:
         """Names of the visits, oldest first."""
-        return [name for (name,) in self._rows("SELECT name FROM visits ORDER BY number")]
+        return [name for (name,) in self._rows("SELECT name FROM visits ORDER BY number", (), "name")]
 
     def changes(self, since: int) -> list[CellChange]:
         """Cells that the visit of this number or later ones added or refreshed, sorted."""
         query = (
             "SELECT x, y, z, MAX(added), MAX(changed) FROM changes WHERE visit >= ? GROUP BY x, y, z ORDER BY x, y, z"
         )
-        return [CellChange((x, y, z), bool(added), changed) for x, y, z, added, changed in self._rows(query, (since,))]
+        rows = self._rows(query, (since,), "x", "y", "z", "added", "changed")
+        return [CellChange((x, y, z), bool(added), changed) for x, y, z, added, changed in rows]
 
     def commit(self, writes: Sequence[tuple[CellWrite, int, Mapping[str, tuple[int, int]]]], visit: int | None) -> None:
         """Makes written versions the current ones, all in one transaction.
@@ -206,13 +215,18 @@ class CellIndex:
         with self._transaction() as connection:
             connection.execute("DELETE FROM parts WHERE x = ? AND y = ? AND z = ? AND name = ?", (*key, name))
 
-    def _rows(self, query: str, values: Sequence[Any] = ()) -> list[tuple]:
+    def _rows(self, query: str, values: Sequence[Any], *columns: str) -> list[tuple]:
+        """What is found, of which each column may be what `index_schema.COLUMNS` says of it."""
         with self._lock, _explain_errors(self.path):
-            return self._connection.execute(query, values).fetchall()
+            self._steps.begin()
+            rows = self._connection.execute(query, values).fetchall()
+        check_rows(self.path, rows, *columns)
+        return rows
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
         with self._lock, _explain_errors(self.path):
+            self._steps.begin()
             self._connection.execute("BEGIN IMMEDIATE")
             try:
                 yield self._connection
@@ -223,9 +237,37 @@ class CellIndex:
                 raise
 
 
+def _refuse_other_files(path: Path) -> None:
+    """SQLite opens what lies beside an index by name: a link or a pipe is refused."""
+    for file in (path, *(path.with_name(path.name + ending) for ending in ("-wal", "-shm", "-journal"))):
+        with suppress(FileNotFoundError):
+            if not stat.S_ISREG(file.lstat().st_mode):
+                raise FormatError(f"{file}: is not a regular file")
+
+
+class _Steps:
+    """Stops SQLite when it takes more steps than a file of this size can need: a damaged one may lead in circles."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        self._path, self._taken, self._most = path, 0, 0
+        connection.set_progress_handler(self._count, _STEPS_AT_ONCE)
+
+    def begin(self) -> None:
+        """The next statements begin."""
+        self._taken = 0
+
+    def _count(self) -> int:
+        self._taken += _STEPS_AT_ONCE
+        if self._taken > self._most:  # the file may have grown
+            with suppress(OSError):
+                self._most = _LEAST_STEPS + _STEPS_A_BYTE * self._path.stat().st_size
+        return int(self._taken > self._most)
+
+
 def _connect(path: Path, write: bool) -> sqlite3.Connection:
     uri = f"{path.resolve().as_uri()}?mode={'rw' if write else 'ro'}"
     connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=_BUSY_SECONDS)
+    _limit(connection)
     if not write:
         try:
             connection.execute("SELECT 1 FROM sqlite_master").fetchone()
@@ -238,10 +280,20 @@ def _connect(path: Path, write: bool) -> sqlite3.Connection:
                     f"{path}: its last writer did not close it; it must be opened once where it can be written"
                 ) from error
             connection = sqlite3.connect(f"{uri}&immutable=1", uri=True, check_same_thread=False)
-    connection.execute("PRAGMA synchronous = FULL")
+            _limit(connection)
+    return connection
+
+
+def _limit(connection: sqlite3.Connection) -> None:
+    """What a file from elsewhere may not make SQLite do."""
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")
-    return connection
+    connection.execute("PRAGMA synchronous = FULL")
+    if sys.version_info >= (3, 11):
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, _LONGEST_VALUE)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_COLUMN, 64)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
 
 
 def _has_log(path: Path) -> bool:
@@ -263,11 +315,9 @@ def _read_settings(path: Path, connection: sqlite3.Connection) -> SubmapSettings
     version = connection.execute("PRAGMA user_version").fetchone()[0]
     if application != _APPLICATION:
         raise FormatError(f"{path}: not the index of a grid store (application id {application:#x})")
-    if version != FORMAT_VERSION:
-        raise FormatError(f"{path}: format version {version}, this program reads version {FORMAT_VERSION}")
-    strange = connection.execute("SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index')").fetchone()
-    if strange is not None:
-        raise FormatError(f"{path}: holds {strange[0]!r}, which no index of ggslam does")
+    if version not in SCHEMAS:
+        raise FormatError(f"{path}: format version {version}, this program reads versions up to {max(SCHEMAS)}")
+    check_schema(path, connection, version)
     try:
         return SubmapSettings(**json.loads(connection.execute("SELECT settings FROM store").fetchone()[0]))
     except (TypeError, ValueError, RecursionError, ConfigError) as error:
@@ -286,7 +336,9 @@ def _explain_errors(path: Path) -> Iterator[None]:
 
 def _explanation(path: Path, error: sqlite3.Error) -> GgslamError:
     reason = str(error)
-    if any(word in reason for word in ("malformed", "not a database", "no such", "disk image")):
+    if "interrupted" in reason:
+        return FormatError(f"{path}: damaged: takes more steps to read than a file of its size can")
+    if any(word in reason for word in ("malformed", "not a database", "no such", "disk image", "too big")):
         return FormatError(f"{path}: damaged: {reason}")
     failure = RunFolderError(f"{path}: {reason}")
     if "full" in reason or "I/O" in reason:

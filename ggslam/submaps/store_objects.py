@@ -20,7 +20,7 @@ from ggslam.errors import FormatError
 from ggslam.scene.object_names import object_label
 from ggslam.scene.oriented_box import Number, OrientedBox, Vector
 from ggslam.scene.poses import motion_of, to_matrix
-from ggslam.submaps.cell_keys import CellKey
+from ggslam.submaps.cell_keys import LIMIT
 from ggslam.submaps.grid import GridStore
 from ggslam.system.atomic import write_bytes
 from ggslam.system.foreign import read_foreign
@@ -28,6 +28,8 @@ from ggslam.system.foreign import read_foreign
 OBJECTS_FILE = "objects.json"
 VERSION = 1
 Kind = Literal["added", "removed", "moved", "look", "unseen"]
+_Coordinate = Annotated[int, pydantic.Field(ge=-LIMIT, le=LIMIT)]
+_Cell = tuple[_Coordinate, _Coordinate, _Coordinate]
 _Row = tuple[Number, Number, Number, Number]
 FiniteMatrix = tuple[_Row, _Row, _Row, _Row]
 
@@ -50,7 +52,7 @@ class StoredObject:
     name: str | None
     box: OrientedBox
     gaussians: Annotated[int, pydantic.Field(ge=0)]
-    cells: list[CellKey]
+    cells: list[_Cell]
     first_seen: str
     last_seen: str
     gone_since: str | None = None
@@ -79,7 +81,7 @@ class ObjectEvent:
     kind: Kind
     id: int | None
     name: str | None
-    cells: list[CellKey] = field(default_factory=list)
+    cells: list[_Cell] = field(default_factory=list)
     middle: Vector | None = None
     T_new_old: FiniteMatrix | None = None
     turn_known: bool | None = None

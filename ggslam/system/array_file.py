@@ -22,6 +22,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.system.atomic import write_failure
+from ggslam.system.foreign import open_foreign
 
 _MAGIC = b"ggstate1"
 _ALIGNMENT = 64
@@ -139,13 +140,11 @@ def read_array_file(path: Path, expected: WrittenFile | None = None) -> tuple[An
         FormatError: it is missing, damaged or another one than expected.
     """
     try:
-        with path.open("rb", buffering=0) as file:
+        with open_foreign(path) as file:
             size = os.fstat(file.fileno()).st_size
             if expected is not None and size != expected.size:
                 raise ValueError(f"expected {expected.size} bytes, found {size}")
             return _read(file, size, expected)
-    except FileNotFoundError:
-        raise FormatError(f"{path}: file is missing") from None
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError, MemoryError) as error:
         raise FormatError(f"{path}: damaged: {error}") from None
 

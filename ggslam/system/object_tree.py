@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import FormatError
+from ggslam.system.typed_values import Example, declared_types, problem
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,8 @@ class Rule:
         take: gets that for an object to be filled, instead of its attributes being set.
         after: called for every object when all of them are there.
         checked: made by calling the class with its fields, which checks them; for settings.
+        check: raises ValueError if the attributes of an object do not fit together; called when all objects are there
+            and their attributes are of the declared types, before `after`.
     """
 
     made: frozenset[str] = frozenset()
@@ -47,6 +50,7 @@ class Rule:
     take: Callable[[Any, dict[str, Any]], None] | None = None
     after: Callable[[Any], None] | None = None
     checked: bool = False
+    check: Callable[[Any], None] | None = None
 
 
 Rules = Mapping[type, Rule]
@@ -98,15 +102,20 @@ def restore(tree: Any, rules: Rules, arrays: Sequence[np.ndarray], kept: Kept | 
     """What `describe` was given; if `into` is of its class, that object is filled.
 
     Raises:
-        FormatError: the tree does not fit the rules.
+        FormatError: the tree does not fit the rules, or an attribute is not of its declared type (of attributes that
+            are not declared: of the type that the object to be filled has there).
     """
     restorer = _Restorer(rules, arrays, kept)
     try:
         value = restorer.restore(tree, into)
+        if into is not None and value is not into:
+            raise ValueError(f"expected {type(into).__name__}, found {type(value).__name__}")
+        restorer.check()
         for call in restorer.pending:
             call()
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, RuntimeError) as error:
-        raise FormatError(f"not a state of this program: {error!r}") from error
+        reason = error if type(error) is ValueError else repr(error)
+        raise FormatError(f"not a state of this program: {reason}") from error
     return value
 
 
@@ -210,6 +219,17 @@ class _Restorer:
         self._rules, self._arrays, self._kept = rules, arrays, kept
         self._classes = class_names(rules)
         self._known: list[Any] = []
+        self._filled: list[tuple[Any, dict[str, Example | None]]] = []
+        """Objects, and what stood in their attributes before."""
+
+    def check(self) -> None:
+        """Raises ValueError if an object's attributes are not what its class declares, or do not fit together."""
+        for value, before in self._filled:
+            _check_attributes(value, before, self._rules[type(value)])
+        for value, _ in self._filled:
+            check = self._rules[type(value)].check
+            if check is not None:
+                check(value)
 
     def restore(self, tree: Any, there: Any) -> Any:
         if isinstance(tree, list):
@@ -285,13 +305,17 @@ class _Restorer:
         if rule.checked:
             number = len(self._known)
             self._known.append(None)
-            self._known[number] = kind(**{k: self.restore(v, None) for k, v in attributes.items()})
-            return self._known[number]
+            made = self._known[number] = kind(**{k: self.restore(v, None) for k, v in attributes.items()})
+            self._filled.append((made, {}))
+            return made
         fill = type(there) is kind
         value = there if fill else object.__new__(kind)
         self._known.append(value)
         if not fill and rule.made - attributes.keys() - set(_class_defaults(kind)):
             raise ValueError(f"{name}: there is none to fill")
+        if fill and rule.save is None and (missing := sorted(vars(value).keys() - rule.made - attributes.keys())):
+            raise ValueError(f"{kind.__name__}: {missing[0]} is missing")
+        self._filled.append((value, {name: Example.of(old) for name, old in vars(value).items()} if fill else {}))
         found = {}
         for attribute, tree in attributes.items():
             if attribute in rule.made:
@@ -313,7 +337,9 @@ class _Restorer:
         for file, number in content:
             trees, arrays = self._kept.part(file, number)
             for tree in trees:
-                value.append(_Restorer(self._rules, arrays, None).restore(tree, None))
+                restorer = _Restorer(self._rules, arrays, None)
+                value.append(restorer.restore(tree, None))
+                self._filled += restorer._filled
         self._kept.grew(value, content)
         return value
 
@@ -327,6 +353,28 @@ class _Restorer:
         else:
             array = self._arrays[content]
         return array if strides is None else _with_strides(array, strides)
+
+
+def _check_attributes(value: Any, before: Mapping[str, Example | None], rule: Rule) -> None:
+    """Raises ValueError if one is missing, unknown, or of another type than it must be."""
+    kind: type = type(value)
+    hints, name = declared_types(kind), kind.__name__
+    there = vars(value).keys() - rule.made
+    if rule.take is None:
+        expected = (before.keys() or hints.keys()) - rule.made
+        if missing := sorted(expected - there):
+            raise ValueError(f"{name}: {missing[0]} is missing")
+        if strange := sorted(there - hints.keys() - before.keys()):
+            raise ValueError(f"{name}: has no {strange[0]}")
+    lengths: dict[str, int] = {}
+    for attribute in sorted(there):
+        example = before.get(attribute)
+        if attribute in hints:
+            found = problem(getattr(value, attribute), hints[attribute], lengths)
+        else:
+            found = None if example is None else example.problem(getattr(value, attribute))
+        if found:
+            raise ValueError(f"{name}.{attribute}: {found}")
 
 
 def _class_defaults(kind: type) -> dict[str, Any]:

@@ -39,6 +39,8 @@ class GicpTracker(Tracker):
         engine: where points are extracted and aligned; None: on the threads of `context`.
     """
 
+    _median_depth: float | None
+
     def __init__(
         self,
         camera: Camera,
@@ -49,7 +51,7 @@ class GicpTracker(Tracker):
     ) -> None:
         super().__init__(TrackerState.begin(camera, settings, context, T_world_camera))
         self._given_engine = engine
-        self._median_depth: float | None = None
+        self._median_depth = None
 
     @classmethod
     def with_state(cls, state: TrackerState) -> GicpTracker:

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from ggslam.scene.poses import separation
+from ggslam.system.array_forms import Pose
 from ggslam.system.settings import setting, settings_class
 
 
@@ -62,9 +63,12 @@ class KeyframePolicy:
         settings: limits.
     """
 
+    kind: KeyframeKind | None
+    _T_world_camera: Pose
+
     def __init__(self, settings: KeyframeSettings | None = None) -> None:
         self.settings = settings or KeyframeSettings()
-        self.kind: KeyframeKind | None = None
+        self.kind = None
         """Of the last keyframe."""
         self._frame_index = 0
         self._T_world_camera = np.eye(4)

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from ggslam.features.orb import FeatureView
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, orthonormalize, separation
+from ggslam.system.array_forms import Form, Pose
 from ggslam.tracking.image_turn import image_turn, small_image
 from ggslam.tracking.photometric import PhotometricReference
 from ggslam.tracking.points import PointSource
@@ -40,16 +42,16 @@ class CameraMotion:
         turned: float64 [4, 4], by how the image shifted, from the last located frame to the one at hand.
     """
 
-    T_world_camera: np.ndarray
-    velocity: np.ndarray = field(default_factory=lambda: np.eye(4))
+    T_world_camera: Pose
+    velocity: Pose = field(default_factory=lambda: np.eye(4))
     lost: bool = False
     views: list[FeatureView] = field(default_factory=list)
     reference_view: FeatureView | None = None
     reference: PhotometricReference | None = None
     greys: list[float] = field(default_factory=list)
     wary: int = 0
-    small: np.ndarray | None = None
-    turned: np.ndarray = field(default_factory=lambda: np.eye(4))
+    small: Annotated[np.ndarray, Form("f4", "h", "w")] | None = None
+    turned: Pose = field(default_factory=lambda: np.eye(4))
 
     def watch(self, color: np.ndarray, camera: Camera) -> None:
         """Sees the next frame's colour uint8 [H, W, 3]: `turned`."""

@@ -59,9 +59,9 @@ def observability(
     The information (about the camera centre) is taken about the points' centroid, where turning and shifting hardly
     mix; angles are measured by the motion they mean at the points' root mean square distance from it, and each
     point's information by its own noise. An eigenvalue is then the mean of (normal . motion)^2: the share of points
-    that see the direction.
+    that see the direction. Points that are no numbers see none.
     """
-    if not spread.total:
+    if not spread.total or not np.isfinite([spread.total, spread.radius, *spread.centroid, *information.ravel()]).all():
         return np.zeros(6), np.eye(6)
     about = about_point(information, -R_world_camera @ spread.centroid)
     scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(spread.radius, 1e-3)] * 3)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ggslam.interface.arrays import address
 from ggslam.interface.core import tracking as structures
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
+from ggslam.system.array_forms import Form, Points32
 from ggslam.tracking.settings import UNBOUNDED, DepthNoise, PointSettings
 
 THICKNESS = 0.01
@@ -51,12 +52,12 @@ class FramePoints:
             camera saw.
     """
 
-    points: np.ndarray
-    normals: np.ndarray
-    covariances: np.ndarray
-    pixels: np.ndarray
-    weights: np.ndarray
-    depths: np.ndarray | None = None
+    points: Points32
+    normals: Points32
+    covariances: Annotated[np.ndarray, Form("f4", "n", 6, finite=True)]
+    pixels: Annotated[np.ndarray, Form("i4", "n", 2)]
+    weights: Annotated[np.ndarray, Form("f4", "n", finite=True)]
+    depths: Annotated[np.ndarray, Form("f4", "n", finite=True)] | None = None
 
     def __len__(self) -> int:
         return len(self.points)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ggslam.system.array_forms import DepthImage, Pose
 from ggslam.tracking.settings import DepthNoise
 
 WIDTH = 160
@@ -44,8 +45,8 @@ MOSTLY = 0.5
 class SmallFrame:
     """A frame at reduced size: grey values float32 [h, w] of 0 to 255, and depth float32 [h, w], metres, 0: unknown."""
 
-    grey: np.ndarray
-    depth: np.ndarray
+    grey: DepthImage
+    depth: DepthImage
 
     @staticmethod
     def of(color: np.ndarray, depth: np.ndarray) -> SmallFrame:
@@ -66,7 +67,7 @@ class StillCamera:
     """
 
     anchor: SmallFrame | None = None
-    T_world_camera: np.ndarray | None = None
+    T_world_camera: Pose | None = None
     frames: int = 0
 
     def holds(self, small: SmallFrame, noise: DepthNoise) -> bool:

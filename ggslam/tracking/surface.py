@@ -16,11 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.errors import FormatError
 from ggslam.formats.array_archive import ArrayArchive, Arrays
 from ggslam.geometry.fixed_to_camera import is_in_image_part
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
+from ggslam.system.array_forms import Form, Pose, PoseForm, check_arrays, check_indices
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import TargetSettings
@@ -31,8 +33,20 @@ FLATNESS = 0.1
 _OPACITY_LOGIT = 3.0
 
 
+_SAVED = {
+    "counts": Form("int", "n", below=2**31 - 1), "reach": Form("float", "n", finite=True),
+    "points": Form("i2", "points", 3), "normals": Form("i1", "points", 3), "poses": PoseForm("float", "n"),
+}  # fmt: skip
+
+
 class _Part:
     """One keyframe's points and normals in its camera's frame, float32 [n, 3]; in an archive if there is one."""
+
+    _name: str
+    _archive: ArrayArchive | None
+    T_world_camera: Pose
+    count: int
+    _arrays: Arrays
 
     def __init__(
         self, number: int, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray,
@@ -41,10 +55,19 @@ class _Part:
         self._name, self._archive = f"surface{number:06d}", archive
         self.T_world_camera = T_world_camera
         self.count = len(points)
-        self._arrays: Arrays = {"points": points, "normals": normals}
+        self._arrays = {"points": points, "normals": normals}
         if archive is not None:
             archive.put(self._name, self._arrays)
             self._arrays = {}
+
+    def check(self) -> None:
+        """Raises FormatError if this is not `count` points with normals in memory: it may come from a file."""
+        if self._archive is not None or set(self._arrays) != {"points", "normals"}:
+            raise FormatError("points of a keyframe: expected points and normals")
+        form = Form("f4", self.count, 3, finite=True)
+        for name, array in self._arrays.items():
+            if found := form.check(array, {}):
+                raise FormatError(f"{name} of a keyframe: {found}")
 
     @property
     def points(self) -> np.ndarray:
@@ -84,24 +107,33 @@ class MeasuredSurface:
         archive: keeps the keyframes' points, in memory or not; None: they stay in memory.
     """
 
+    _parts: list[_Part]
+    active: set[int]
+    _joined: list[list[int]]
+
     def __init__(self, settings: TargetSettings, context: NativeContext, archive: ArrayArchive | None = None) -> None:
         self.settings = settings
         """May be changed until the first keyframe is in."""
         self._context, self._archive = context, archive
-        self._parts: list[_Part] = []
+        self._parts = []
         self.finish = True
         """False: the targets' voxels are left without shapes; see `GicpTarget.from_arrays`."""
-        self.active: set[int] = set()
+        self.active = set()
         """Numbers of the keyframes that take part."""
         self.target: GicpTarget | None = None
         """What has been gathered so far; None before the first keyframe. Each change makes a new one."""
-        self._joined: list[list[int]] = []
+        self._joined = []
         """The keyframes of the target, in the groups in which they joined it."""
         self._helper: ThreadPoolExecutor | None = None
         self._begun: _Begun | None = None
 
     def __len__(self) -> int:
         return len(self._parts)
+
+    def check(self) -> None:
+        """Raises FormatError if it names keyframes that it does not have: it may come from a file."""
+        check_indices("keyframes of the surface", self.active, len(self))
+        check_indices("keyframes of the surface", (number for group in self._joined for number in group), len(self))
 
     def begin(self, points: PointSource, T_world_camera: np.ndarray) -> None:
         """Starts in another thread what `add` will have to do, for a caller that has other things to do until then."""
@@ -229,11 +261,12 @@ class MeasuredSurface:
         """Takes over what `to_arrays` gave, all of it active.
 
         Raises:
-            ValueError: arrays that do not fit together.
+            FormatError: arrays that do not fit together.
         """
-        counts, poses = arrays["counts"], arrays["poses"]
-        if counts.sum() != len(arrays["points"]) or len(arrays["points"]) != len(arrays["normals"]):
-            raise ValueError("points and normals do not fit their numbers")
+        check_arrays(arrays, _SAVED, "surface")
+        counts, poses = arrays["counts"].astype(np.int64), arrays["poses"]
+        if counts.sum() != len(arrays["points"]):
+            raise FormatError("surface: points do not fit their numbers")
         ends = np.cumsum(counts)[:-1]
         for q, n, r, T in zip(
             np.split(arrays["points"], ends), np.split(arrays["normals"], ends), arrays["reach"], poses, strict=True

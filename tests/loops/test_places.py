@@ -81,9 +81,12 @@ def test_what_is_saved_finds_the_same(index: PlaceIndex) -> None:
 def test_damaged_arrays_are_told(index: PlaceIndex) -> None:
     arrays = index.to_arrays()
     for change, message in (
-        ({"points": arrays["points"][:-1]}, "'points' has .* rows, expected"),
-        ({"codes": arrays["codes"][:, :-1]}, "'codes' is"),
-        ({"descriptors": arrays["descriptors"][:, 0]}, "'descriptors' is"),
+        ({"points": arrays["points"][:-1]}, "'points': expected .* for landmarks, found"),
+        ({"codes": arrays["codes"][:, :-1]}, "'codes': expected uint8"),
+        ({"descriptors": arrays["descriptors"][:, 0]}, "'descriptors': expected uint8"),
+        ({"counts": -arrays["counts"]}, "'counts': expected 0 to"),
+        ({"numbers": 0 * arrays["numbers"]}, "a keyframe has two"),
+        ({"points": arrays["points"] * np.float32(np.inf)}, "'points': expected finite numbers"),
     ):
         with pytest.raises(FormatError, match=message):
             PlaceIndex.from_arrays(CAMERA, {**arrays, **change})

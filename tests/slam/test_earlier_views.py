@@ -94,7 +94,7 @@ def test_counts_of_another_size_are_refused() -> None:
     view = next(iter(first.earlier_views.views.values()))
     view.through = view.through[:-1]
     tree, arrays = describe_state(first)
-    with pytest.raises(FormatError, match="views of the map that the run began with"):
+    with pytest.raises(FormatError, match="EarlierView.through: expected int16"):
         restore_state(again, tree, [array.copy() for array in arrays])
 
 

@@ -166,7 +166,7 @@ def test_a_state_is_data_and_must_fit(room: Path) -> None:
     refused({"o": [name, {**attributes, "poses": {"r": 10**6}}]}, "list index")
     refused(tree, "list index", [])
     wide = [np.zeros((2, 2, 3), np.uint8) if array.shape == (120, 160, 3) else array for array in arrays]
-    refused(tree, "not of this recording", wide)
+    refused(tree, "expected .* for h, found", wide)
     short = [array[:-1] if len(array) == slam.map.count else array for array in arrays]
     refused(tree, "Gaussians instead of", short)
     with pytest.raises(ConfigError, match="memory is limited"):

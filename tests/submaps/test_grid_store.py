@@ -314,10 +314,10 @@ def test_other_versions_and_grids(folder: Path) -> None:
     connection.commit()
     with pytest.raises(FormatError, match="damaged settings"):
         GridStore.open(folder)
-    connection.execute("PRAGMA user_version = 2")
+    connection.execute("PRAGMA user_version = 3")
     connection.commit()
     connection.close()
-    with pytest.raises(FormatError, match="format version 2, this program reads version 1"):
+    with pytest.raises(FormatError, match="format version 3, this program reads versions up to 2"):
         GridStore.open(folder)
 
 

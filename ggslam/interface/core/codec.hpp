@@ -165,9 +165,9 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_decode_details(void* context, void* slice
 // Brings values [points, components] from the order of the stream, in which raw attributes are, into coding order.
 GGSLAM_EXPORT std::int64_t ggslam_gpcc_sort_values(void* slice, std::int32_t components, std::int32_t* values);
 
-// Y, Cb, Cr [count, 3] of the colours rgb[order[i]].
-GGSLAM_EXPORT int ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
-                                       std::uint32_t count, std::int32_t* out);
+// Y, Cb, Cr [count, 3] of the colours rgb[order[i]], rgb [colors, 3].
+GGSLAM_EXPORT int ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, std::uint32_t colors,
+                                       const std::uint32_t* order, std::uint32_t count, std::int32_t* out);
 GGSLAM_EXPORT int ggslam_gpcc_from_ycbcr(void* context, const std::int32_t* components, std::uint32_t count,
                                          std::uint8_t* rgb);
 

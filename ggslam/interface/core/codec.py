@@ -9,7 +9,7 @@ from enum import IntEnum
 from typing import Any
 
 HEADER = "core/codec.hpp"
-HEADER_SHA256 = "c17ae1ef05e7d4e214ca5b2d110018cf08879f0d29193efa254d888196f8ddbc"
+HEADER_SHA256 = "2c1c7cbcced73fc9a750c52a8241e7e63a4bd932d0f2f94669e16e7f4f6fbf2e"
 
 
 class Status(IntEnum):
@@ -124,7 +124,7 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
         c_void_p, c_void_p, POINTER(DetailSettings), c_void_p, c_size_t, c_void_p,
     ]),
     "ggslam_gpcc_sort_values": (c_int64, [c_void_p, c_int32, c_void_p]),
-    "ggslam_gpcc_to_ycbcr": (c_int, [c_void_p, c_void_p, c_void_p, c_uint32, c_void_p]),
+    "ggslam_gpcc_to_ycbcr": (c_int, [c_void_p, c_void_p, c_uint32, c_void_p, c_uint32, c_void_p]),
     "ggslam_gpcc_from_ycbcr": (c_int, [c_void_p, c_void_p, c_uint32, c_void_p]),
     "ggslam_gpcc_on_grid": (c_int, [POINTER(Points), POINTER(Grid), c_void_p]),
     "ggslam_gpcc_along_axis": (c_int, [POINTER(Points), POINTER(Grid), c_int32, c_void_p]),

@@ -129,9 +129,9 @@ GGSLAM_EXPORT int ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* o
 GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int32_t* pixels, float min_weight,
                                                 const ggslam::PixelTerms* out);
 
-// out [P, channels] = sum of weight times feature. Returns 0.
+// out [P, channels] = sum of weight times feature [gaussians, channels]. Returns 0.
 GGSLAM_EXPORT int ggslam_terms_blend(void* context, const ggslam::PixelTerms* terms, const float* features,
-                                     int channels, float* out);
+                                     std::int64_t gaussians, int channels, float* out);
 
 // Adam on the features of the Gaussians in `terms`, their gradient being the sum of weight times gradient [P, channels].
 // Returns 0 or 1 (out of memory).

@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_float, c_int, c_int32, c_int64, c_void_
 from typing import Any
 
 HEADER = "core/rendering.hpp"
-HEADER_SHA256 = "1f1becba7c365515a7c27c953b73379c097caeba0b0eb39b0d019e498837eec1"
+HEADER_SHA256 = "ec99881f6f1951d61eba4c3558f3ecedb0e46127e47e6020a5a3cb4b1fc83b7e"
 
 
 class GaussianArrays(Structure):
@@ -127,7 +127,7 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     ]),
     "ggslam_rasterizer_statistics": (c_int, [c_void_p, c_void_p]),
     "ggslam_rasterizer_pixel_terms": (c_int, [c_void_p, c_void_p, c_float, POINTER(PixelTerms)]),
-    "ggslam_terms_blend": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, c_int, c_void_p]),
+    "ggslam_terms_blend": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, c_int64, c_int, c_void_p]),
     "ggslam_terms_step": (c_int, [c_void_p, POINTER(PixelTerms), c_void_p, POINTER(FeatureAdam)]),
     "ggslam_terms_vote": (c_int, [
         c_void_p, POINTER(PixelTerms), c_void_p, c_void_p, c_int64, c_int, c_void_p, c_void_p,

@@ -19,7 +19,7 @@ from ggslam.runs.records.mark import FileRecord
 from ggslam.runs.records.visit import VisitRecord
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.packed_arrays import unpack_bytes
-from ggslam.submaps.cell_keys import CellKey
+from ggslam.submaps.cell_keys import CellKey, is_coordinate
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.coming_store import coming_store
 from ggslam.submaps.grid import GridStore
@@ -29,7 +29,7 @@ from ggslam.system.zip_files import ZIP_DAMAGE, open_zip
 
 SUFFIX = ".ggc"
 HEAD, OBJECTS, VISIT = "cells.json", "objects.json.xz", "visits/{}.json.xz"
-_MEMBER = re.compile(r"cells/(-?\d+)_(-?\d+)_(-?\d+)\.bin")
+_MEMBER = re.compile(r"cells/(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})\.bin", re.ASCII)
 _CELLS_AT_ONCE = 64
 _DAMAGE = (*ZIP_DAMAGE, KeyError)
 
@@ -130,7 +130,10 @@ def key_of(name: str, path: Path) -> CellKey:
     match = _MEMBER.fullmatch(name)
     if match is None:
         raise FormatError(f"{path}: {name[:80]!r} is no cell")
-    return int(match[1]), int(match[2]), int(match[3])
+    x, y, z = (int(number) for number in match.groups())
+    if not all(is_coordinate(number) for number in (x, y, z)):
+        raise FormatError(f"{path}: {name!r} lies beyond all cells")
+    return x, y, z
 
 
 def decode_store(path: Path, out: Path, threads: int | None = None) -> int:

@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
+from ggslam.errors import FormatError
 from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
 from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
+from ggslam.system.array_forms import Form
 
 
 class CpuClassTable:
@@ -17,12 +21,23 @@ class CpuClassTable:
         channels: length of an identity vector.
     """
 
+    _rows: Annotated[np.ndarray, Form("f4", "rows", None, finite=True)]
+    _moments: Annotated[np.ndarray, Form("f4", 2, "rows", None, finite=True)]
+
     def __init__(self, rng: np.random.Generator, channels: int = IDENTITY_CHANNELS) -> None:
         self._rng, self._channels = rng, channels
         self._rows = np.zeros((FIRST_CLASSES, channels + 1), np.float32)  # weights, then the bias
         self._moments = np.zeros((2, FIRST_CLASSES, channels + 1), np.float32)
         self._numbers = ClassNumbers()
         self._steps = 0
+
+    def check(self) -> None:
+        """Raises FormatError if it has not a row for each class: it may come from a file."""
+        width = self._channels + 1
+        if self.count > len(self._rows) or self._rows.shape[1] != width or self._moments.shape[2] != width:
+            raise FormatError(f"classifier: expected {self.count} rows of {width} numbers")
+        if self._steps < 0:
+            raise FormatError(f"classifier: {self._steps} steps")
 
     @property
     def count(self) -> int:

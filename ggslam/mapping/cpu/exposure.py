@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
 from ggslam.errors import RenderError
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.rendering.exposure import identity_exposure
+from ggslam.system.array_forms import Form
 
 _IDENTITY = identity_exposure()
 
@@ -20,6 +23,15 @@ class ExposureAdam:
     what was measured when the keyframe was made, from where it starts: a step is at most 0.002 long and a keyframe is
     trained on some ten times, so that a change by half would never be reached. `measured` waits to become the anchor.
     """
+
+    settings: ExposureSettings
+    beta1: float
+    beta2: float
+    anchor: Annotated[np.ndarray, Form("f8", 3, 2, finite=True)]
+    measured: Annotated[np.ndarray, Form("f8", 3, 2, finite=True)]
+    first: Annotated[np.ndarray, Form("f8", 3, 2, finite=True)]
+    second: Annotated[np.ndarray, Form("f8", 3, 2, finite=True)]
+    steps: int
 
     def __init__(self, settings: ExposureSettings, beta1: float = 0.9, beta2: float = 0.99) -> None:
         self.settings, self.beta1, self.beta2 = settings, beta1, beta2

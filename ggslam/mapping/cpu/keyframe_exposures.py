@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ggslam.errors import FormatError
 from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.settings import ExposureSettings
@@ -47,13 +48,23 @@ class KeyframeExposures:
         found_lit: whether a keyframe has shown colours; those before are blind.
     """
 
+    optimizers: list[ExposureAdam]
+    known: list[bool]
+    blind: list[bool]
+
     def __init__(self, settings: ExposureSettings) -> None:
         self.settings = settings
-        self.optimizers: list[ExposureAdam] = []
+        self.optimizers = []
         self.changed = False
-        self.known: list[bool] = []
-        self.blind: list[bool] = []
+        self.known = []
+        self.blind = []
         self.found_lit = False
+
+    def check(self, count: int) -> None:
+        """Raises FormatError if these are not of so many keyframes: they may come from a file."""
+        counts = [len(self.optimizers), len(self.known), len(self.blind)]
+        if counts != [count] * 3:
+            raise FormatError(f"exposures: expected those of {count} keyframes, found {counts}")
 
     def adopt(self, count: int) -> None:
         """Starts with so many keyframes of an earlier run, whose exposures are what they are."""

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import torch
 
+from ggslam.errors import FormatError
 from ggslam.mapping.color_changes import scale_colors, take_colors
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
@@ -28,6 +29,7 @@ from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.array_forms import check_indices
 
 FEW_LOOKS = 8
 """Where fewer keyframes look for what surfaces hide, each looks with all its pixels; else with a quarter of them by
@@ -50,6 +52,21 @@ class CpuMapper(Mapper):
     identity: CpuIdentityLearner | None
     _rasterizer: CpuRasterizer
 
+    _pose_optimizers: list[PoseAdam]
+
+    def check(self) -> None:
+        """Raises FormatError if its parts are not of the same keyframes and Gaussians: it may come from a file."""
+        count = len(self.keyframes)
+        check_indices("keyframes that were left out", self.left_out, count)
+        if len(self._pose_optimizers) != count:
+            raise FormatError(f"optimisers of poses: expected {count}, found {len(self._pose_optimizers)}")
+        self._exposures.check(count)
+        if self.identity is not None:
+            self.identity.check(self.keyframes)
+        if not self._mean.fits(self.map):
+            raise FormatError("the mean of the map: not of its Gaussians")
+        self.map.check(count)
+
     def __init__(
         self,
         gaussians: GaussianMap,
@@ -63,7 +80,7 @@ class CpuMapper(Mapper):
         self._last_psnr = float("nan")
         self._rasterizer = CpuRasterizer(context=context)
         self._loss = CpuImageLoss(context)
-        self._pose_optimizers: list[PoseAdam] = []
+        self._pose_optimizers = []
         self._exposures = KeyframeExposures(settings.exposure)
 
     @property

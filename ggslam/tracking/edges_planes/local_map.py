@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ggslam.scene.poses import inverse, orthonormalize, separation
+from ggslam.system.array_forms import Pose
 from ggslam.tracking.edges_planes.alignment import LAST_STEP, FeatureAligner, FeatureAlignment, FrameClock
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
@@ -24,13 +25,16 @@ class LocalFeatureMap:
         settings: see `FeatureTrackerSettings`.
     """
 
+    _T_map_added: Pose | None
+    _T_world_map: Pose
+
     def __init__(self, settings: FeatureTrackerSettings) -> None:
         self.settings = settings
         self.clock = FrameClock(settings.align.budget_ms)
         self.features = FeatureMap(settings.map, settings.device)
         self._aligner = FeatureAligner(self.features, settings.align, self.clock)
         self._T_world_map = np.eye(4)
-        self._T_map_added: np.ndarray | None = None
+        self._T_map_added = None
         """Where the newest scan in the map was taken."""
 
     @property

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ggslam.errors import FormatError
 from ggslam.tracking.edges_planes.settings import FeatureMapSettings
 
 _OFFSET = 1 << 19
@@ -65,6 +66,12 @@ class FeatureMap:
         self._corners = torch.tensor(corners, device=device)
         self._ones = torch.ones(3, device=device)
         self._isotropic = torch.tensor([1.0, 0.0, 0.0, 1.0, 0.0, 1.0], device=device)
+
+    def check(self) -> None:
+        """Raises FormatError if the table has not its number of slots: it may come from a file."""
+        tables = (self._keys, self._weight, self._surface, self._scatter)
+        if any(len(table) != self.settings.slots for table in tables):
+            raise FormatError(f"map of features: expected {self.settings.slots} slots")
 
     def __len__(self) -> int:
         """Voxels held, counting those that are neither plane nor edge yet."""

@@ -302,9 +302,12 @@ GGSLAM_EXPORT std::int64_t ggslam_gpcc_sort_values(void* slice, std::int32_t com
   return gpcc::kOk;
 } GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, const std::uint32_t* order,
-                                       std::uint32_t count, std::int32_t* out) try {
-  check_array("rgb", rgb, count), check_array("order", order, count), check_array("out", out, count);
+GGSLAM_EXPORT int ggslam_gpcc_to_ycbcr(void* context, const std::uint8_t* rgb, std::uint32_t colors,
+                                       const std::uint32_t* order, std::uint32_t count, std::int32_t* out) try {
+  check_array("rgb", rgb, colors), check_array("order", order, count), check_array("out", out, count);
+  std::uint32_t last = 0;
+  for (std::uint32_t i = 0; i < count; ++i) last = std::max(last, order[i]);
+  if (count > 0 && last >= colors) refuse("order: expected numbers below %u, found %u", colors, last);
   GGSLAM_DISPATCH(gpcc::isa_of(context), colours_to_ycbcr)(rgb, order, count, out);
   return 0;
 } GGSLAM_CATCH_ALL

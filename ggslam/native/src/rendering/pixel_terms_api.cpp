@@ -184,6 +184,7 @@ GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int
   const Rasterizer& r = object_of<Rasterizer>(rasterizer);
   const std::int64_t count = check_terms(out).pixels, size = std::int64_t{r.view.width} * r.view.height;
   check_array("pixels", pixels, count);
+  if (!r.ready) refuse("rasterizer: there is no picture yet");
   for (std::int64_t i = 0; i < count; ++i)
     if (pixels[i] < 0 || pixels[i] >= size)
       refuse("pixels: expected those of the last picture, below %lld, found %d", static_cast<long long>(size), pixels[i]);
@@ -196,12 +197,12 @@ GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int
   return 0;
 } GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int ggslam_terms_blend(void* context, const PixelTerms* terms, const float* features, int channels,
-                                     float* out) try {
+GGSLAM_EXPORT int ggslam_terms_blend(void* context, const PixelTerms* terms, const float* features,
+                                     std::int64_t gaussians, int channels, float* out) try {
   Context& c = object_of<Context>(context);
-  check_counts(check_terms(terms));
+  check_gaussians(check_terms(terms), gaussians);
   check_range("channels", channels, 0, kMostChannels);
-  check_array("features", features, 1), check_array("out", out, terms->pixels);
+  check_array("features", features, gaussians), check_array("out", out, terms->pixels);
   const auto blend = GGSLAM_DISPATCH(c.isa, blend_terms);
   c.pool.parallel_for(terms->pixels, 256, [&](std::size_t begin, std::size_t end, int) {
     blend(*terms, features, channels, static_cast<std::int64_t>(begin), static_cast<std::int64_t>(end), out);

@@ -30,6 +30,27 @@ void check_input(const GaussianArrays& g, const CameraView& view, const RenderTa
   check_array("features", g.features, g.count), check_array("rendered features", targets.features, 1);
 }
 
+void check_adam(const Rasterizer& r, const AdamArguments& adam) {
+  const std::int64_t count = r.gaussians.count;
+  const AdamArrays groups[] = {adam.means, adam.quaternions, adam.log_scales, adam.opacity_logits, adam.sh, adam.features};
+  for (int k = 0; k < (r.padded_features > 0 ? 6 : 5); ++k)
+    for (const void* array : {groups[k].parameters, groups[k].first_moments, groups[k].second_moments})
+      check_array("parameters and moments", array, count);
+  check_array("updates", adam.updates, count), check_array("schedule", adam.schedule, 1);
+  check_range("schedule_rows", adam.schedule_rows, 1, 1 << 30);
+}
+
+void check_backward(const Rasterizer& r, const GaussianGradients& out, const AdamArguments* adam) {
+  if (!r.ready) refuse("rasterizer: there is no picture to differentiate");
+  if (r.as_3dgs) refuse("rasterizer: pictures by the rules of 3DGS have no gradients");
+  check_array("twist", out.twist, 6), check_array("touched", out.touched, r.gaussians.count);
+  if (adam != nullptr) return check_adam(r, *adam);
+  const void* const arrays[] = {out.quaternions, out.log_scales, out.opacity_logits, out.sh};
+  for (const void* array : arrays)
+    if ((array == nullptr) != (out.means == nullptr)) refuse("gradients: expected all arrays or none");
+  if (out.means != nullptr && r.padded_features > 0) check_array("gradients of features", out.features, r.gaussians.count);
+}
+
 void prepare(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& view) {
   r.gaussians = gaussians;
   r.view = view;
@@ -148,13 +169,17 @@ GGSLAM_EXPORT int ggslam_rasterizer_forward(void* rasterizer, const GaussianArra
   Rasterizer& r = object_of<Rasterizer>(rasterizer);
   check_input(object_of<GaussianArrays>(gaussians), object_of<CameraView>(view), object_of<RenderTargets>(targets));
   r.as_3dgs = as_3dgs != 0;
-  return forward(r, *gaussians, *view, *targets);
+  r.ready = false;
+  const Status status = forward(r, *gaussians, *view, *targets);
+  r.ready = status == kDone;
+  return status;
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_rasterizer_backward(void* rasterizer, const ImageGradients* image_gradients,
                                              const GaussianGradients* gradients, const AdamArguments* adam) try {
-  check_array("twist", object_of<GaussianGradients>(gradients).twist, 6);
-  return backward(object_of<Rasterizer>(rasterizer), object_of<ImageGradients>(image_gradients), *gradients, adam);
+  Rasterizer& r = object_of<Rasterizer>(rasterizer);
+  check_backward(r, object_of<GaussianGradients>(gradients), adam);
+  return backward(r, object_of<ImageGradients>(image_gradients), *gradients, adam);
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* out) try {

@@ -10,8 +10,10 @@
 // rasterizer.cpp runs them over blocks of Gaussians and over tiles. Blocks and tiles write only to places of their own
 // and every sum has a fixed order, so results do not depend on the number of threads.
 #pragma once
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 
 #include "common/buffer.hpp"
 #include "common/context.hpp"
@@ -39,6 +41,16 @@ constexpr int kChunk = 64;                      // splats that a tile composites
 // schedule [rows][8]: for a Gaussian at its u-th update, row min(u, rows) - 1 holds the step sizes (learning rate over
 // 1 - beta1^u) of the seven groups in the order below, then 1 / sqrt(1 - beta2^u).
 enum AdamGroup { kMeans, kQuaternions, kLogScales, kOpacityLogits, kShConstant, kShRest, kFeatures, kCorrection };
+
+// One update more, as far as 32 bits count; a negative counter, which may come from a file, begins anew.
+inline std::int32_t next_update(std::int32_t updates) {
+  return updates < 0 ? 1 : updates + (updates < std::numeric_limits<std::int32_t>::max());
+}
+
+// Row of a schedule for a Gaussian at its `updates`-th update.
+inline std::size_t schedule_row(std::int32_t updates, std::int32_t rows) {
+  return static_cast<std::size_t>(std::clamp(updates, 1, rows) - 1);
+}
 
 // --- what the stages hand to one another -----------------------------------------------------------------------------
 
@@ -95,6 +107,7 @@ struct Rasterizer {
   GaussianArrays gaussians{};
   CameraView view{};
   bool as_3dgs = false;     // the last forward was by the rules of 3DGS
+  bool ready = false;       // the last forward went well: its lists may be looked at
   int padded_features = 0;  // rendered feature channels, rounded up to a multiple of 4
   TileLayout tile{};
   int tiles_x = 0, tiles_y = 0;

@@ -25,6 +25,7 @@ constexpr int kLanes = 4;
 
 typedef float Float __attribute__((vector_size(4 * kLanes), aligned(4 * kLanes), may_alias));
 typedef std::int32_t Int __attribute__((vector_size(4 * kLanes), aligned(4 * kLanes), may_alias));
+typedef std::uint32_t Bits __attribute__((vector_size(4 * kLanes), aligned(4 * kLanes), may_alias));
 typedef float UnalignedFloat __attribute__((vector_size(4 * kLanes), aligned(4), may_alias));
 typedef std::int32_t UnalignedInt __attribute__((vector_size(4 * kLanes), aligned(4), may_alias));
 
@@ -179,7 +180,7 @@ static inline Float exp2_unchecked(Float x) {
   p = p * f + 2.402211972e-1f;
   p = p * f + 6.931469671e-1f;
   p = p * f + 1.000000072f;
-  return (Float)((Int)p + ((Int)shifted << 23));
+  return (Float)((Bits)p + ((Bits)shifted << 23));  // unsigned: sums of garbage wrap around
 }
 
 #endif

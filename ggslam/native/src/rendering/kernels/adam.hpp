@@ -18,9 +18,8 @@ static inline void count_updates(const AdamArguments& adam, const Rows& rows, Ad
   out.rows = rows;
   for (int i = 0; i < kLanes; ++i) {
     std::int32_t& updates = adam.updates[rows.numbers[i]];
-    updates += i < rows.n;
-    const std::int32_t line = (updates < adam.schedule_rows ? updates : adam.schedule_rows) - 1;
-    out.lines[i] = adam.schedule + 8 * static_cast<std::size_t>(line);
+    if (i < rows.n) updates = next_update(updates);
+    out.lines[i] = adam.schedule + 8 * schedule_row(updates, adam.schedule_rows);
   }
   const float* upper[kLanes];
   for (int i = 0; i < kLanes; ++i) upper[i] = out.lines[i] + 4;

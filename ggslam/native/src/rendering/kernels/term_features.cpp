@@ -57,8 +57,8 @@ void step_term_rows(const TermsByGaussian& terms, const float* gradient, const F
       for (int q = 0; q < channels; ++q) sums[q] += terms.weights[k] * row[q];
     }
     const std::size_t gaussian = terms.touched[i], at = gaussian * channels;
-    const std::int32_t count = ++adam.updates[gaussian];
-    const float* line = adam.schedule + 2 * ((count < adam.schedule_rows ? count : adam.schedule_rows) - 1);
+    const std::int32_t count = adam.updates[gaussian] = next_update(adam.updates[gaussian]);
+    const float* line = adam.schedule + 2 * schedule_row(count, adam.schedule_rows);
     if (adam.short_moments != nullptr) {
       step_compact(adam, gaussian, sums, line);
       continue;
