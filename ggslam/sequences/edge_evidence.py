@@ -31,7 +31,7 @@ WORST = 0.6
 
 PARTS = 4
 """Rows and columns of the parts of an image whose edges are told apart."""
-WORST_TURNED = 0.4
+WORST_TURNED = 0.5
 """The same where depth may be mirrored or turned: little is left by chance."""
 TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mirrored": lambda image: image[:, ::-1],
@@ -39,6 +39,10 @@ TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mirrored,flipped": lambda image: image[::-1, ::-1],
 }
 """By `depth_kind` that undoes it: how depth may lie on colour."""
+
+UNRELATED, SURELY_UNRELATED = 0.2, 0.35
+"""Strength below which colour and depth have nothing to do with one another, and two standard errors above it. Sound
+recordings have 0.5 to 3.5, depth that is not registered or a frame off 0.4, colour of another room 0."""
 
 MOST_SEARCHED = 10
 """Frames that are enlarged in search of a place."""
@@ -118,6 +122,19 @@ def find_turn(seen: EdgeImages) -> tuple[str, Better] | None:
         if better is not None and better.strength < WORST_TURNED * better.best:
             found = max(found, (name, better), key=lambda one: one[1].best) if found else (name, better)
     return found
+
+
+def find_unrelated(seen: EdgeImages) -> float | None:
+    """Strength of the edges of colour under outlines of depth, if it is what chance gives; None: it is more, or nothing
+    can be told."""
+    pairs = seen.pairs()
+    if not _enough([outlines for outlines, _ in pairs]):
+        return None
+    values = np.array([edges[outlines > 0].mean() for outlines, edges in pairs])
+    weights = _weights([outlines for outlines, _ in pairs])
+    strength = float(weights @ values)
+    error = float(np.sqrt((weights**2 * (values - strength) ** 2).sum()))
+    return strength if strength < UNRELATED and strength + 2 * error < SURELY_UNRELATED else None
 
 
 def find_step(seen: EdgeImages) -> tuple[int, Better] | None:
