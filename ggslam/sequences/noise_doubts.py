@@ -66,7 +66,7 @@ def judge_views(sequence: Sequence, glances: list[Glance]) -> list[Verdict]:
         np.array_equal(a.grey, b.grey) and np.array_equal(a.depth, b.depth)
         for a, b in zip(glances, glances[1:], strict=False)
     )
-    if not same or len(glances) < FEWEST_FRAMES:
+    if not same or len(glances) < FEWEST_FRAMES or glances[0].blank:  # along a bare wall, all images are alike
         return []
     text = f"all {len(sequence)} frames hold the same images: one frame, repeated, shows no motion"
     return [Verdict("no_motion", "doubtful", f"{text}; record with a moving camera")]

@@ -30,7 +30,8 @@ from ggslam.tracking.tracker import TrackingStatus
 
 _CAUSES = (
     "depth_noise", "color_noise", "unrelated", "no_motion", "orientation", "depth_side", "depth_kind", "depth_delay",
-    "registration", "depth_codes", "depth_repeats", "color_repeats", "depth_scale", "intrinsics", "poses", "alignment", "step", "time", "textureless", "degenerate",
+    "registration", "depth_codes", "depth_repeats", "color_repeats", "depth_scale", "intrinsics", "poses", "mirrored",
+    "alignment", "step", "time", "textureless", "degenerate",
 )  # fmt: skip
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 _SAME_GAIN = 1.3

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A look at a recording's depth and masks before a run spends its time on it."""
+"""A look at a recording's camera, depth and masks before a run spends its time on it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 from ggslam.errors import SequenceError
 from ggslam.jobs.progress import Observer
 from ggslam.sequences import Sequence
+from ggslam.sequences.camera_doubts import judge_intrinsics
 from ggslam.sequences.depth_doubts import DepthDoubts
 from ggslam.sequences.inspection import VOID_TEXT
 from ggslam.sequences.live import LiveSequence
@@ -27,12 +28,21 @@ def check_depth(sequence: Sequence | LiveSequence, observer: Observer) -> list[V
     except Exception as error:  # the run itself will tell what is wrong with images, if it matters
         observer.note(f"depth could not be checked: {error!r}")
         return []
-    certain = [verdict.text for verdict in found if verdict.severity == "wrong"]
+    certain = [verdict.text for verdict in [*_judge_cameras(sequence), *found] if verdict.severity == "wrong"]
     if certain:
         raise SequenceError(f"{sequence.path}: {'; '.join(certain)} (or `check` to run it as it is)")
     for verdict in found:
         observer.note(verdict.text)
     return found
+
+
+def _judge_cameras(sequence: Sequence | LiveSequence) -> list[Verdict]:
+    """What is wrong with intrinsics by themselves; what is doubtful is told at the end of the run, with all else."""
+    if isinstance(sequence, RigSequence):
+        return [verdict for part in sequence.parts for verdict in _judge_cameras(part.sequence)]
+    if isinstance(sequence, LiveSequence):
+        return judge_intrinsics(sequence.camera)
+    return judge_intrinsics(sequence.native_camera, sequence.stated_size, sequence.camera_source)
 
 
 def _judge(sequence: Sequence | LiveSequence) -> list[Verdict]:
