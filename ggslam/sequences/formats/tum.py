@@ -95,7 +95,8 @@ class TumFormat:
             names = f"'{true}'" if given == true else f"'{given}', a link to '{true}',"
             warnings.append(
                 f"the folder's name {names} does not say freiburg1, 2 or 3: default intrinsics "
-                "525 525 319.5 239.5 of 640x480 pixels without distortion are used; `intrinsics` or `camera` tell others"
+                "525 525 319.5 239.5 of 640x480 images without distortion are used; `intrinsics` or `camera` tell "
+                "others"
             )
             return DEFAULT_CALIBRATION, None, "default: the folder's name tells no camera"
         name, number = named[0]
