@@ -33,6 +33,9 @@ PARTS = 4
 """Rows and columns of the parts of an image whose edges are told apart."""
 WORST_TURNED = 0.5
 """The same where depth may be mirrored or turned: little is left by chance."""
+TURNED_BY_PART, LEAST_TURNED = 1.5, 0.4
+"""Standard errors by parts of the image, which tell little of turned images (the horizon is in the same parts), and how
+strong the edges have to be then."""
 TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mirrored": lambda image: image[:, ::-1],
     "flipped": lambda image: image[::-1],
@@ -118,8 +121,8 @@ def find_turn(seen: EdgeImages) -> tuple[str, Better] | None:
         hits = _Hits()
         for outlines, edges in seen.pairs():
             hits.add(outlines, [edges, turn(edges)])  # each of them undoes itself
-        better = hits.compare(0, 1)
-        if better is not None and better.strength < WORST_TURNED * better.best:
+        better = hits.compare(0, 1, TURNED_BY_PART)
+        if better is not None and better.strength < WORST_TURNED * better.best and better.best > LEAST_TURNED:
             found = max(found, (name, better), key=lambda one: one[1].best) if found else (name, better)
     return found
 
@@ -221,7 +224,7 @@ class _Hits:
         """Number of the image that fits best; -1: nothing can be told."""
         return int(np.sum(self._sums, axis=(0, 2))[1:].argmax()) if _enough(self._outlines) else -1
 
-    def compare(self, plain: int, other: int) -> Better | None:
+    def compare(self, plain: int, other: int, sure_by_part: float = SURE_BY_PART) -> Better | None:
         """Another image against that of the frame itself, if it fits clearly better."""
         if not _enough(self._outlines):
             return None
@@ -230,7 +233,7 @@ class _Hits:
         count, strength, best = by_part.sum(1)
         found = Better(float(strength / count), float(best / count))
         gain = found.best - found.strength
-        sure = gain > SURE_BY_PART * _error(by_part) and gain > SURE_BY_FRAME * _error(by_frame)
+        sure = gain > sure_by_part * _error(by_part) and gain > SURE_BY_FRAME * _error(by_frame)
         return found if sure and gain > LEAST_GAIN and found.best > LEAST_STRENGTH else None
 
 
