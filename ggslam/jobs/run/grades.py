@@ -45,6 +45,10 @@ BAD_AGREEMENT, DOUBTFUL_AGREEMENT = 0.9, 0.95
 """Share of the pixels at the measured depth. Sound runs reach 0.95 to 1, a HoloLens with ragged depth 0.93; depth that
 is not registered 0.90, with pixels at full scale 0.81. Depth of another kind bends the map as a whole and agrees with
 it (0.95 to 0.98): sharpness and movers tell that."""
+LOCATED_STRUCTURE, LOCATED_AGREEMENT = (0.87, 0.82), (0.85, 0.75)
+"""The same of frames that were only located in a map, doubtful and bad: Kinect and HoloLens have 0.95 and 0.91 of the
+structure and 0.94 and 0.91 of the depth, a generated room with five changes 0.97 and 0.99, one with exchanged colour
+channels 0.77, with other textures 0.80."""
 LARGEST_OBJECT, ONLY_OBJECT = 0.5, 0.9
 """Share of the Gaussians that one object holds: it joins several things, or everything."""
 UNSURE_IDS, WRONG_IDS = 0.8, 0.5
@@ -130,10 +134,11 @@ def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] 
     """Whether the map looks like the keyframes, and these like the place; `found`: what seems wrong with them."""
     if fit is None:
         return AspectRecord(text="no keyframe of this run to compare with")
+    limits = LOCATED_STRUCTURE if fit.located else (DOUBTFUL_STRUCTURE, BAD_STRUCTURE)
     off = max(fit.brightness, 1 / max(fit.brightness, 1e-6))
     overfit = scored.overfit_db is not None and scored.overfit_db > OVERFIT_DB
     grades: list[Grade] = [
-        _at_least(fit.structure, DOUBTFUL_STRUCTURE, BAD_STRUCTURE), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
+        _at_least(fit.structure, *limits), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
         "doubtful" if overfit else "good",
     ]  # fmt: skip
     codes = {verdict.code for verdict in found or []} & OF_RECORDING.keys()
@@ -142,6 +147,7 @@ def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] 
     if off > OTHER_BRIGHTNESS:
         words.append(f"the map is {fit.brightness:.2f} times as bright as they are")
     words += [f"held-out frames are {scored.overfit_db:.1f} dB worse"] if overfit else []
+    words += ["the map looks otherwise than the frames"] if fit.located and fit.structure < limits[0] else []
     words += [text for code, text in OF_RECORDING.items() if code in codes]
     return _aspect(grades, fit.psnr, "dB", words)
 
@@ -153,7 +159,8 @@ def grade_geometry(fit: MapFit | None, found: list[Verdict]) -> AspectRecord:
     wrong = [v for v in found if v.severity == "wrong" and v.code in ("depth_scale", "intrinsics")]
     odd = [v for v in found if v.severity == "doubtful" and v.code in ("intrinsics", "depth_repeats")]
     doubts: list[Grade] = ["bad" if wrong else "doubtful" if odd else "good"]
-    grades = [_at_least(fit.agreeing, DOUBTFUL_AGREEMENT, BAD_AGREEMENT), *doubts]
+    limits = LOCATED_AGREEMENT if fit.located else (DOUBTFUL_AGREEMENT, BAD_AGREEMENT)
+    grades = [_at_least(fit.agreeing, *limits), *doubts]
     words = [f"{fit.agreeing:.1%} of the pixels at the measured depth, half within {fit.depth_error:.2%}"]
     words += ["the world comes out in another size or shape"] if wrong else []
     words += ["depth repeats while colour moves on"] if any(v.code == "depth_repeats" for v in odd) else []

@@ -37,10 +37,12 @@ def judge(sequence: Sequence | LiveSequence, result: SlamResult, depth: list[Ver
 
 
 def doubt_movers(notes: list[str], verdicts: list[Verdict]) -> list[str]:
-    """Notes of a run; where depth is at fault, what seems to move is put down to it first."""
-    if not any(verdict.code in DEPTH_CODES for verdict in verdicts):
+    """Notes of a run; where depth or intrinsics are at fault, what seems to move is put down to them first."""
+    codes = {verdict.code for verdict in verdicts}
+    cause = "depth is" if codes & DEPTH_CODES else "the intrinsics are" if "intrinsics" in codes else ""
+    if not cause:
         return notes
-    return [f"{note}; more likely depth is at fault, see below" if MOVES in note else note for note in notes]
+    return [f"{note}; more likely {cause} at fault, see below" if MOVES in note else note for note in notes]
 
 
 def _explain(of_run: list[Verdict], of_recording: list[Verdict]) -> list[Verdict]:

@@ -142,6 +142,8 @@ def _advice(
             return f"{look} (does the depth fit the images: its kind, scale, camera, frame?)"
         if "tracked" in weak:
             return _slower(result, look)
+        if "sharp" in weak and fit is not None and fit.located:
+            return "ggslam update, which brings the map up to date, or a map made in the same light"
         if "sharp" in weak and grade == "bad":
             return f"{look} (do depth and colour belong to one frame and one camera?)"
         if "sharp" in weak:

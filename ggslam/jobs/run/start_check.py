@@ -18,26 +18,28 @@ from ggslam.sequences.void_ids import has_void_id
 
 
 def check_depth(sequence: Sequence | LiveSequence, observer: Observer) -> list[Verdict]:
-    """What is doubtful about depth; each is told as a note.
+    """What is doubtful about depth; that, and what is of intrinsics, is told as a note.
 
     Raises:
-        SequenceError: depth is certainly not what it is taken for; says what it is and what to do.
+        SequenceError: depth is certainly not what it is taken for, or the intrinsics are of no such image; says what
+            is wrong and what to do.
     """
     try:
         found = _judge(sequence)
     except Exception as error:  # the run itself will tell what is wrong with images, if it matters
         observer.note(f"depth could not be checked: {error!r}")
         return []
-    certain = [verdict.text for verdict in [*_judge_cameras(sequence), *found] if verdict.severity == "wrong"]
+    cameras = _judge_cameras(sequence)
+    certain = [verdict.text for verdict in [*cameras, *found] if verdict.severity == "wrong"]
     if certain:
         raise SequenceError(f"{sequence.path}: {'; '.join(certain)} (or `check` to run it as it is)")
-    for verdict in found:
+    for verdict in [*cameras, *found]:
         observer.note(verdict.text)
     return found
 
 
 def _judge_cameras(sequence: Sequence | LiveSequence) -> list[Verdict]:
-    """What is wrong with intrinsics by themselves; what is doubtful is told at the end of the run, with all else."""
+    """What is implausible of intrinsics by themselves."""
     if isinstance(sequence, RigSequence):
         return [verdict for part in sequence.parts for verdict in _judge_cameras(part.sequence)]
     if isinstance(sequence, LiveSequence):
