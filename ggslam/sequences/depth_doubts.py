@@ -11,6 +11,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.frame import Frame
+from ggslam.sequences.alignment import measure_alignment
 from ggslam.sequences.depth_kind import DepthKind
 from ggslam.sequences.edge_evidence import (
     Better,
@@ -122,7 +123,8 @@ class DepthDoubts:
         found += [(step[1].best, self._step_verdict(*step))] if step else []
         found += [(turn[1].best, self._side_verdict(*turn))] if turn else []
         if not found and not hung and (strength := find_unrelated(self._edges)) is not None:
-            return [self._unrelated_verdict(strength)]
+            moved = measure_alignment(self.spread)  # a few pixels off, the right colour fits as badly
+            return [] if moved is not None and moved.doubtful else [self._unrelated_verdict(strength)]
         return [max(found, key=lambda one: one[0])[1]] if found else []
 
     def _unrelated_verdict(self, strength: float) -> Verdict:

@@ -39,6 +39,9 @@ VOID_TEXT = (
     "`void_id` 255 leaves it out"
 )
 
+OTHER_SCENES = {"unrelated", "color_noise", "depth_noise", "color_repeats", "depth_repeats"}
+"""Codes of verdicts that say that colour and depth of many frames show other things."""
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -156,7 +159,8 @@ def inspect_sequence(
         report.motion = _motion(sequence.ground_truth)
         _check_poses(report, doubt_poses(pairs), doubts)
     report.alignment = measure_alignment(frames)
-    if not certain:  # or it would be blamed on others
+    explained = any(verdict.code in OTHER_SCENES for verdict in report.verdicts)
+    if not certain and not explained:  # or it would be blamed on others
         _check_alignment(report)
         _check_camera(report, sequence, frames)
         _check_steps(report, sequence)
@@ -241,9 +245,11 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None, doubts: DepthD
         text = (
             f"the true poses are not of these images, but of {SIDES[doubt.convention].description}: read so, "
             f"neighbouring depth images agree to {doubt.best:.2%}, as they are only to {doubt.error:.2%}; turn colour, "
-            "depth and masks back, or text and rooms come out mirrored"
+            "depth and masks back"
         )
-        report.judge([Verdict("mirrored", "wrong", text)])
+        turned = doubt.convention == "turned"  # the world comes out as it is, and the poses' camera stands on its head
+        text += "" if turned else ", or text and rooms come out mirrored"
+        report.judge([Verdict("mirrored", "doubtful" if turned else "wrong", text)])
     elif doubt.wrong_convention:
         text = (
             f"the true poses look like {CONVENTIONS[doubt.convention].description}: read so, neighbouring depth images "

@@ -350,7 +350,7 @@ def test_real_time_runs_have_one(room: Path, tmp_path: Path) -> None:
     assert outcome.verdict.geometry.grade is not None
 
 
-def test_frames_located_in_a_map_of_other_colours_are_not_good(room_run: RunFolder, spoilt: Copy, tmp_path: Path) -> None:
+def test_frames_located_in_a_map_of_other_colours(room_run: RunFolder, spoilt: Copy, tmp_path: Path) -> None:
     """The map fits the frames it was made of; with their channels exchanged their depth alone."""
 
     def located(name: str) -> RunVerdict:

@@ -156,7 +156,7 @@ def grade_geometry(fit: MapFit | None, found: list[Verdict]) -> AspectRecord:
     """Whether the map's depth is the measured one."""
     if fit is None:
         return AspectRecord(text="no keyframe of this run to compare with")
-    wrong = [v for v in found if v.severity == "wrong" and v.code in ("depth_scale", "intrinsics")]
+    wrong = [v for v in found if v.severity == "wrong" and v.code in ("depth_scale", "intrinsics", "mirrored")]
     odd = [v for v in found if v.severity == "doubtful" and v.code in ("intrinsics", "depth_repeats")]
     doubts: list[Grade] = ["bad" if wrong else "doubtful" if odd else "good"]
     limits = LOCATED_AGREEMENT if fit.located else (DOUBTFUL_AGREEMENT, BAD_AGREEMENT)
