@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import struct
 import zipfile
@@ -113,6 +114,28 @@ def covered(recording: Path) -> None:
             assert image is not None and cv2.imwrite(str(path), np.zeros_like(image))
 
 
+def hangs(recording: Path, kind: str) -> None:
+    """From frame `AT` on all images of a kind are that of this frame."""
+    paths = sorted((recording / kind).iterdir())
+    for path in paths[AT + 1 :]:
+        shutil.copy(paths[AT], path)
+
+
+def keep_frames(recording: Path, count: int) -> None:
+    for kind in ("rgb", "depth", "masks"):
+        for path in sorted((recording / kind).iterdir())[count:]:
+            path.unlink()
+    lines = (recording / "poses.txt").read_text().splitlines()
+    (recording / "poses.txt").write_text("\n".join(lines[: count + 1]) + "\n")
+
+
+def repeated(recording: Path) -> None:
+    for kind in ("rgb", "depth", "masks"):
+        first, *others = sorted((recording / kind).iterdir())
+        for path in others:
+            shutil.copy(first, path)
+
+
 def backwards(recording: Path) -> None:
     times = [0.1, 0.0667, 0.0333, 0.0, *(k / 30 for k in range(4, len(list((recording / "rgb").iterdir()))))]
     (recording / "timestamps.txt").write_text("".join(f"{time}\n" for time in times))
@@ -156,6 +179,12 @@ RECORDINGS: dict[str, Damage] = {
                                                    sorted((r / k).iterdir())[4:9]],
     "the lens is covered for four frames": covered,
     "all but two frames show something else": lambda r: [images(r, kind, noise, 2) for kind in ("rgb", "depth")],
+    "colour hangs from a frame on": lambda r: hangs(r, "rgb"),
+    "depth hangs from a frame on": lambda r: hangs(r, "depth"),
+    "all images are noise": lambda r: [images(r, kind, noise) for kind in ("rgb", "depth")],
+    "colour alone is noise": lambda r: images(r, "rgb", noise),
+    "there is one frame": lambda r: keep_frames(r, 1),
+    "all frames are the first one": repeated,
     "there is no depth at all": lambda r: images(r, "depth", np.zeros_like),
     "a wall without texture": lambda r: (images(r, "rgb", lambda i: np.full_like(i, 128)),
                                          images(r, "depth", lambda i: np.full_like(i, 10000))),
@@ -164,6 +193,11 @@ RECORDINGS: dict[str, Damage] = {
     "the focal length is twice too long": lambda r: (camera_value("fx", 144.0)(r), camera_value("fy", 144.0)(r)),
     "intrinsics are normalised (fx = 0.75)": lambda r: (camera_value("fx", 0.75)(r), camera_value("fy", 1.0)(r)),
     "the principal point is far outside": camera_value("cx", 1e7),
+    "the principal point is outside": camera_value("cx", 144.0),
+    "camera.yaml is for images twice as large": lambda r: (camera_value("width", 192)(r),
+                                                           camera_value("height", 144)(r)),
+    "camera.yaml is for images of another shape": camera_value("height", 54),
+    "depth images are cut": lambda r: images(r, "depth", lambda i: i[:, :72]),
     "exposure falls to 0.4 in mid-recording": lambda r: images(r, "rgb", lambda i: (0.4 * i).astype(np.uint8), AT),
     "images are 1 x 1": lambda r: [images(r, k, lambda i: i[:1, :1]) for k in ("rgb", "depth", "masks")],
     "the focal length is missing": camera_value("fx", None),

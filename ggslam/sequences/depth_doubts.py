@@ -11,6 +11,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.frame import Frame
+from ggslam.sequences.alignment import measure_alignment
 from ggslam.sequences.depth_kind import DepthKind
 from ggslam.sequences.edge_evidence import (
     Better,
@@ -19,9 +20,13 @@ from ggslam.sequences.edge_evidence import (
     find_place,
     find_step,
     find_turn,
+    find_unrelated,
     look_at_edges,
     stretches,
 )
+from ggslam.sequences.glances import Glance, look_over
+from ggslam.sequences.hung_streams import judge_hung
+from ggslam.sequences.noise_doubts import judge_noise, judge_views
 from ggslam.sequences.orientation import WORDS as ORIENTATIONS
 from ggslam.sequences.orientation import orientation_of
 from ggslam.sequences.plane_evidence import PlaneEvidence, look_at_planes
@@ -34,7 +39,7 @@ from ggslam.sequences.verdicts import USUAL_MEDIAN_DEPTH, Verdict, judge_inverse
 
 CODES = frozenset({
     "orientation", "depth_side", "depth_kind", "depth_delay", "registration", "depth_repeats", "color_repeats",
-    "depth_codes",
+    "depth_codes", "depth_noise", "unrelated",
 })  # fmt: skip
 """Of the verdicts that doubt depth itself."""
 LOOKS = 8
@@ -67,10 +72,17 @@ class DepthDoubts:
 
     def judge(self) -> list[Verdict]:
         """All doubts. One about units, place or kind of depth hides those that it may be the cause of."""
-        found = self._judge_units()
-        found += self._judge_edges() if not found else []
+        found = judge_noise(self._glances, self.sequence.selection)
+        hung = judge_hung(self.sequence, self._glances)
+        found += self._judge_units() if not found else []
+        found += self._judge_edges(bool(hung)) if not found else []
         found += self._judge_measure() if not found else []
-        return [*found, *self._judge_repeats(), *self._judge_codes()]
+        still = judge_views(self.sequence, self._glances)
+        return [*found, *self._judge_repeats(hung), *self._judge_codes(), *still]
+
+    @cached_property
+    def _glances(self) -> list[Glance]:
+        return look_over(self.sequence)
 
     @cached_property
     def spread(self) -> list[Frame]:
@@ -103,13 +115,25 @@ class DepthDoubts:
     def _edges(self) -> EdgeImages:
         return look_at_edges(stretches(self.sequence))
 
-    def _judge_edges(self) -> list[Verdict]:
-        """Whether depth is mirrored or turned, a frame off, or of another camera: what fits best."""
+    def _judge_edges(self, hung: bool) -> list[Verdict]:
+        """Whether depth is mirrored or turned, a frame off, or of another camera: what fits best; or, unless a stream
+        hangs, of another scene."""
         turn, step, place = find_turn(self._edges), find_step(self._edges), find_place(self._edges)
         found = [(place.best, self._place_verdict(place))] if place else []
         found += [(step[1].best, self._step_verdict(*step))] if step else []
         found += [(turn[1].best, self._side_verdict(*turn))] if turn else []
+        if not found and not hung and (strength := find_unrelated(self._edges)) is not None:
+            moved = measure_alignment(self.spread)  # a few pixels off, the right colour fits as badly
+            return [] if moved is not None and moved.doubtful else [self._unrelated_verdict(strength)]
         return [max(found, key=lambda one: one[0])[1]] if found else []
+
+    def _unrelated_verdict(self, strength: float) -> Verdict:
+        text = (
+            f"colour and depth do not belong together: outlines of depth lie on edges of colour no more often than by "
+            f"chance (strength {strength:.2f}, of sound recordings 0.5 and more); look whether both folders are of one "
+            "recording"
+        )
+        return Verdict("unrelated", "doubtful", text)
 
     def _side_verdict(self, name: str, better: Better) -> Verdict:
         how = f"its outlines fit the edges of colour then (strength {better.best:.2f}, as it is {better.strength:.2f})"
@@ -198,12 +222,13 @@ class DepthDoubts:
         )
         return Verdict("registration", "wrong", text)
 
-    def _judge_repeats(self) -> list[Verdict]:
-        found, verdicts = find_repeats(self.sequence), []
+    def _judge_repeats(self, hung: list[Verdict]) -> list[Verdict]:
+        """Whether images come several times: `hung`, in long stretches, else all along."""
+        found, verdicts = find_repeats(self.sequence), list(hung)
         for code, count, same, other in (
             ("depth_repeats", found.depth, "depth", "colour"), ("color_repeats", found.color, "colour", "depth"),
         ):  # fmt: skip
-            if not found.many(count):
+            if not found.many(count) or code in {verdict.code for verdict in hung}:
                 continue
             share = count / found.pairs
             runs = round(1 / max(1 - share, 1e-9)) if share < 0.95 else 0

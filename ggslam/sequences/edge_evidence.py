@@ -31,14 +31,21 @@ WORST = 0.6
 
 PARTS = 4
 """Rows and columns of the parts of an image whose edges are told apart."""
-WORST_TURNED = 0.4
+WORST_TURNED = 0.5
 """The same where depth may be mirrored or turned: little is left by chance."""
+TURNED_BY_PART, LEAST_TURNED = 1.5, 0.4
+"""Standard errors by parts of the image, which tell little of turned images (the horizon is in the same parts), and how
+strong the edges have to be then."""
 TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "mirrored": lambda image: image[:, ::-1],
     "flipped": lambda image: image[::-1],
     "mirrored,flipped": lambda image: image[::-1, ::-1],
 }
 """By `depth_kind` that undoes it: how depth may lie on colour."""
+
+UNRELATED, SURELY_UNRELATED = 0.2, 0.35
+"""Strength below which colour and depth have nothing to do with one another, and two standard errors above it. Sound
+recordings have 0.5 to 3.5, depth that is not registered or a frame off 0.4, colour of another room 0."""
 
 MOST_SEARCHED = 10
 """Frames that are enlarged in search of a place."""
@@ -114,10 +121,23 @@ def find_turn(seen: EdgeImages) -> tuple[str, Better] | None:
         hits = _Hits()
         for outlines, edges in seen.pairs():
             hits.add(outlines, [edges, turn(edges)])  # each of them undoes itself
-        better = hits.compare(0, 1)
-        if better is not None and better.strength < WORST_TURNED * better.best:
+        better = hits.compare(0, 1, TURNED_BY_PART)
+        if better is not None and better.strength < WORST_TURNED * better.best and better.best > LEAST_TURNED:
             found = max(found, (name, better), key=lambda one: one[1].best) if found else (name, better)
     return found
+
+
+def find_unrelated(seen: EdgeImages) -> float | None:
+    """Strength of the edges of colour under outlines of depth, if it is what chance gives; None: it is more, or nothing
+    can be told."""
+    pairs = seen.pairs()
+    if not _enough([outlines for outlines, _ in pairs]):
+        return None
+    values = np.array([edges[outlines > 0].mean() for outlines, edges in pairs])
+    weights = _weights([outlines for outlines, _ in pairs])
+    strength = float(weights @ values)
+    error = float(np.sqrt((weights**2 * (values - strength) ** 2).sum()))
+    return strength if strength < UNRELATED and strength + 2 * error < SURELY_UNRELATED else None
 
 
 def find_step(seen: EdgeImages) -> tuple[int, Better] | None:
@@ -204,7 +224,7 @@ class _Hits:
         """Number of the image that fits best; -1: nothing can be told."""
         return int(np.sum(self._sums, axis=(0, 2))[1:].argmax()) if _enough(self._outlines) else -1
 
-    def compare(self, plain: int, other: int) -> Better | None:
+    def compare(self, plain: int, other: int, sure_by_part: float = SURE_BY_PART) -> Better | None:
         """Another image against that of the frame itself, if it fits clearly better."""
         if not _enough(self._outlines):
             return None
@@ -213,7 +233,7 @@ class _Hits:
         count, strength, best = by_part.sum(1)
         found = Better(float(strength / count), float(best / count))
         gain = found.best - found.strength
-        sure = gain > SURE_BY_PART * _error(by_part) and gain > SURE_BY_FRAME * _error(by_frame)
+        sure = gain > sure_by_part * _error(by_part) and gain > SURE_BY_FRAME * _error(by_frame)
         return found if sure and gain > LEAST_GAIN and found.best > LEAST_STRENGTH else None
 
 

@@ -12,11 +12,12 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.alignment import Alignment, measure_alignment
+from ggslam.sequences.camera_doubts import judge_intrinsics
 from ggslam.sequences.clock_offset import ClockOffset, measure_clock_offset
 from ggslam.sequences.depth_doubts import DepthDoubts
-from ggslam.sequences.focal_doubts import doubt_focal_length
+from ggslam.sequences.focal_doubts import doubt_focal_length, pairs_matched
 from ggslam.sequences.pose_conventions import CONVENTIONS, OURS
-from ggslam.sequences.pose_doubts import PoseDoubt, doubt_poses, pairs_apart
+from ggslam.sequences.pose_doubts import SIDES, PoseDoubt, doubt_poses, pairs_apart
 from ggslam.sequences.scale_doubts import measure_scale_signs
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.step_doubts import REACH as STEP_REACH
@@ -24,7 +25,6 @@ from ggslam.sequences.step_doubts import doubt_steps
 from ggslam.sequences.verdicts import (
     Verdict,
     judge_depth_scale,
-    judge_intrinsics,
     judge_scale_by,
     judge_scale_signs,
     judge_times,
@@ -38,8 +38,9 @@ VOID_TEXT = (
     "id 255 stands in most masks and is far from all other ids: it seems to mean that nobody decided what is there; "
     "`void_id` 255 leaves it out"
 )
-APART = 12
-"""Frames from one to the other of those that are compared where no true pose tells how far the camera moved."""
+
+OTHER_SCENES = {"unrelated", "color_noise", "depth_noise", "color_repeats", "depth_repeats"}
+"""Codes of verdicts that say that colour and depth of many frames show other things."""
 
 
 @dataclass(frozen=True)
@@ -149,18 +150,19 @@ def inspect_sequence(
     doubts = DepthDoubts(sequence, frames)
     report.judge(depth if depth is not None else doubts.judge() if frames else [])
     certain = any(verdict.severity == "wrong" for verdict in report.verdicts)
-    report.judge(judge_intrinsics(report.camera))
+    report.judge(judge_intrinsics(sequence.native_camera, sequence.stated_size, sequence.camera_source))
     if masks and has_void_id(sequence):
         report.judge([Verdict("void_id", "doubtful", VOID_TEXT)])
-    pairs = _pairs(report, sequence, frames)
     if sequence.ground_truth is not None:
+        pairs = pairs_apart(sequence, frames)
         report.posed_frames = int(np.isfinite(sequence.ground_truth).all((1, 2)).sum())
         report.motion = _motion(sequence.ground_truth)
         _check_poses(report, doubt_poses(pairs), doubts)
     report.alignment = measure_alignment(frames)
-    if not certain:  # or it would be blamed on others
+    explained = any(verdict.code in OTHER_SCENES for verdict in report.verdicts)
+    if not certain and not explained:  # or it would be blamed on others
         _check_alignment(report)
-        _check_camera(report, pairs)
+        _check_camera(report, sequence, frames)
         _check_steps(report, sequence)
     report.clocks = measure_clock_offset(sequence) if clocks else None
     _warn(report, times, frames)
@@ -239,7 +241,16 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None, doubts: DepthD
             return
     if doubt is None:
         return
-    if doubt.wrong_convention:
+    if doubt.wrong_convention and doubt.convention in SIDES:
+        text = (
+            f"the true poses are not of these images, but of {SIDES[doubt.convention].description}: read so, "
+            f"neighbouring depth images agree to {doubt.best:.2%}, as they are only to {doubt.error:.2%}; turn colour, "
+            "depth and masks back"
+        )
+        turned = doubt.convention == "turned"  # the world comes out as it is, and the poses' camera stands on its head
+        text += "" if turned else ", or text and rooms come out mirrored"
+        report.judge([Verdict("mirrored", "doubtful" if turned else "wrong", text)])
+    elif doubt.wrong_convention:
         text = (
             f"the true poses look like {CONVENTIONS[doubt.convention].description}: read so, neighbouring depth images "
             f"agree to {doubt.best:.2%}, as {CONVENTIONS[OURS].description} only to {doubt.error:.2%}; "
@@ -255,21 +266,12 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None, doubts: DepthD
         report.judge([Verdict("poses", "doubtful", text)])
 
 
-def _pairs(report: SequenceReport, sequence: Sequence, frames: list[Frame]) -> list[tuple[Frame, Frame]]:
-    """Frames with others that show much the same from another side."""
-    if sequence.ground_truth is not None:
-        return pairs_apart(sequence, frames)
-    last = len(sequence) - 1
-    later = [_try(sequence, min(frame.index + APART, last), report, masks=False) for frame in frames]
-    return [(a, b) for a, b in zip(frames, later, strict=True) if b is not None and b.index > a.index]
-
-
-def _check_camera(report: SequenceReport, pairs: list[tuple[Frame, Frame]]) -> None:
+def _check_camera(report: SequenceReport, sequence: Sequence, frames: list[Frame]) -> None:
     """Judges intrinsics by pairs of frames, unless they are implausible by themselves."""
-    doubt = None if report.has_verdict("intrinsics") else doubt_focal_length(pairs)
+    doubt = None if report.has_verdict("intrinsics") else doubt_focal_length(pairs_matched(sequence, frames))
     if doubt is not None and doubt.wrong:
         text = (
-            f"intrinsics are suspicious: with fx {report.native_camera.fx * doubt.factor:.0f} instead of "
+            f"intrinsics are suspicious: with fx {report.native_camera.fx * doubt.likely:.0f} instead of "
             f"{report.native_camera.fx:.0f} distances of points seen twice agree to {doubt.best:.2%}, so only to "
             f"{doubt.error:.2%}; check fx and fy, and whether they are of this size of images"
         )

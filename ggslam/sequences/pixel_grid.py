@@ -256,8 +256,10 @@ def _color_camera(recording: Recording, color_size: Size, color_file: ImageFile)
         return camera_of(_source(recording), *color_size, *recording.calibration)
     stated = (recording.camera.width, recording.camera.height)
     if not same_aspect(stated, color_size):
+        place = f" ({recording.camera_source})" if recording.camera_source else ""
         raise SequenceError(
             f"{color_file}: image is {_text(color_size)}, but the intrinsics of the recording are for {_text(stated)}"
+            f"{place}: not the same view; give those of these images with `camera` or `intrinsics`"
         )
     return recording.camera.resize(*color_size)
 

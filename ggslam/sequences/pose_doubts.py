@@ -4,6 +4,7 @@ stand and as they are often written, with depth as it stands and in other units.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,21 @@ FEWEST = 200
 """Pixels that have to be seen twice for anything to be said."""
 
 
+def _with_axes(x: float, y: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Poses of a camera whose images have their axes times these."""
+    axes = np.diag([x, y, 1.0, 1.0])
+    return lambda T: T @ axes
+
+
+SIDES = {
+    "mirrored": PoseConvention("a world seen in a mirror: left and right of the images exchanged", _with_axes(-1, 1)),
+    "flipped": PoseConvention("images stored upside down", _with_axes(1, -1)),
+    "turned": PoseConvention("images turned by 180 degrees", _with_axes(-1, -1)),
+}
+"""How colour and depth may be stored together, so that one fits the other and the world is another one than that of
+the poses."""
+READINGS = {**CONVENTIONS, **SIDES}
+
 RATIOS = np.geomspace(1 / 12, 12, 35)
 """By which depth is multiplied in search of its unit; 1 is among them."""
 
@@ -32,7 +48,7 @@ class PoseDoubt:
 
     Attributes:
         error: median relative difference of depth as it stands.
-        convention, ratio: reading of the poses (of `CONVENTIONS`), and factor on depth, that agree best.
+        convention, ratio: reading of the poses (of `READINGS`), and factor on depth, that agree best.
         best: median relative difference with these.
     """
 
@@ -89,7 +105,7 @@ def doubt_poses(pairs: list[tuple[Frame, Frame]]) -> PoseDoubt | None:
     # A reading that sees less than half as much twice can look good by chance.
     fewest = max(FEWEST, _seen_twice(pairs) // 2)
     best = PoseDoubt(error, OURS, 1.0, error)
-    for name, convention in CONVENTIONS.items():
+    for name, convention in READINGS.items():
         for ratio in RATIOS if name == OURS else (1.0,):
             found = _error(pairs, convention, float(ratio), fewest if name == OURS else FEWEST)
             if found is not None and found < best.best:

@@ -74,6 +74,7 @@ class Sequence:
         upright: whether colour images are turned as their orientation tag says.
         void_id: id of stored masks that means "unlabelled" besides 0, or None.
         color_size, depth_size: (width, height) of the stored images.
+        stated_size: (width, height) of the colour images that the recording's intrinsics say they are for, or None.
         lens: distortion that is undone and intrinsics that change, in words; "" for a pinhole camera that stays one.
         min_confidence: depth less sure than this is dropped; None: the recording has no confidence images.
         registered: whether depth images of another camera are registered to the colour images.
@@ -139,6 +140,9 @@ class Sequence:
         self._geometry = self._measure(scale)
         self.color_size: tuple[int, int] = self._geometry.color_size
         self.depth_size: tuple[int, int] = self._geometry.depth_size
+        self.stated_size: tuple[int, int] | None = None
+        if recording.camera is not None:
+            self.stated_size = (recording.camera.width, recording.camera.height)
         if self.camera_source and recording.camera is not None:
             self.camera_source += _scale_note(recording.camera, self.color_size)
         self.camera: Camera = self._geometry.camera

@@ -11,8 +11,6 @@ from typing import Literal
 
 import numpy as np
 
-from ggslam.scene.camera import Camera
-
 Severity = Literal["doubtful", "wrong"]
 
 SMALLEST_MEDIAN_DEPTH, LARGEST_MEDIAN_DEPTH = 0.1, 6.0
@@ -32,8 +30,6 @@ SLOW, FAST = 0.35, 1.5
 """Metres a second, between which cameras usually move."""
 USUAL_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10000.0, 512.0, 256.0, 1.0)
 """Depth units per metre that cameras and data sets use."""
-LEAST_ANGLE, LARGEST_ANGLE = 20.0, 120.0
-"""Degrees: horizontal angles of view of usual lenses."""
 GAP = 2.5
 """Intervals that are longer than so many usual ones lack frames."""
 MISSING_SHARE, MISSING_S = 0.05, 0.5
@@ -137,23 +133,6 @@ def judge_scale_by(scale: float, ratio: float, how: str, tolerance: float = 0.15
     likely = usual_scale(scale * ratio, tolerance)
     text = f"depth scale {scale:g} is suspicious: {how}; try `depth_scale` {likely:g}"
     return [Verdict("depth_scale", "wrong", text)]
-
-
-def judge_intrinsics(camera: Camera) -> list[Verdict]:
-    """What is implausible of intrinsics by themselves."""
-    angle = 2 * np.degrees(np.arctan(camera.width / (2 * camera.fx)))
-    if not LEAST_ANGLE <= angle <= LARGEST_ANGLE:
-        text = f"intrinsics are suspicious: horizontal angle of view {angle:.0f} degrees; check fx"
-        return [Verdict("intrinsics", "wrong", text)]
-    wide = abs(camera.fy / camera.fx)
-    if not 0.8 <= wide <= 1.25:
-        text = f"fx {camera.fx:.1f} and fy {camera.fy:.1f} mean pixels {wide:.2f} times as wide as high; check both"
-        return [Verdict("intrinsics", "wrong", f"intrinsics are suspicious: {text}")]
-    off = max(abs((camera.cx + 0.5) / camera.width - 0.5), abs((camera.cy + 0.5) / camera.height - 0.5))
-    if off > 0.2:
-        text = f"the principal point lies {off:.0%} of the image away from its middle; check cx and cy"
-        return [Verdict("intrinsics", "wrong", f"intrinsics are suspicious: {text}")]
-    return []
 
 
 def judge_times(timestamps: np.ndarray, nominal: bool = False) -> list[Verdict]:

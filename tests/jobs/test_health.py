@@ -20,7 +20,8 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.metrics import ImageScoresRecord
 from ggslam.sequences import inspect_sequence, open_sequence
-from ggslam.sequences.verdicts import judge_intrinsics, judge_times, usual_scale
+from ggslam.sequences.camera_doubts import judge_intrinsics
+from ggslam.sequences.verdicts import judge_times, usual_scale
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import judge_path, judge_run
 

@@ -348,3 +348,36 @@ def test_real_time_runs_have_one(room: Path, tmp_path: Path) -> None:
     outcome = execute(RunRequest(SequenceRequest(room), out=tmp_path / "run", overrides=more, evaluate=False))
     assert outcome.verdict is not None and outcome.verdict.tracked.grade is not None
     assert outcome.verdict.geometry.grade is not None
+
+
+def test_frames_located_in_a_map_of_other_colours(room_run: RunFolder, spoilt: Copy, tmp_path: Path) -> None:
+    """The map fits the frames it was made of; with their channels exchanged their depth alone."""
+
+    def located(name: str) -> RunVerdict:
+        asked = SequenceRequest(spoilt.path, stop=10)
+        verdict = execute(RunRequest(asked, tmp_path / name, map=room_run.path, localize_only=True)).verdict
+        assert verdict is not None
+        return verdict
+
+    here = located("here")
+    for path in spoilt.paths("rgb"):
+        cv2.imwrite(str(path), cv2.imread(str(path))[:, :, [1, 2, 0]])
+    other = located("other")
+    assert here.grade == "good" and here.fit is not None and here.fit.located and here.fit.structure > 0.95
+    assert (other.sharp.grade, other.geometry.grade) == ("bad", "good")
+    assert "the map looks otherwise" in other.sharp.text and "update" in other.next
+
+
+def test_what_is_said_of_a_recording_counts(sound: RunOutcome) -> None:
+    def graded(*codes: str) -> RunVerdict:
+        found = [Verdict(code, "doubtful", "told; try it") for code in codes]
+        return judge_result(sound.result, found, fit_of(sound), None, None, "room")
+
+    assert graded().grade == "good"
+    for code, aspect, grade in (
+        ("color_noise", "sharp", "bad"), ("unrelated", "sharp", "bad"), ("color_repeats", "sharp", "doubtful"),
+        ("depth_repeats", "geometry", "doubtful"), ("intrinsics", "geometry", "doubtful"),
+        ("no_motion", "tracked", "doubtful"), ("depth_noise", "tracked", "bad"),
+    ):  # fmt: skip
+        verdict = graded(code)
+        assert (verdict.grade, verdict.aspects()[aspect].grade, verdict.next) == (grade, grade, "it"), code

@@ -367,7 +367,7 @@ def test_a_file_in_the_folder_is_found(make: Callable[[str], Path], name: str) -
 
 def test_a_file_in_a_folder_like_tums_goes_before_the_default(make: Callable[[str], Path]) -> None:
     folder = make("tum").rename(make("folder").parent / "walk")
-    assert open_sequence(folder).camera.fx == 525
+    assert open_sequence(folder).camera.fx == pytest.approx(525 * 32 / 640)
     (folder / "K.txt").write_text("30 0 15\n0 31 11\n0 0 1\n")
     sequence = open_sequence(folder)
     assert sequence.native_camera == Camera(32, 24, 30, 31, 15, 11) and sequence.camera_source == "K.txt"

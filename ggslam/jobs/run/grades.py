@@ -45,6 +45,10 @@ BAD_AGREEMENT, DOUBTFUL_AGREEMENT = 0.9, 0.95
 """Share of the pixels at the measured depth. Sound runs reach 0.95 to 1, a HoloLens with ragged depth 0.93; depth that
 is not registered 0.90, with pixels at full scale 0.81. Depth of another kind bends the map as a whole and agrees with
 it (0.95 to 0.98): sharpness and movers tell that."""
+LOCATED_STRUCTURE, LOCATED_AGREEMENT = (0.87, 0.82), (0.85, 0.75)
+"""The same of frames that were only located in a map, doubtful and bad: Kinect and HoloLens have 0.95 and 0.91 of the
+structure and 0.94 and 0.91 of the depth, a generated room with five changes 0.97 and 0.99, one with exchanged colour
+channels 0.77, with other textures 0.80."""
 LARGEST_OBJECT, ONLY_OBJECT = 0.5, 0.9
 """Share of the Gaussians that one object holds: it joins several things, or everything."""
 UNSURE_IDS, WRONG_IDS = 0.8, 0.5
@@ -58,6 +62,11 @@ MOVING_PICTURE = 0.5
 """Of the image moving on average where something moves: then the camera's pose or depth is wrong, not the world."""
 FEWEST_FRAMES = 3
 """Frames of a run that show whether it is good: a first frame alone fits whatever comes."""
+OF_RECORDING = {
+    "color_noise": "the colour images show noise", "unrelated": "colour and depth do not belong together",
+    "color_repeats": "colour repeats while depth moves on",
+}  # fmt: skip
+"""What is wrong with colour, by code of the verdict on the recording; whatever map is made of it fits it well."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +94,8 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
     grades: list[Grade] = [
         _at_most((lost + doubted) / max(1, total), LOST_SHARE, BADLY_LOST),
         "doubtful" if searched > MUCH_SEARCHED * total or len(jumps) or codes & {"degenerate", "dropped"} else "good",
-        "bad" if "textureless" in codes else "good",
-        "doubtful" if stopped or total < FEWEST_FRAMES else "good",
+        "bad" if codes & {"textureless", "depth_noise"} else "good",
+        "doubtful" if stopped or total < FEWEST_FRAMES or "no_motion" in codes else "good",
     ]
     words = [f"{total - lost} of {total} frames located"]
     words += [f"{searched} of them by search"] if searched else []
@@ -95,7 +104,9 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
     words += ["most with an open direction"] if "degenerate" in codes else []
     words += [f"the path jumps {len(jumps)} times (the first: frame {jumps[0]})"] if jumps else []
     words += [f"{dropped} frames dropped"] if dropped else []
-    words += ["too few to tell"] if total < FEWEST_FRAMES else []
+    words += ["the depth images show noise"] if "depth_noise" in codes else []
+    one = ["too few to tell"] if total < FEWEST_FRAMES else ["one frame shows no motion"]
+    words += one if total < FEWEST_FRAMES or "no_motion" in codes else []
     words += ["stopped before the end of the recording"] if stopped else []
     return _aspect(grades, 100 * (total - lost) / max(1, total), "%", words)
 
@@ -119,20 +130,25 @@ def jumps_of(places: np.ndarray, index: np.ndarray) -> list[int]:
     return [int(i) for i in index[2:][np.nan_to_num(changes) > limit]]
 
 
-def grade_sharp(fit: MapFit | None, scored: ScoredFigures) -> AspectRecord:
-    """Whether the map looks like the keyframes."""
+def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] | None = None) -> AspectRecord:
+    """Whether the map looks like the keyframes, and these like the place; `found`: what seems wrong with them."""
     if fit is None:
         return AspectRecord(text="no keyframe of this run to compare with")
+    limits = LOCATED_STRUCTURE if fit.located else (DOUBTFUL_STRUCTURE, BAD_STRUCTURE)
     off = max(fit.brightness, 1 / max(fit.brightness, 1e-6))
     overfit = scored.overfit_db is not None and scored.overfit_db > OVERFIT_DB
     grades: list[Grade] = [
-        _at_least(fit.structure, DOUBTFUL_STRUCTURE, BAD_STRUCTURE), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
+        _at_least(fit.structure, *limits), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
         "doubtful" if overfit else "good",
     ]  # fmt: skip
+    codes = {verdict.code for verdict in found or []} & OF_RECORDING.keys()
+    grades += ["doubtful" if codes == {"color_repeats"} else "bad"] if codes else []
     words = [f"{fit.psnr:.1f} dB, {fit.structure:.1%} of the structure that image noise leaves"]
     if off > OTHER_BRIGHTNESS:
         words.append(f"the map is {fit.brightness:.2f} times as bright as they are")
     words += [f"held-out frames are {scored.overfit_db:.1f} dB worse"] if overfit else []
+    words += ["the map looks otherwise than the frames"] if fit.located and fit.structure < limits[0] else []
+    words += [text for code, text in OF_RECORDING.items() if code in codes]
     return _aspect(grades, fit.psnr, "dB", words)
 
 
@@ -140,10 +156,15 @@ def grade_geometry(fit: MapFit | None, found: list[Verdict]) -> AspectRecord:
     """Whether the map's depth is the measured one."""
     if fit is None:
         return AspectRecord(text="no keyframe of this run to compare with")
-    wrong = [v for v in found if v.severity == "wrong" and v.code in ("depth_scale", "intrinsics")]
-    grades: list[Grade] = [_at_least(fit.agreeing, DOUBTFUL_AGREEMENT, BAD_AGREEMENT), "bad" if wrong else "good"]
+    wrong = [v for v in found if v.severity == "wrong" and v.code in ("depth_scale", "intrinsics", "mirrored")]
+    odd = [v for v in found if v.severity == "doubtful" and v.code in ("intrinsics", "depth_repeats")]
+    doubts: list[Grade] = ["bad" if wrong else "doubtful" if odd else "good"]
+    limits = LOCATED_AGREEMENT if fit.located else (DOUBTFUL_AGREEMENT, BAD_AGREEMENT)
+    grades = [_at_least(fit.agreeing, *limits), *doubts]
     words = [f"{fit.agreeing:.1%} of the pixels at the measured depth, half within {fit.depth_error:.2%}"]
     words += ["the world comes out in another size or shape"] if wrong else []
+    words += ["depth repeats while colour moves on"] if any(v.code == "depth_repeats" for v in odd) else []
+    words += ["the intrinsics are doubtful"] if not wrong and any(v.code == "intrinsics" for v in odd) else []
     return _aspect(grades, 100 * fit.agreeing, "%", words)
 
 

@@ -3,18 +3,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ggslam.errors import GgslamError
 from ggslam.sequences import Sequence, inspect_sequence
+from ggslam.sequences.camera_doubts import judge_intrinsics
 from ggslam.sequences.depth_doubts import CODES as DEPTH_CODES
 from ggslam.sequences.live import LiveSequence
 from ggslam.sequences.rig import RigSequence
 from ggslam.sequences.rig_inspection import inspect_rig
-from ggslam.sequences.verdicts import Verdict, judge_intrinsics, judge_times
+from ggslam.sequences.verdicts import Verdict, judge_times
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import judge_path, judge_run
 
 MOVES = "something moves in"
 """What the note of a run that found movers says."""
+OTHER_CAUSES = {"intrinsics", "color_noise", "step", "alignment", "depth_scale"}
+"""Codes of verdicts on a recording, besides those that doubt depth, for which a camera is lost."""
+_SEE = "; most likely for what is said of the recording above"
 FRAMES = 5
 """Of the recording that are looked at."""
 
@@ -22,7 +28,8 @@ FRAMES = 5
 def judge(sequence: Sequence | LiveSequence, result: SlamResult, depth: list[Verdict] | None = None) -> list[Verdict]:
     """Verdicts on a run that has ended; some frames of its recording are read once more. `depth`: what was said of its
     depth before it began; None: nobody looked."""
-    verdicts = [*_judge_recording(sequence, result, depth), *judge_run(result)]
+    of_recording = _judge_recording(sequence, result, depth)
+    verdicts = [*of_recording, *_explain(judge_run(result), of_recording)]
     told = {verdict.code for verdict in verdicts}
     if isinstance(sequence, Sequence) and not told & {"depth_scale", "intrinsics"}:  # which make paths wrong
         verdicts += judge_path(result, sequence.ground_truth, sequence.depth_scale)
@@ -30,10 +37,23 @@ def judge(sequence: Sequence | LiveSequence, result: SlamResult, depth: list[Ver
 
 
 def doubt_movers(notes: list[str], verdicts: list[Verdict]) -> list[str]:
-    """Notes of a run; where depth is at fault, what seems to move is put down to it first."""
-    if not any(verdict.code in DEPTH_CODES for verdict in verdicts):
+    """Notes of a run; where depth or intrinsics are at fault, what seems to move is put down to them first."""
+    codes = {verdict.code for verdict in verdicts}
+    cause = "depth is" if codes & DEPTH_CODES else "the intrinsics are" if "intrinsics" in codes else ""
+    if not cause:
         return notes
-    return [f"{note}; more likely depth is at fault, see below" if MOVES in note else note for note in notes]
+    return [f"{note}; more likely {cause} at fault, see below" if MOVES in note else note for note in notes]
+
+
+def _explain(of_run: list[Verdict], of_recording: list[Verdict]) -> list[Verdict]:
+    """Verdicts on a run, without the advice to move slower where the recording explains what happened."""
+    causes = [verdict for verdict in of_recording if verdict.code in DEPTH_CODES | OTHER_CAUSES]
+    if not causes:
+        return of_run
+    return [
+        replace(verdict, text=f"{verdict.text.rpartition('; ')[0]}{_SEE}")
+        if verdict.code in ("jump", "lost") else verdict for verdict in of_run
+    ]  # fmt: skip
 
 
 def _judge_recording(

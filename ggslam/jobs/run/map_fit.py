@@ -8,16 +8,18 @@ nothing moved. Colours are divided by the brightness of the keyframe first, so t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from ggslam.evaluation.images import SSIM_WINDOW, ssim_map
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.evaluation.images import SSIM_WINDOW, fit_colors, ssim_map
+from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.sequences import Sequence as Recording
+from ggslam.slam.result import SlamResult
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.settings import DepthNoise
 
@@ -51,6 +53,7 @@ class MapFit:
         agreeing: share of the pixels with depth whose rendered depth is the measured one, see `SAME_DEPTH`.
         covered: share of them that have a rendered depth.
         depth_error: median of |rendered - measured| / measured.
+        located: whether the frames were only located in the map, which was not made of them.
     """
 
     views: int
@@ -60,16 +63,19 @@ class MapFit:
     agreeing: float
     covered: float
     depth_error: float
+    located: bool = False
 
 
 def measure_fit(
-    keyframes: Sequence[Keyframe], map_in_view: Callable[[Camera, np.ndarray], GaussianMap]
+    keyframes: Sequence[Keyframe], map_in_view: Callable[[Camera, np.ndarray], GaussianMap], exposed: bool = True
 ) -> MapFit | None:
     """Compares a map with what it was made from; None: no keyframe of this run has enough depth.
 
     Args:
         keyframes: of the run, their images still there.
         map_in_view: what of the map a camera at T_camera_world [4, 4] may see.
+        exposed: whether the keyframes tell their exposure, and the map was made of them; else the best exposure is
+            taken, and what the map does not show is left out.
     """
     rasterizer, rows = CpuRasterizer(), []
     for keyframe in _spread([k for k in keyframes if k.frame_index != ELSEWHERE]):
@@ -78,9 +84,31 @@ def measure_fit(
             features=False,
         )  # fmt: skip
         depth = np.where(view.alpha.numpy() > _OPAQUE, view.expected_depth.numpy(), 0)
-        row = _compare(keyframe, view.image.numpy().transpose(1, 2, 0), depth)
+        image = view.image.numpy().transpose(1, 2, 0)
+        if not exposed:
+            keyframe = replace(keyframe, depth=np.where(depth > 0, keyframe.depth, np.uint16(0)))
+            image = _expose(image, keyframe)
+        row = _compare(keyframe, image, depth)
         rows += [] if row is None else [row]
-    return _summary(rows)
+    found = _summary(rows)
+    return found if found is None else replace(found, located=not exposed)
+
+
+def located_views(recording: Recording, result: SlamResult) -> list[Keyframe]:
+    """Frames spread over a run that was located in a map that stays as it is, as the keyframes that it did not make."""
+    poses = result.trajectory()
+    known = [k for k in range(len(poses)) if np.isfinite(poses[k]).all()]
+    chosen = np.unique(np.linspace(0, len(known) - 1, min(LOOKED_AT, len(known))).round().astype(int))
+    return [
+        make_keyframe(number, recording.frame(result.frames[known[k]].frame_index, masks=False), poses[known[k]])
+        for number, k in enumerate(chosen.tolist())
+    ]
+
+
+def _expose(image: np.ndarray, keyframe: Keyframe) -> np.ndarray:
+    """The image [H, W, 3] in the exposure that brings it nearest to the keyframe."""
+    known = keyframe.depth > 0
+    return fit_colors(image, keyframe.color.astype(np.float32) / 255, known).astype(np.float32)
 
 
 def _spread(keyframes: list[Keyframe]) -> Iterable[Keyframe]:

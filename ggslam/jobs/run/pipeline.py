@@ -16,7 +16,7 @@ from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.checkpointing import Checkpointing, start_record
 from ggslam.jobs.run.health import doubt_movers, judge
-from ggslam.jobs.run.map_fit import MapFit, measure_fit
+from ggslam.jobs.run.map_fit import MapFit, located_views, measure_fit
 from ggslam.jobs.run.rescue import save_somewhere
 from ggslam.jobs.run.resuming import Resumption
 from ggslam.jobs.run.run_verdict import judge_result
@@ -33,6 +33,7 @@ from ggslam.runs.starting import ancestors
 from ggslam.runs.writing import REPORT_FILE, RunToWrite
 from ggslam.sequences import Sequence
 from ggslam.sequences.live import LiveSequence
+from ggslam.sequences.rig import RigSequence
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.config import Config, load_config
 from ggslam.slam.result import SlamResult
@@ -245,10 +246,17 @@ class _Run:
                 self.folder, RunToWrite(self.config, described, result, told, names, wanted, verdicts)
             )
             if (folder.path / "map.ply").is_file():
-                self.fit = self._or_note(lambda: measure_fit(result.keyframes, folder.map_in_parts().in_view))
+                self.fit = self._or_note(lambda: self._fit(result, folder))
         finally:
             result.close()
         return RunOutcome(folder, result, error=error or failure, failure=failure, verdicts=verdicts)
+
+    def _fit(self, result: SlamResult, folder: RunFolder) -> MapFit | None:
+        """How well the map shows the keyframes, or the frames that were only located in it."""
+        in_view, sequence = folder.map_in_parts().in_view, self.sequence
+        if self.request.localize_only and isinstance(sequence, Sequence) and not isinstance(sequence, RigSequence):
+            return measure_fit(located_views(sequence, result), in_view, exposed=False)
+        return measure_fit(result.keyframes, in_view)
 
     def _or_note(self, look: Callable[[], T]) -> T | None:
         """What a look at run, map or recording tells; None: it failed, which must not cost the run."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from ggslam.jobs.run.grades import (
     MOSTLY_LOST,
+    OF_RECORDING,
     OTHER_BRIGHTNESS,
     ScoredFigures,
     grade_geometry,
@@ -28,8 +29,9 @@ from ggslam.slam.result import SlamResult
 from ggslam.tracking.tracker import TrackingStatus
 
 _CAUSES = (
-    "orientation", "depth_side", "depth_kind", "depth_delay", "registration", "depth_codes", "depth_repeats",
-    "color_repeats", "depth_scale", "intrinsics", "poses", "alignment", "step", "time", "textureless", "degenerate",
+    "depth_noise", "color_noise", "unrelated", "no_motion", "orientation", "depth_side", "depth_kind", "depth_delay",
+    "registration", "depth_codes", "depth_repeats", "color_repeats", "depth_scale", "intrinsics", "poses", "mirrored",
+    "alignment", "step", "time", "textureless", "degenerate",
 )  # fmt: skip
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 _SAME_GAIN = 1.3
@@ -54,7 +56,7 @@ def judge_result(
     """
     scored = _figures_of_scores(metrics)
     aspects = {
-        "tracked": grade_tracked(result, found, stopped), "sharp": grade_sharp(fit, scored),
+        "tracked": grade_tracked(result, found, stopped), "sharp": grade_sharp(fit, scored, found),
         "geometry": grade_geometry(fit, found), "objects": grade_objects(table, scored),
         "movers": grade_movers(result),
     }  # fmt: skip
@@ -82,7 +84,10 @@ def judge_scores(verdict: RunVerdict, table: ObjectTable | None, metrics: Metric
     if verdict.failure or verdict.fit is None:
         return verdict
     scored, fit = _figures_of_scores(metrics), MapFit(**vars(verdict.fit))
-    aspects = {**verdict.aspects(), "sharp": grade_sharp(fit, scored), "objects": grade_objects(table, scored)}
+    sharp = grade_sharp(fit, scored)
+    if verdict.sharp.text.endswith(tuple(OF_RECORDING.values())):  # scores tell nothing of that
+        sharp = verdict.sharp
+    aspects = {**verdict.aspects(), "sharp": sharp, "objects": grade_objects(table, scored)}
     grade = overall(aspects)
     weak = [name for name, aspect in aspects.items() if aspect.grade == grade]
     before = [name for name, aspect in verdict.aspects().items() if aspect.grade == verdict.grade]
@@ -137,6 +142,8 @@ def _advice(
             return f"{look} (does the depth fit the images: its kind, scale, camera, frame?)"
         if "tracked" in weak:
             return _slower(result, look)
+        if "sharp" in weak and fit is not None and fit.located:
+            return "ggslam update, which brings the map up to date, or a map made in the same light"
         if "sharp" in weak and grade == "bad":
             return f"{look} (do depth and colour belong to one frame and one camera?)"
         if "sharp" in weak:

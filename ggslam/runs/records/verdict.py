@@ -47,6 +47,7 @@ class FitRecord(Record):
     agreeing: float
     covered: float
     depth_error: float
+    located: bool = False
 
 
 class RunVerdict(RecordFile):

@@ -81,7 +81,7 @@ class FolderFormat:
             calibration, distortion=distortion, fisheye=fisheye, depth_camera=depth_camera, time_source=time_source,
             depth_delays=pairs.delays, problems=missing_depth_problems(files), warnings=pairs.warnings,
             instance_names=_instances(path, settings),
-            camera_source="" if path.name == CAMERA_FILE else path.name,
+            camera_source=path.name,
         )  # fmt: skip
         _hint_at_numbering(recording, pairs.colors)
         if (folder / "poses.txt").is_file():

@@ -44,6 +44,8 @@ class ReplicaFormat:
             self.name, folder, files, nominal_timestamps(len(files)), depth_scale, camera,
             instance_names=names, problems=missing_depth_problems(files),
         )  # fmt: skip
+        told = any((place / "cam_params.json").is_file() for place in (folder, folder.parent))
+        recording.camera_source = "cam_params.json" if told else "Replica's published camera"
         options.add_truth(recording, lambda: add_row_poses(recording, folder / "traj.txt"))
         return recording
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.scene.camera import Camera
 from ggslam.sequences.association import pair_images
 from ggslam.sequences.calibration import (
     camera_or_calibration,
@@ -35,6 +36,8 @@ CALIBRATIONS = {
     "3": ((535.4, 539.2, 320.1, 247.6), None),
 }
 """Published calibration of the three cameras: (fx, fy, cx, cy) and (k1, k2, p1, p2, k3)."""
+SIZE = (640, 480)
+"""(width, height) of the images that these and the default are for."""
 DEFAULT_CALIBRATION = (525.0, 525.0, 319.5, 239.5)
 CAMERA_IN_NAME = re.compile(r"(?:freiburg|fr)([123])")
 
@@ -73,9 +76,8 @@ class TumFormat:
         named = any(CAMERA_IN_NAME.search(name) for name in _names(folder))
         file = None if named else options.recorded_camera(lambda: find_camera_file(folder))
         if file is None:
-            recording.calibration, recording.distortion, recording.camera_source = self._calibration(
-                folder, recording.warnings
-            )
+            calibration, recording.distortion, recording.camera_source = self._calibration(folder, recording.warnings)
+            recording.camera, recording.calibration = Camera(*SIZE, *calibration), None
             return
         settings = read_calibration(file)
         recording.camera, recording.calibration = camera_or_calibration(file, settings)
@@ -93,7 +95,8 @@ class TumFormat:
             names = f"'{true}'" if given == true else f"'{given}', a link to '{true}',"
             warnings.append(
                 f"the folder's name {names} does not say freiburg1, 2 or 3: default intrinsics "
-                "525 525 319.5 239.5 without distortion are used; `intrinsics` or `camera` tell others"
+                "525 525 319.5 239.5 of 640x480 images without distortion are used; `intrinsics` or `camera` tell "
+                "others"
             )
             return DEFAULT_CALIBRATION, None, "default: the folder's name tells no camera"
         name, number = named[0]

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether intrinsics can be those of the images, by their own numbers: angle of view, shape of pixels, and principal
+point, which tells the size of the images that they were made for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.scene.camera import Camera
+from ggslam.sequences.verdicts import Verdict
+
+LEAST_ANGLE, LARGEST_ANGLE = 20.0, 130.0
+"""Degrees: horizontal angles of view of usual lenses."""
+WIDEST_PIXEL = 1.25
+"""Width of a pixel over its height, or the reverse."""
+FARTHEST_OFF = 0.2
+"""Share of the image by which the principal point lies beside its middle."""
+OTHER_SIZE, SAME_SIZE = 1.4, 0.06
+"""Twice the principal point over the size of the image, or the reverse, from which the intrinsics seem to be of another
+size; and how nearly rows and columns have to say the same (natural logarithm)."""
+
+Size = tuple[int, int]
+"""(width, height) in pixels."""
+
+
+def judge_intrinsics(camera: Camera, stated: Size | None = None, source: str = "") -> list[Verdict]:
+    """What is implausible of intrinsics by themselves: "wrong" if they can belong to no such image.
+
+    Args:
+        camera: intrinsics of the images.
+        stated: size that they were told for before they were brought to that of the images; None: not known.
+        source: where they come from, for people.
+    """
+    told = f" ({source.partition(', scaled')[0]})" if source else ""
+    inside = 0 <= camera.cx <= camera.width - 1 and 0 <= camera.cy <= camera.height - 1
+    text = _other_size(camera, stated, told) or _off_centre(camera, inside, told)
+    if not inside:
+        return [Verdict("intrinsics", "wrong", text)]
+    text = text or _odd_focal(camera, told)
+    return [Verdict("intrinsics", "doubtful", text)] if text else []
+
+
+def _odd_focal(camera: Camera, told: str) -> str:
+    angle = 2 * np.degrees(np.arctan(camera.width / (2 * camera.fx)))
+    if not LEAST_ANGLE <= angle <= LARGEST_ANGLE:
+        size = f"fx {camera.fx:.1f} of images of {camera.width}x{camera.height}"
+        return f"intrinsics{told} are suspicious: horizontal angle of view {angle:.0f} degrees ({size}); check fx"
+    wide = abs(camera.fy / camera.fx)
+    if not 1 / WIDEST_PIXEL <= wide <= WIDEST_PIXEL:
+        text = f"fx {camera.fx:.1f} and fy {camera.fy:.1f} mean pixels {wide:.2f} times as wide as high; check both"
+        return f"intrinsics{told} are suspicious: {text}"
+    return ""
+
+
+def _off_centre(camera: Camera, inside: bool, told: str) -> str:
+    """That the principal point lies outside of the image, or far from its middle; "" if it does not."""
+    size = f"{camera.width}x{camera.height}"
+    if not inside:
+        text = f"the principal point {camera.cx:.1f}, {camera.cy:.1f} lies outside of the images of {size}"
+        return f"intrinsics{told} cannot be of these images: {text}; check cx and cy, and the size they are for"
+    off = max(abs((camera.cx + 0.5) / camera.width - 0.5), abs((camera.cy + 0.5) / camera.height - 0.5))
+    if off <= FARTHEST_OFF:
+        return ""
+    text = f"the principal point lies {off:.0%} of the image away from its middle"
+    return f"intrinsics{told} are suspicious: {text} ({camera.cx:.1f}, {camera.cy:.1f} of {size}); check cx and cy"
+
+
+def _other_size(camera: Camera, stated: Size | None, told: str) -> str:
+    """That the principal point is the middle of images of another size; "" if it is not."""
+    size = np.array([camera.width, camera.height])
+    ratios = 2 * (np.array([camera.cx, camera.cy]) + 0.5) / size
+    if ratios.min() <= 0 or abs(np.log(ratios[0] / ratios[1])) > SAME_SIZE:
+        return ""
+    ratio = float(np.sqrt(ratios.prod()))
+    if 1 / OTHER_SIZE < ratio < OTHER_SIZE:
+        return ""
+    said = stated or (camera.width, camera.height)
+    width, height = np.rint(ratio * np.array(said)).astype(int)
+    words = f"the principal point is the middle of images of {width}x{height}, not of {said[0]}x{said[1]}"
+    if stated is not None and stated != (camera.width, camera.height):
+        words += f", the size that they are said to be for (the images are {camera.width}x{camera.height})"
+    return f"intrinsics{told} are of another size: {words}; give width, height, fx, fy, cx and cy of the same images"

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Streams that hang: for some frames colour or depth is that of one frame, while the other goes on. Files that are the
+same are found by their sizes and bytes in all frames, images that were compressed again by small views of some."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.glances import Glance, glance_of
+from ggslam.sequences.recording import ImageFile
+from ggslam.sequences.sequence import Sequence
+from ggslam.sequences.verdicts import Verdict
+from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
+
+FEWEST = 4
+"""Frames that hold one image, from which a stream hangs: cameras of other rates repeat images once or twice."""
+MOST_COMPARED, MOST_STRETCHES = 64, 12
+"""Neighbouring files of one size that are read though they differ, and stretches that are looked at, of each stream."""
+
+
+Test = Callable[[Glance, Glance], bool]
+"""Whether two views are the same, or are not."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Frames that all hold one image of a stream, the first to the last by index; `blank`: of one colour."""
+
+    first: int
+    last: int
+    blank: bool = False
+
+
+def judge_hung(sequence: Sequence, glances: list[Glance]) -> list[Verdict]:
+    """Whether colour hangs while depth moves on, or depth while colour does."""
+    return [verdict for kind in ("color", "depth") for verdict in _judge(sequence, glances, kind)]
+
+
+def _judge(sequence: Sequence, glances: list[Glance], kind: str) -> list[Verdict]:
+    found = find_hung(sequence, glances, kind)
+    if not found:
+        return []
+    numbers = sequence.selection
+    frames = sum(one.last - one.first + 1 for one in found)
+    where = ", ".join(f"{numbers[one.first]} to {numbers[one.last]}" for one in found[:3])
+    where += f" and in {len(found) - 3} more places" if len(found) > 3 else ""
+    same, other = ("colour", "depth") if kind == "color" else ("depth", "colour")
+    told = f"{frames} of {len(sequence)} frames, {where},"
+    if all(one.blank for one in found):
+        text = f"colour images are blank: {told} show one and the same colour while depth moves on; take the cover off"
+        return [Verdict("color_repeats", "doubtful", f"{text} the lens, or look how the images were written")]
+    text = f"{same} images hang: {told} hold the {same} image of the first of them while {other} moves on"
+    return [Verdict(f"{kind}_repeats", "doubtful", f"{text}; {_remedy(sequence, found)}")]
+
+
+def _remedy(sequence: Sequence, found: list[Stretch]) -> str:
+    """How to leave them out, where they lie at one end."""
+    numbers, (one, *more) = sequence.selection, found
+    if not more and one.last == len(sequence) - 1 and one.first > 0:
+        return f"try `stop` {numbers[one.first] + 1}"
+    if not more and one.first == 0 and one.last < len(sequence) - 1:
+        return f"try `start` {numbers[one.last]}"
+    return "record again: check the cable, the disk and what else the computer does"
+
+
+def find_hung(sequence: Sequence, glances: list[Glance], kind: str) -> list[Stretch]:
+    """Stretches in which "color" or "depth" (`kind`) hangs, in order."""
+    same, moved = _tests(kind)
+    spans = _same_files([getattr(sequence.files(k), kind) for k in range(len(sequence))])
+    found = [one for span in spans[:MOST_STRETCHES] if (one := _confirm(sequence, *span, same, moved))]
+    for first, last in _same_views(sequence, glances, same, moved):
+        if not any(one.first <= last and first <= one.last for one in found):
+            found.append(Stretch(first, last))
+    return sorted(found, key=lambda one: one.first)
+
+
+def _same_views(sequence: Sequence, glances: list[Glance], same: Test, moved: Test) -> list[tuple[int, int]]:
+    """First and last of the frames whose small views are the same while the other stream moves on."""
+    spans, begin = [], 0
+    while begin < len(glances):
+        a, end = glances[begin], begin + 1
+        while end < len(glances) and same(a, glances[end]):
+            end += 1
+        if any(moved(a, view) for view in glances[begin + 1 : end]):
+            before = glances[begin - 1].index + 1 if begin else 0
+            after = glances[end].index - 1 if end < len(glances) else len(sequence) - 1
+            span = _edge(sequence, a, a.index, before, same), _edge(sequence, a, glances[end - 1].index, after, same)
+            spans += [span] if span[1] - span[0] + 1 >= FEWEST else []
+        begin = end
+    return spans
+
+
+def _tests(kind: str) -> tuple[Test, Test]:
+    """That images of the kind are the same, and that those of the other kind are not."""
+    if kind == "color":
+        return Glance.same_color, Glance.depth_moved
+    return Glance.same_depth, Glance.color_moved
+
+
+def _confirm(sequence: Sequence, first: int, last: int, same: Test, moved: Test) -> Stretch | None:
+    """A stretch of equal files, if the other stream moves on meanwhile: a camera at rest records the same for long."""
+    a, *others = (glance_of(sequence, k) for k in (first, (first + last) // 2, last))
+    if a is None or not any(b is not None and moved(a, b) for b in others):
+        return None
+    return Stretch(first, last, moved is Glance.depth_moved and a.blank)
+
+
+def _edge(sequence: Sequence, a: Glance, near: int, far: int, same: Test) -> int:
+    """The last frame from `near`, which holds the image of `a`, towards `far` that does, by halving."""
+    while near != far:
+        middle = (near + far + (far > near)) // 2
+        view = glance_of(sequence, middle)
+        if view is not None and same(a, view):
+            near = middle
+        else:
+            far = middle - (1 if far > near else -1)
+    return near
+
+
+def _same_files(files: list[ImageFile]) -> list[tuple[int, int]]:
+    """First and last of the frames whose files hold the same bytes, the longest first; none of other images."""
+    spans, begin, unequal = [], 0, 0
+    for k in range(1, len(files) + 1):
+        alike = k < len(files) and unequal < MOST_COMPARED and _size(files[k]) == _size(files[k - 1]) is not None
+        if alike:
+            alike = _read(files[k]) == _read(files[k - 1])
+            unequal += not alike
+        if not alike:
+            spans += [(begin, k - 1)] if k - begin >= FEWEST else []
+            begin = k
+    return sorted(spans, key=lambda span: span[0] - span[1])
+
+
+def _size(file: ImageFile) -> int | None:
+    try:
+        return file.stat().st_size if isinstance(file, Path) and file.is_file() else None
+    except OSError:
+        return None
+
+
+def _read(file: ImageFile) -> bytes | None:
+    try:
+        return read_foreign(file, MAX_IMAGE_BYTES, SequenceError) if isinstance(file, Path) else None
+    except SequenceError:
+        return None
