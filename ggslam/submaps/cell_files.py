@@ -12,6 +12,7 @@ import fcntl
 import os
 import re
 import shutil
+import stat
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -23,6 +24,7 @@ from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.system.atomic import write_failure
 from ggslam.system.foreign import read_foreign
+from ggslam.system.links import refuse_link
 
 _WAITING_THREADS = 8
 _CELL = re.compile(r"(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})", re.ASCII)
@@ -123,10 +125,15 @@ class WriterLock:
     """
 
     def __init__(self, path: Path) -> None:
+        refuse_link(path)
         try:
-            self._file = path.open("a+b")
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise write_failure(path, error) from error
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            os.close(handle)
+            raise RunFolderError(f"{path}: is not a regular file; it may be deleted")
+        self._file = os.fdopen(handle, "a+b")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

@@ -392,3 +392,13 @@ def test_impossible_settings() -> None:
     for settings in ({"spacing": 0.0}, {"radius": float("nan")}, {"ratio": 1.5}, {"axes": "yz"}):
         with pytest.raises(ConfigError, match=next(iter(settings))):
             SubmapSettings(**settings)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder"])
+def test_a_lock_that_is_no_file_is_refused(tmp_path: Path, kind: str) -> None:
+    GridStore.create(tmp_path / "store").close()
+    lock = tmp_path / "store" / "lock"
+    lock.unlink()
+    os.mkfifo(lock) if kind == "pipe" else lock.mkdir()
+    with pytest.raises(RunFolderError, match="lock"):
+        GridStore.open(tmp_path / "store", write=True)
