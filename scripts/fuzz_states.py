@@ -70,13 +70,21 @@ def cut_off_runs(folder: Path) -> list[Path]:
 
 
 def read_checkpoint(path: Path) -> Any:
-    """Goes on with a run to its end."""
+    """Goes on with a run: every fourth input to its end, the others for a frame, which takes a tenth of the time."""
+    from ggslam.jobs.progress import SilentObserver
     from ggslam.jobs.run.pipeline import resume
+
+    class Killer(SilentObserver):
+        def frame(self, report: Any) -> None:
+            raise _CutOff
 
     with tempfile.TemporaryDirectory() as name:
         run = _copied(path, Path(name) / "run")
         repair_checkpoints(run / "checkpoints")
-        return len(resume(run).result.frames)
+        whole = zlib.crc32(str(path).encode()) % 4 == 0
+        with suppress(_CutOff):
+            return len(resume(run, SilentObserver() if whole else Killer()).result.frames)
+        return None
 
 
 def repair_checkpoints(folder: Path) -> None:
