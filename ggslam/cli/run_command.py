@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
@@ -49,6 +49,8 @@ EPILOG = """
   ggslam run --resume runs/kitchen
 """
 
+_MODEL = "masks.model"
+"""Setting that whoever goes on with a run has to know, if it has one."""
 _WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate", "strict"}
 """Options that change nothing of what a run computes."""
 
@@ -172,7 +174,7 @@ def run(
 
     watched = _Watched(log, (host, port) if view else None, strict)
     if resume is not None:
-        return _go_on(context, resume, sequence, checkpoint_every, evaluate, watched)
+        return _go_on(context, resume, sequence, checkpoint_every, evaluate, settings, watched)
     reading = SequenceRequest(
         _recording(sequence), format_name, start, stop, stride, scale, masks, depth_scale,
         "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
@@ -203,19 +205,22 @@ def _overrides(settings: list[str] | None, shortcuts: dict[str, Any]) -> list[st
 
 def _go_on(
     context: typer.Context, run: Path, recording: Path | None, checkpoint_every: int | None, evaluate: bool,
-    watched: _Watched,
+    settings: list[str] | None, watched: _Watched,
 ) -> None:  # fmt: skip
     """Goes on with a run that was cut off."""
     from ggslam.jobs.run.pipeline import resume
 
-    given = refuse_other_options(context)
-    again = partial(resume, run, recording=recording, checkpoint_every=checkpoint_every)
+    models = [value for name, _, value in (text.partition("=") for text in settings or []) if name == _MODEL]
+    given = refuse_other_options(context, ["settings"] if len(models) == len(settings or []) else [])
+    model = models[-1] if models else None
+    again = partial(resume, run, recording=recording, checkpoint_every=checkpoint_every, model=model)
     again = partial(again, evaluate=evaluate) if "evaluate" in given else again
     _run_and_show(again, run.resolve().name, watched)
 
 
-def refuse_other_options(context: typer.Context) -> set[str]:
-    """With --resume only options that do not change the result are taken; returns the parameters that were given.
+def refuse_other_options(context: typer.Context, more: Iterable[str] = ()) -> set[str]:
+    """With --resume only options that do not change the result are taken, and those named in `more`; returns the
+    parameters that were given.
 
     Raises:
         ConfigError: another one was given; it is named.
@@ -223,7 +228,7 @@ def refuse_other_options(context: typer.Context) -> set[str]:
     options_of = {parameter.name or "": parameter.opts[0] for parameter in context.command.params}
     sources = {name: context.get_parameter_source(name) for name in options_of}
     given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
-    for name in sorted(given - _WITH_RESUME):
+    for name in sorted(given - _WITH_RESUME - set(more)):
         raise ConfigError(f"--resume: {options_of[name]} does not go with it: the run goes on as it was begun")
     return given
 
@@ -300,9 +305,13 @@ def _failure(outcome: RunOutcome) -> str:
 
 def go_on_command(run: Path) -> list[str]:
     """How a run that was cut off goes on, if it can."""
-    from ggslam.runs.checkpoints import has_checkpoints
+    from ggslam.jobs.run import resuming
+    from ggslam.runs.checkpoints import Checkpoints, has_checkpoints
 
-    return [f"next: ggslam run --resume {shlex.quote(str(run))}"] if has_checkpoints(run) else []
+    if not has_checkpoints(run):
+        return []
+    masks = Checkpoints(run).start().config.get("masks", {})
+    return [f"next: {resuming.go_on_command(run, masks.get('model', ''))}"]
 
 
 def next_commands(run: Path) -> list[str]:

@@ -23,6 +23,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.system.atomic import write_failure
 from ggslam.system.foreign import open_foreign
+from ggslam.system.links import new_file
 
 _MAGIC = b"ggstate1"
 _ALIGNMENT = 64
@@ -93,7 +94,7 @@ def write_array_file(path: Path, values: Any, arrays: Sequence[np.ndarray]) -> P
     header += b" " * (-(len(_MAGIC) + 8 + len(header)) % _ALIGNMENT)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with _new_file(temporary) as file:
+        with new_file(temporary) as file:
             out = _Summed(file)
             out.write(_MAGIC + struct.pack("<Q", len(header)) + header)
             for array in arrays:
@@ -106,12 +107,6 @@ def write_array_file(path: Path, values: Any, arrays: Sequence[np.ndarray]) -> P
             temporary.unlink(missing_ok=True)
         raise write_failure(path, error) from error
     return PendingFile(path, temporary, WrittenFile(path.name, out.size, crc))
-
-
-def _new_file(path: Path) -> IO[bytes]:
-    """An empty file in the place of what is there; of a link the link goes, not what it points to."""
-    path.unlink(missing_ok=True)
-    return path.open("xb", buffering=0)
 
 
 class _Summed:

@@ -11,6 +11,7 @@ import os
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
+from typing import IO
 
 from ggslam.errors import GgslamError, RunFolderError
 
@@ -67,6 +68,13 @@ def remove_folder(folder: Path) -> None:
     """
     refuse_link(folder)
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def new_file(path: Path) -> IO[bytes]:
+    """An empty file, to be written, in the place of what is there: of a link, a pipe or one of several names of a file
+    the name goes, not what is behind it."""
+    path.unlink(missing_ok=True)
+    return path.open("xb", buffering=0)
 
 
 def _leads_to(link: Path) -> str:

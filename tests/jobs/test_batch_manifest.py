@@ -11,7 +11,7 @@ import typer
 
 from ggslam.cli.main import app
 from ggslam.errors import ConfigError
-from ggslam.jobs.batch.manifest import ALLOWED, REPLICA, manifest_of_folder, read_manifest
+from ggslam.jobs.batch.manifest import ALLOWED, FLAGS, REPLICA, manifest_of_folder, read_manifest
 
 MANIFEST = """
 out: tables/first
@@ -128,3 +128,26 @@ def test_every_option_of_a_run_is_passed_on_or_refused_on_purpose() -> None:
         "record", "help-setting", "help-settings",
     }  # fmt: skip
     assert names - set(ALLOWED) == refused and set(ALLOWED) <= names
+    flags = {n.lstrip("-") for option in options if option.is_flag for n in (*option.opts, *option.secondary_opts)}
+    assert flags & set(ALLOWED) == FLAGS
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--set masks.model=a.onnx --camera --set=masks.model=", "--camera: expected a value, found '--set="),
+        ("--config own.yaml --masks --config=plain.yaml", "--masks: expected a value, found '--config=plain.yaml'"),
+        ("--set", "--set needs a value"),
+        ("--scale 0.5 elsewhere", "expected an option, found 'elsewhere'"),
+        ("--strict elsewhere", "expected an option, found 'elsewhere'"),
+        ("-- --scale 0.5", "-- is not for batches"),
+    ],
+)
+def test_no_option_hides_behind_another(tmp_path: Path, options: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        read_manifest(written(tmp_path, f"recordings: [a]\noptions: '{options}'"))
+
+
+def test_numbers_below_zero_are_values(tmp_path: Path) -> None:
+    found = read_manifest(written(tmp_path, "recordings: [a]\noptions: --depth-delay -0.5 --no-check"))
+    assert found.jobs[0].words[1:4] == ("--depth-delay", "-0.5", "--no-check")

@@ -16,8 +16,9 @@ import pytest
 from command_line import succeed
 from small_batch import write_small_batch
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, RunFolderError
 from ggslam.jobs.batch.batch import run_batch
+from ggslam.jobs.batch.job_process import JobProcess
 from ggslam.jobs.batch.job_states import JobState, State, states_of
 from ggslam.jobs.batch.manifest import BatchJob, Manifest, read_manifest
 from ggslam.jobs.tasks.processors import shares
@@ -95,3 +96,39 @@ def test_processors_are_shared_out() -> None:
         assert len(found) == workers and all(len(share) == max(1, there // workers) for share in found)
     with pytest.raises(ConfigError, match="workers"):
         shares(0)
+
+
+PLANTED = ("runs", "runs/a", "runs/a/b", "runs/a/b/seed0", "jobs", "jobs/a/b/seed0", "jobs/a/b/seed0/log.txt")
+
+
+@pytest.mark.parametrize("place", PLANTED)
+def test_no_link_in_a_batch_leads_its_runs_elsewhere(tmp_path: Path, place: str) -> None:
+    victim, out = tmp_path / "victim", tmp_path / "out"
+    victim.mkdir()
+    (victim / "run.json").write_text("precious")
+    link = out / place
+    link.parent.mkdir(parents=True)
+    link.symlink_to(victim / "run.json" if place.endswith(".txt") else victim)
+    with pytest.raises(RunFolderError, match="is a link"):
+        JobProcess.begin(JobState(BatchJob("a", "b", 0, ("nowhere",)), out), ())
+    assert [path.name for path in victim.iterdir()] == ["run.json"]
+    assert (victim / "run.json").read_text() == "precious"
+
+
+@pytest.mark.parametrize("kind", ["hard link", "pipe"])
+def test_a_log_takes_the_place_of_what_is_there(tmp_path: Path, kind: str) -> None:
+    precious, state = tmp_path / "precious", JobState(BatchJob("a", "b", 0, ("nowhere",)), tmp_path / "out")
+    precious.write_text("precious")
+    state.log.parent.mkdir(parents=True)
+    os.mkfifo(state.log) if kind == "pipe" else os.link(precious, state.log)
+    JobProcess.begin(state, ()).process.wait(timeout=60)
+    assert precious.read_text() == "precious" and "nowhere" in state.log.read_text()
+
+
+def test_tables_are_not_written_through_links(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "precious").write_text("precious")
+    (tmp_path / "out" / "table.csv").symlink_to(tmp_path / "precious")
+    with pytest.raises(RunFolderError, match=r"table\.csv: is a link"):
+        run_batch(Manifest("mine", tmp_path / "out", []), engine="none")
+    assert (tmp_path / "precious").read_text() == "precious"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import shutil
 import signal
 import subprocess
@@ -17,13 +18,14 @@ import pytest
 from command_line import ggslam, refuse, succeed
 
 from ggslam.cli.run_command import go_on_command
-from ggslam.errors import GgslamError, RunFolderError
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run import rescue
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute, resume
 from ggslam.runs import checkpoints, writing
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
+from ggslam.runs.records.start import StartRecord, hash_of
 from ggslam.runs.verification import verify_run
 from ggslam.slam.result import StepReport
 from ggslam.system.atomic import sync_folder, write_failure
@@ -370,3 +372,24 @@ def test_a_real_kill(room: Path, whole: Path, tmp_path: Path) -> None:
     assert process.wait() == -signal.SIGKILL
     assert "going on after frame" in succeed("run", "--resume", out)
     assert_same(out, whole)
+
+
+def test_a_model_runs_only_if_it_is_named_again(cut: Path) -> None:
+    """Whoever hands on a run could have written any model into it, with the right sum."""
+    path = cut / checkpoints.FOLDER / StartRecord.FILE
+    start = json.loads(path.read_text())
+    start["config"]["masks"]["model"] = "a model.onnx"
+    path.write_text(json.dumps({**start, "config_hash": hash_of(start["config"])}))
+    command = f"ggslam run --resume {cut} --set masks.model='a model.onnx'"
+    refuse(ggslam("run", "--resume", cut), "a model of masks, which is run like a program", command)
+    assert go_on_command(cut) == [f"next: {command}"]
+    with pytest.raises(ConfigError, match="which is run like a program"):
+        resume(cut, model="another.onnx")
+    with pytest.raises(GgslamError, match=r"a model\.onnx: (file is missing|.*onnxruntime)"):
+        resume(cut, model="a model.onnx")
+
+
+def test_no_model_is_taken_by_a_run_without(cut: Path) -> None:
+    again = ("run", "--resume", cut, "--set")
+    refuse(ggslam(*again, "masks.model=a.onnx"), "was begun without a model of masks")
+    refuse(ggslam(*again, "mapping.iterations_per_frame=1"), "--set does not go with it")

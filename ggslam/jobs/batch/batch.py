@@ -80,7 +80,7 @@ def run_batch(
         found = ScoresTable.of(manifest.title, states, _machine())
         files = []
         for name, make in found.files().items():
-            write_text(manifest.out / name, make())
+            write_text(manifest.out / name, make(), follow=False)
             files.append(manifest.out / name)
     return BatchOutcome(states, found, files)
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from ggslam.errors import RunFolderError
 from ggslam.jobs.batch.job_states import JobState
 from ggslam.system.atomic import make_folder
+from ggslam.system.links import new_file
 
 
 @dataclass
@@ -52,7 +53,7 @@ class JobProcess:
         tied = ["ggslam.jobs.batch.tied_process", str(os.getpid())] if with_parent else ["ggslam"]
         environment = os.environ | {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": threads}
         try:
-            with state.log.open("wb") as log:
+            with new_file(state.log) as log:
                 process = subprocess.Popen(
                     [sys.executable, "-m", *tied, *arguments], stdin=subprocess.DEVNULL, stdout=log,
                     stderr=subprocess.STDOUT, env=environment, start_new_session=True,

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import ClassVar
 
 from ggslam.errors import FormatError, GgslamError
-from ggslam.jobs.batch.manifest import BatchJob, Manifest, option
+from ggslam.jobs.batch.manifest import BatchJob, Manifest, model_of, option
 from ggslam.runs.checkpoints import has_checkpoints
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.record import RecordFile
 from ggslam.system.atomic import make_folder
 from ggslam.system.foreign import open_foreign, printable
+from ggslam.system.links import refuse_link
 
 _log = logging.getLogger(__name__)
 _TAIL, _LINE = 8192, 300
@@ -114,11 +115,20 @@ class JobState:
         """Of `ggslam`: to go on with a run that was cut off, else to make it anew."""
         record = self.memory()
         if record is not None and record.exit_code is None and has_checkpoints(self.run):
-            return ["run", option("resume"), str(self.run)]
+            model = model_of(self.job.words)
+            return ["run", option("resume"), str(self.run), *([option("set"), f"masks.model={model}"] if model else [])]
         return ["run", *self.job.words, option("out"), str(self.run), option("overwrite")]
 
     def begin(self) -> None:
-        """Notes what is begun."""
+        """Notes what is begun.
+
+        Raises:
+            RunFolderError: there is a link among the batch's folders, which would lead the run elsewhere.
+        """
+        for path in (self.run, self.log):
+            parts = path.relative_to(self.out).parts
+            for depth in range(1, len(parts) + 1):
+                refuse_link(self.out.joinpath(*parts[:depth]))
         make_folder(self._beside)
         JobRecord.of({"words": list(self.job.words)}).write(self._beside)
         self.see_begun()

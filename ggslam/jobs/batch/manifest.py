@@ -63,6 +63,8 @@ class Manifest:
     title: str
     out: Path
     jobs: list[BatchJob] = field(default_factory=list)
+FLAGS = {"upright", "loops", "no-loops", "skip-bad-frames", "no-skip-bad-frames", "check", "no-check", "strict"}
+"""Those of them that take no value."""
 
 
 def read_manifest(path: str | Path, out: Path | None = None, options: Sequence[str] = ()) -> Manifest:
@@ -187,11 +189,29 @@ def _options(path: Path, where: str, words: Any) -> tuple[str, ...]:
 
 def _check_words(where: str, words: Sequence[str]) -> Sequence[str]:
     """Raises ConfigError if there are options that a batch does not pass on."""
-    for word in words:
-        name = word.partition("=")[0]
-        if name.startswith("-") and not _is_number(name) and name not in map(option, ALLOWED):
-            raise ConfigError(f"{where}: {name} is not for batches: folders, seeds, scores and pages are theirs")
+    for name, value in _pairs(words):
+        if name not in map(option, ALLOWED):
+            told = f"{name} is not for batches: folders, seeds, scores and pages are theirs"
+            told = told if name.startswith("-") else f"expected an option, found {name[:80]!r}"
+            raise ConfigError(f"{where}: {told}")
+        if value is None and name[2:] not in FLAGS:
+            raise ConfigError(f"{where}: {name} needs a value")
+        if value is not None and value.startswith("--"):
+            raise ConfigError(f"{where}: {name}: expected a value, found {value[:80]!r}, which looks like an option")
     return words
+
+
+def _pairs(words: Sequence[str]) -> list[tuple[str, str | None]]:
+    """Options with their values, as the command line takes them; None: a flag, or nothing follows."""
+    found: list[tuple[str, str | None]] = []
+    rest = list(words)
+    while rest:
+        name, equals, value = rest.pop(0).partition("=")
+        if equals or name[2:] in FLAGS or not name.startswith("-"):
+            found.append((name, value if equals else None))
+        else:
+            found.append((name, rest.pop(0) if rest else None))
+    return found
 
 
 def _refuse_models(where: str, asked: tuple[str, ...], runs: Iterable[tuple[str, ...]]) -> None:
@@ -206,24 +226,16 @@ def _refuse_models(where: str, asked: tuple[str, ...], runs: Iterable[tuple[str,
 def _model_of(words: Sequence[str]) -> str | None:
     """The model of masks that options of `ggslam run` lead to, by themselves or through a file of settings; "": none,
     None: no run begins with these options."""
-    given: dict[str, list[str]] = {"config": [], "set": []}
-    for number, word in enumerate(words):
-        name, equals, value = word.partition("=")
-        for known, values in given.items():
-            if name == option(known):
-                values += [value] if equals else list(words[number + 1 : number + 2])
+    given = {name: [v or "" for n, v in _pairs(words) if n == option(name)] for name in ("config", "set")}
     try:
         return load_config(given["config"][-1] if given["config"] else None, given["set"]).masks.model
     except ConfigError:
         return None
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+def model_of(words: Sequence[str]) -> str:
+    """The model of masks of a job, by its words: a recording and options; "": none."""
+    return _model_of(words[1:]) or ""
 
 
 def _take_list(path: Path, where: str, values: Any) -> list[Any]:

@@ -131,7 +131,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
 
 def resume(
     run: Path, observer: Observer | None = None, follower: Follower | None = None, *, recording: Path | None = None,
-    evaluate: bool | None = None, checkpoint_every: int | None = None,
+    evaluate: bool | None = None, checkpoint_every: int | None = None, model: str | None = None,
 ) -> RunOutcome:  # fmt: skip
     """Goes on with a run that was cut off, from its newest checkpoint. A synchronous run on the CPU becomes what it
     would have become, bit for bit.
@@ -143,14 +143,16 @@ def resume(
         recording: where the recording is now, if it was moved.
         evaluate: score the run; None: as it was asked to.
         checkpoint_every: as of `RunRequest`.
+        model: the model of masks that the run was begun with, if it was with one: it is run like a program, and the
+            folder may come from somebody else.
 
     Raises:
         GgslamError: there is nothing to go on from; the recording is another one; the run was made with another
-            version.
+            version; `model` is not the run's.
     """
     folder = RunFolder.open_unfinished(run)
     with stop_on_request() as stop, folder_lock(folder.path):
-        found = Resumption.of(folder, recording, evaluate)
+        found = Resumption.of(folder, recording, evaluate, model)
         asked = RunRequest(
             found.request, folder.path, evaluate=found.start.evaluate if evaluate is None else evaluate,
             localize_only=found.start.localize_only, checkpoint_every=checkpoint_every,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,13 +35,16 @@ class Resumption:
     earlier: RunFolder | None
 
     @staticmethod
-    def of(folder: RunFolder, recording: Path | None, evaluate: bool | None = None) -> Resumption:
+    def of(
+        folder: RunFolder, recording: Path | None, evaluate: bool | None = None, model: str | None = None
+    ) -> Resumption:
         """That of a run.
 
         Args:
             folder: of the run, see `RunFolder.open_unfinished`.
             recording: where its recording is now; None: where it was.
             evaluate: whether it will be scored; None: as it was asked to.
+            model: of masks that whoever goes on knows to be the run's.
 
         Raises:
             GgslamError: see `resume`.
@@ -55,6 +59,8 @@ class Resumption:
         if hash_of(start.config) != start.config_hash:
             raise RunFolderError(f"{where}: the settings are not those that the run was begun with")
         config = config_from_dict(start.config, str(where))
+        if (model or "") != config.masks.model:
+            raise ConfigError(_other_model(folder.path, config.masks.model))
         request = request_in(start.open, recording)
         sequence = request.open(truth=start.evaluate if evaluate is None else evaluate)
         found, expected = identity_of(sequence), start.recording
@@ -82,6 +88,19 @@ class Resumption:
         if other:
             observer.note(f"other {', '.join(other)} than the run was begun with: the last bits may differ")
         return begin
+
+
+def _other_model(run: Path, model: str) -> str:
+    if not model:
+        return f"{run}: was begun without a model of masks"
+    command = go_on_command(run, model)
+    return f"{run}: was begun with a model of masks, which is run like a program; if it is yours: `{command}`"
+
+
+def go_on_command(run: Path, model: str = "") -> str:
+    """What goes on with a run that was cut off; `model`: of masks, that it was begun with."""
+    form = "ggslam run --resume {} --set masks.model={}" if model else "ggslam run --resume {}"
+    return form.format(shlex.quote(str(run)), shlex.quote(model))
 
 
 def _earlier(start: StartRecord) -> RunFolder | None:
