@@ -331,25 +331,29 @@ class _Restorer:
         return value
 
     def _list_in_parts(self, content: Any, there: Any) -> list[Any]:
-        assert self._kept is not None
+        kept = self._kept_files()
         value: list[Any] = there if type(there) is list else []
         value.clear()
         for file, number in content:
-            trees, arrays = self._kept.part(file, number)
+            trees, arrays = kept.part(file, number)
             for tree in trees:
                 restorer = _Restorer(self._rules, arrays, None)
                 value.append(restorer.restore(tree, None))
                 self._filled += restorer._filled
-        self._kept.grew(value, content)
+        kept.grew(value, content)
         return value
+
+    def _kept_files(self) -> Kept:
+        if self._kept is None:
+            raise ValueError("a kept part names arrays of other files")
+        return self._kept
 
     def _array(self, content: Any) -> np.ndarray:
         strides = None
         if isinstance(content, dict):
             content, strides = content["p"], content["strides"]
         if isinstance(content, list):
-            assert self._kept is not None
-            array = self._kept.array(*content)
+            array = self._kept_files().array(*content)
         else:
             array = self._arrays[content]
         return array if strides is None else _with_strides(array, strides)
