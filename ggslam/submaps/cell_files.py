@@ -12,7 +12,6 @@ import fcntl
 import os
 import re
 import shutil
-import stat
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -24,7 +23,7 @@ from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.system.atomic import write_failure
 from ggslam.system.foreign import read_foreign
-from ggslam.system.links import refuse_link
+from ggslam.system.links import refuse_link, refuse_shared_file
 
 _WAITING_THREADS = 8
 _CELL = re.compile(r"(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})", re.ASCII)
@@ -121,7 +120,7 @@ class WriterLock:
     While it is held the file names the process; a name found in it is that of a writer which ended without `release`.
 
     Raises:
-        RunFolderError: another writer has it, or the file cannot be written.
+        RunFolderError: another writer has it, or the file cannot be written or may be somebody's (a hard link).
     """
 
     def __init__(self, path: Path) -> None:
@@ -130,9 +129,11 @@ class WriterLock:
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise write_failure(path, error) from error
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
+        try:
+            refuse_shared_file(path, os.fstat(handle))
+        except RunFolderError:
             os.close(handle)
-            raise RunFolderError(f"{path}: is not a regular file; it may be deleted")
+            raise
         self._file = os.fdopen(handle, "a+b")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
