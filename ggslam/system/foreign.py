@@ -98,10 +98,14 @@ def read_foreign_text(path: str | Path, error: type[GgslamError] = FormatError, 
 
 
 def is_plain_name(name: object) -> bool:
-    """Whether this is a name of a file in a folder, and nothing that leads elsewhere or is longer than names can be."""
+    """Whether this is a name of a file in a folder, and nothing that leads elsewhere, is longer than names can be or
+    has characters that the file system cannot write."""
     if not isinstance(name, str) or name in ("", ".", "..") or set(name) & {"/", "\\", "\0"}:
         return False
-    return len(name.encode(errors="surrogatepass")) <= _LONGEST_NAME
+    try:
+        return len(os.fsencode(name)) <= _LONGEST_NAME
+    except UnicodeEncodeError:  # half a pair of UTF-16, which JSON can hold
+        return False
 
 
 def member(folder: str | Path, name: str, error: type[GgslamError] = FormatError) -> Path:

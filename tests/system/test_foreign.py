@@ -72,10 +72,11 @@ def test_text_may_have_any_line_ends_and_a_mark(tmp_path: Path) -> None:
         read_foreign_text(path)
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/etc", "..\\x", "a\0", "a" * 256, None, 3, ["x"]])
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/etc", "..\\x", "a\0", "a" * 256, None, 3, ["x"], "\ud800"])
 def test_names_that_lead_elsewhere(name: object) -> None:
     assert not is_plain_name(name)
-    assert is_plain_name("map.ply") and is_plain_name("..map")
+    assert is_plain_name("map.ply") and is_plain_name("..map") and is_plain_name("Stra\xdfe \U0001f40e")
+    assert is_plain_name(os.fsdecode(b"caf\xe9"))  # of an old system: no UTF-8, but a name all the same
 
 
 def test_members_stay_in_their_folder(tmp_path: Path) -> None:
