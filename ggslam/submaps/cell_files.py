@@ -12,6 +12,7 @@ import fcntl
 import os
 import re
 import shutil
+import stat
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -172,26 +173,34 @@ class WriterLock:
             raise write_failure(path, error) from error
 
 
-def read_current(find: Callable[[], Path], attempts: int = 5) -> tuple[Path, bytes]:
+def read_current(find: Callable[[], tuple[Path, int]], attempts: int = 5) -> tuple[Path, bytes]:
     """Reads the file that `find` names, asking again if a writer has replaced it meanwhile.
+
+    Args:
+        find: gives the file, and how many bytes it is to have.
+        attempts: how often to ask again.
 
     Raises:
         OSError: it cannot be read.
+        FormatError: it is of another size, and was not read, or is no regular file.
     """
-    path = find()
+    path, size = find()
     for _ in range(attempts):
         try:
-            return path, _content(path)
+            return path, _content(path, size)
         except FileNotFoundError:
             found = find()
-            if found == path:
+            if found[0] == path:
                 raise
-            path = found
-    return path, _content(path)
+            path, size = found
+    return path, _content(path, size)
 
 
-def _content(path: Path) -> bytes:
-    """Of a part. Raises FormatError if it is no regular file, FileNotFoundError if there is none."""
+def _content(path: Path, size: int) -> bytes:
+    """Of a part. Raises FormatError if it is no regular file or of another size, FileNotFoundError if there is none."""
+    found = path.stat()
+    if stat.S_ISREG(found.st_mode) and found.st_size != size:  # before it is read: it may be a huge file of holes
+        raise FormatError(f"{path}: damaged: {found.st_size} bytes, the index says {size}")
     try:
         return read_foreign(path)
     except FormatError:
