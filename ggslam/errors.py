@@ -5,14 +5,30 @@ from __future__ import annotations
 
 import re
 
-_NOISE = re.compile(r"\[Errno -?\d+\] |(?<=/)\.staged-\d+-[0-9a-f]{8}/")
-"""What tells people nothing: numbers of the operating system's errors, and hidden folders that files are written to
-before they take their places."""
+_MARK = r"\d+-[0-9a-f]{8}(?![0-9a-f])"
+"""Number of a process and eight digits: how hidden names end that ggslam gives to what is not done yet."""
+_BEGIN = r"(?<![^/\s'\"(=])"
+"""Nothing before it but a folder."""
+_TO_DELETE = r"(?!: (?:is|holds) a link)"
+"""Not of a message that asks people to look at the hidden name itself."""
+
+_NOISE = (
+    (re.compile(r"\[Errno -?\d+\] "), ""),
+    (re.compile(rf"(?<=/)\.staged-{_MARK}/"), ""),
+    (re.compile(rf"/\.staged-{_MARK}(?!/){_TO_DELETE}"), ""),
+    (re.compile(rf"{_BEGIN}\.index-{_MARK}"), "index.sqlite"),
+    (re.compile(rf"{_BEGIN}\.([^/\n]+?)-coming-{_MARK}{_TO_DELETE}(?:/[^\s:'\"]*)?"), r"\1"),
+    (re.compile(rf"{_BEGIN}\.([^/\n]+?)\.{_MARK}{_TO_DELETE}"), r"\1"),
+)
+"""What tells people nothing: numbers of the operating system's errors, and hidden files and folders that are written
+to before they take their places; what they are to become is named instead."""
 
 
 def plain(text: str) -> str:
     """A message without what only the program needs to know."""
-    return _NOISE.sub("", text)
+    for pattern, instead in _NOISE:
+        text = pattern.sub(instead, text)
+    return text
 
 
 class GgslamError(Exception):

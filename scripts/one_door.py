@@ -2,8 +2,8 @@
 """Finds reads of files that do not go through the door, `ggslam/system/foreign.py`; a part of house.py.
 
 A file that a user or a stranger gave may be a pipe, a device, a folder, or larger than memory. `open_foreign`,
-`read_foreign` and what is built on them (`open_zip`, `read_picture`) know; a plain `open` does not. A call that reads
-from a file which the door opened is fine, and so is writing.
+`read_foreign` and what is built on them (`open_zip`, `read_picture`, `copy_foreign`) know; a plain `open` does not. A
+call that reads from a file which the door opened is fine, and so is writing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ READERS = {
     "pickle": {"load"}, "mmap": {"mmap"}, "gzip": {"open", "GzipFile"}, "bz2": {"open", "BZ2File"},
     "lzma": {"open", "LZMAFile"}, "io": {"open", "FileIO", "open_code"}, "codecs": {"open"}, "Image": {"open"},
     "shelve": {"open"}, "h5py": {"File"}, "onnxruntime": {"InferenceSession"}, "rosbags.highlevel": {"AnyReader"},
-    "Stage": {"Open"}, "os": {"open"},
+    "Stage": {"Open"}, "os": {"open"}, "shutil": {"copy", "copy2", "copyfile", "copytree"},
 }  # fmt: skip
 """What opens or decodes files, by the last name before the dot."""
 _MODULES = {"numpy": "np", "PIL.Image": "Image"}

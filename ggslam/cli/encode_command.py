@@ -167,7 +167,7 @@ def _encode_store(
     for line in (f"wrote {out}", *(f"left out: {line}" for line in done.failures.values())):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if done.failures:
-        raise typer.Exit(1)
+        raise typer.Exit(done.exit_code)
 
 
 def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> None:

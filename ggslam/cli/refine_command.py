@@ -91,9 +91,9 @@ def _show_store(outcome: StoreRefinement) -> None:
         lines.append(f"{outcome.unseen} cells are as they were: no keyframe shows enough of them")
     lines += [f"note: {note}" for note in outcome.notes]
     _print([*lines, f"wrote {outcome.path} in {outcome.seconds:.1f} s"])
-    if outcome.failures:
+    if outcome.failures:  # of the store: those of ggslam or the machine are raised
         _print([f"as it was: {line}" for line in outcome.failures.values()])
-        raise typer.Exit(1)
+        raise typer.Exit(2)
 
 
 def _gain(before: float, after: float) -> str:

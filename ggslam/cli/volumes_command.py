@@ -196,8 +196,8 @@ def _make_of_store(
         f"wrote {outcome.out}", *(f"not made: {line}" for line in outcome.failures.values()),
     ):  # fmt: skip
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    if outcome.failures:
-        raise typer.Exit(1)
+    if outcome.failures:  # of the store: those of ggslam or the machine are raised
+        raise typer.Exit(2)
 
 
 def _make_and_show(request: VolumesRequest, speeds: list[float], braking: Braking, cells: tuple[object, ...]) -> None:

@@ -59,7 +59,7 @@ from ggslam.slam.result import SlamResult
 from ggslam.system.folder_lock import LOCK_FILE, refuse_other_writers
 from ggslam.system.foreign import printable, read_foreign_text, refuse_links
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
-from ggslam.system.staging import finish_saving, is_being_saved, leftovers
+from ggslam.system.staging import finish_saving, is_being_saved, leftovers, refuse_links_at
 
 MARKER = RunRecord.FILE
 """Is there if and only if a folder is a run of ggslam."""
@@ -90,7 +90,8 @@ class RunFolder:
         """Makes the folder, or takes an empty one, or with `overwrite` an earlier run's.
 
         Raises:
-            RunFolderError: it holds something else, or a run that was not to be replaced, or cannot be written to.
+            RunFolderError: it holds something else, or a run that was not to be replaced, or a link in the place of one
+                of its files, or cannot be written to.
         """
         folder = RunFolder(path)
         refuse_other_writers(folder.path)
@@ -108,6 +109,7 @@ class RunFolder:
                 folder._made_here = True
         except OSError as error:
             raise RunFolderError(f"{path}: cannot be written to: {error.strerror or error}") from None
+        refuse_links_at(folder.path, (MARKER, *RUN_FILES))
         folder.check_writable()
         return folder
 
@@ -151,6 +153,7 @@ class RunFolder:
         """
         refuse_other_writers(Path(path))
         if has_checkpoints(Path(path)):
+            refuse_links_at(Path(path), (MARKER, *RUN_FILES))
             return RunFolder(path)
         folder = RunFolder.open(path)
         whole = folder.mark().complete

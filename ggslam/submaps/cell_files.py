@@ -24,7 +24,7 @@ from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.system.atomic import write_failure
 from ggslam.system.foreign import read_foreign
-from ggslam.system.links import refuse_link
+from ggslam.system.links import refuse_link, refuse_shared_file
 
 _WAITING_THREADS = 8
 _CELL = re.compile(r"(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})", re.ASCII)
@@ -121,7 +121,7 @@ class WriterLock:
     While it is held the file names the process; a name found in it is that of a writer which ended without `release`.
 
     Raises:
-        RunFolderError: another writer has it, or the file cannot be written.
+        RunFolderError: another writer has it, or the file cannot be written or may be somebody's (a hard link).
     """
 
     def __init__(self, path: Path) -> None:
@@ -130,9 +130,11 @@ class WriterLock:
             handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise write_failure(path, error) from error
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
+        try:
+            refuse_shared_file(path, os.fstat(handle))
+        except RunFolderError:
             os.close(handle)
-            raise RunFolderError(f"{path}: is not a regular file; it may be deleted")
+            raise
         self._file = os.fdopen(handle, "a+b")
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -171,26 +173,34 @@ class WriterLock:
             raise write_failure(path, error) from error
 
 
-def read_current(find: Callable[[], Path], attempts: int = 5) -> tuple[Path, bytes]:
+def read_current(find: Callable[[], tuple[Path, int]], attempts: int = 5) -> tuple[Path, bytes]:
     """Reads the file that `find` names, asking again if a writer has replaced it meanwhile.
+
+    Args:
+        find: gives the file, and how many bytes it is to have.
+        attempts: how often to ask again.
 
     Raises:
         OSError: it cannot be read.
+        FormatError: it is of another size, and was not read, or is no regular file.
     """
-    path = find()
+    path, size = find()
     for _ in range(attempts):
         try:
-            return path, _content(path)
+            return path, _content(path, size)
         except FileNotFoundError:
             found = find()
-            if found == path:
+            if found[0] == path:
                 raise
-            path = found
-    return path, _content(path)
+            path, size = found
+    return path, _content(path, size)
 
 
-def _content(path: Path) -> bytes:
-    """Of a part. Raises FormatError if it is no regular file, FileNotFoundError if there is none."""
+def _content(path: Path, size: int) -> bytes:
+    """Of a part. Raises FormatError if it is no regular file or of another size, FileNotFoundError if there is none."""
+    found = path.stat()
+    if stat.S_ISREG(found.st_mode) and found.st_size != size:  # before it is read: it may be a huge file of holes
+        raise FormatError(f"{path}: damaged: {found.st_size} bytes, the index says {size}")
     try:
         return read_foreign(path)
     except FormatError:

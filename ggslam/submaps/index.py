@@ -29,6 +29,7 @@ from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellChange, CellRecord, CellWrite, PartRecord
 from ggslam.submaps.index_schema import NEWEST, SCHEMAS, check_rows, check_schema
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.links import refuse_shared_file
 
 _APPLICATION = 0x67677367  # "ggsg": how SQLite files tell whose they are
 _BUSY_SECONDS = 10.0
@@ -76,7 +77,7 @@ class CellIndex:
         """
         if not path.is_file():
             raise FormatError(f"{path.parent}: no grid store: there is no file {path.name}")
-        _refuse_other_files(path)
+        _refuse_other_files(path, write)
         with _explain_errors(path):
             connection = _connect(path, write)
             try:
@@ -237,12 +238,17 @@ class CellIndex:
                 raise
 
 
-def _refuse_other_files(path: Path) -> None:
-    """SQLite opens what lies beside an index by name: a link or a pipe is refused."""
-    for file in (path, *(path.with_name(path.name + ending) for ending in ("-wal", "-shm", "-journal"))):
+def _refuse_other_files(path: Path, write: bool) -> None:
+    """SQLite opens what lies beside an index by name, and writes to it even for readers: links and pipes are refused.
+    The index itself is only read unless `write`, so that a store copied with hard links can be read."""
+    beside = [path.with_name(path.name + ending) for ending in ("-wal", "-shm", "-journal")]
+    for file in (path, *beside):
         with suppress(FileNotFoundError):
-            if not stat.S_ISREG(file.lstat().st_mode):
+            found = file.lstat()
+            if not stat.S_ISREG(found.st_mode):
                 raise FormatError(f"{file}: is not a regular file")
+            if write or file != path:
+                refuse_shared_file(file, found, "copy the store without hard links (`cp -r`)", FormatError)
 
 
 class _Steps:

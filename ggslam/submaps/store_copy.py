@@ -4,17 +4,21 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_files import CellFiles, wait_for_disk
+from ggslam.submaps.cell_records import PartRecord
 from ggslam.submaps.coming_store import coming_store
 from ggslam.submaps.grid import CELLS, INDEX, GridStore
 from ggslam.submaps.index import CellIndex
 from ggslam.submaps.store_objects import OBJECTS_FILE
-from ggslam.submaps.visit_files import VISITS
+from ggslam.submaps.visit_files import visit_file
 from ggslam.system.atomic import make_folder
+from ggslam.system.foreign import MAX_TEXT_BYTES, copy_foreign
+from ggslam.system.process_memory import most_memory_bytes
 
 _TRIES = 20
 """Times that a writer may have replaced files between a look at the index and at them."""
@@ -22,8 +26,8 @@ _WAITING_THREADS = 8
 
 
 def copy_store(source: Path, target: Path) -> None:
-    """Makes a store with the content of another one; it appears when all of it is on the disk. Files that are missing
-    or damaged are so in the copy, too.
+    """Makes a store with the content of another one; it appears when all of it is on the disk. Only what the index
+    names is copied. Parts that are missing or damaged are so in the copy, too.
 
     Raises:
         FormatError: the source is no store, or damaged.
@@ -53,24 +57,42 @@ def _copy_to(store: GridStore, folder: Path, last: bool) -> bool:
                 path = copies.path(key, part.version, name)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 try:
-                    shutil.copyfile(files.path(key, part.version, name), path)
+                    _copy_part(files.path(key, part.version, name), path, part)
                     written.append(path)
                 except FileNotFoundError:
                     now = store.cell(key).parts.get(name) if key in store else None
                     if not last and (now is None or now.version != part.version):
                         return False
+        written += _copy_beside(store.path, folder, index.visits())
     finally:
         index.close()
-    if (store.path / VISITS).is_dir():
-        if (store.path / VISITS).is_symlink():
-            raise FormatError(f"{store.path / VISITS}: is a link; a store holds none")
-        shutil.copytree(store.path / VISITS, folder / VISITS, symlinks=True)
-        written += (folder / VISITS).iterdir()
-    known = store.path / OBJECTS_FILE
-    if known.is_file():
-        shutil.copyfile(known, folder / OBJECTS_FILE, follow_symlinks=False)  # a store with links was not opened
-        written.append(folder / OBJECTS_FILE)
     folders = {path.parent for path in written} | {path.parent.parent for path in written[1:]}
     with ThreadPoolExecutor(_WAITING_THREADS) as pool:
         list(pool.map(wait_for_disk, [*written, *folders]))
     return True
+
+
+def _copy_part(source: Path, target: Path, part: PartRecord) -> None:
+    """Copies a part; of one that is not as large as the index says, or than can be, an empty file is made, which is
+    damaged likewise. Raises FileNotFoundError if there is none."""
+    size = source.stat().st_size
+    try:
+        if size == part.bytes:
+            copy_foreign(source, target, limit=min(size, most_memory_bytes()))
+            return
+    except FormatError:
+        source.stat()  # removed by a writer meanwhile?
+    target.write_bytes(b"")
+
+
+def _copy_beside(source: Path, target: Path, visits: Sequence[str]) -> list[Path]:
+    """Copies what is remembered of the visits that the index knows, and the objects; gives the copies."""
+    known = [(visit_file(source, name), visit_file(target, name)) for name in visits]
+    known.append((source / OBJECTS_FILE, target / OBJECTS_FILE))  # a store with links was not opened
+    written = []
+    for file, copy in known:
+        if file.is_file():
+            copy.parent.mkdir(exist_ok=True)
+            copy_foreign(file, copy, MAX_TEXT_BYTES)
+            written.append(copy)
+    return written

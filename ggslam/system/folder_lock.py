@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ggslam.errors import RunFolderError
 from ggslam.system.foreign import printable
+from ggslam.system.links import refuse_shared_file
 
 try:
     import fcntl
@@ -151,9 +152,14 @@ def _enter(folder: Path, name: str) -> _Key:
 
 
 def _lock(path: Path) -> int:
-    """A descriptor that holds the lock."""
+    """A descriptor that holds the lock. Raises RunFolderError if its file may be somebody's."""
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        try:
+            refuse_shared_file(path, os.fstat(descriptor))
+        except RunFolderError:
+            os.close(descriptor)
+            raise
         try:
             if fcntl is not None:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -20,6 +20,7 @@ MAX_TEXT_BYTES = 256 << 20
 """Descriptions, tables and trajectories in text: a trajectory of a day at 30 frames/s has 200 MB."""
 MAX_IMAGE_BYTES = 256 << 20
 """One image file."""
+_BLOCK = 1 << 20
 _LONGEST_NAME = 255
 """Bytes of a file's name, on all usual file systems."""
 
@@ -72,16 +73,76 @@ def read_foreign(path: str | Path, limit: int | None = None, error: type[GgslamE
         MemoryFullError: a file that could be held was not, for memory is full.
     """
     with open_foreign(path, error) as file:
-        size = os.fstat(file.fileno()).st_size
-        most = most_memory_bytes() if limit is None else limit
-        if size > most:
-            raise error(f"{path}: too large for what it is: {size:,} bytes, at most {most:,} are read")
+        size = _size_within(file, path, limit, error)
         try:
             return file.read(size) or b""  # None: of some files in /proc, without a size
         except OSError as reason:
             raise error(f"{path}: cannot be read: {reason.strerror or reason}") from None
         except MemoryError:
             raise MemoryFullError(f"{path}: memory is full: no room for its {size:,} bytes") from None
+
+
+def _size_within(file: BinaryIO, path: str | Path, limit: int | None, error: type[GgslamError]) -> int:
+    size = os.fstat(file.fileno()).st_size
+    most = most_memory_bytes() if limit is None else limit
+    if size > most:
+        raise error(f"{path}: too large for what it is: {size:,} bytes, at most {most:,} are read")
+    return size
+
+
+def copy_foreign(
+    source: str | Path, target: Path, limit: int | None = None, error: type[GgslamError] = FormatError
+) -> None:
+    """Copies the content of a regular file, as many bytes as it has when it is opened.
+
+    Args:
+        source: the file.
+        target: where to; what is there is replaced.
+        limit: bytes it may have, so that a file of holes does not fill the disk; None: as many as this machine's
+            memory has.
+        error: class of the error to raise.
+
+    Raises:
+        error: as `read_foreign`; nothing was written.
+        OSError: `target` cannot be written.
+    """
+    with open_foreign(source, error) as file:
+        left = _size_within(file, source, limit, error)
+        with target.open("wb") as copy:
+            while left > 0:
+                try:
+                    block = file.read(min(left, _BLOCK))
+                except OSError as reason:
+                    raise error(f"{source}: cannot be read: {reason.strerror or reason}") from None
+                if not block:
+                    break
+                copy.write(block)
+                left -= len(block)
+
+
+def copy_foreign_folder(
+    source: Path, target: Path, limit: int | None = None, error: type[GgslamError] = FormatError
+) -> None:
+    """Copies the files of a folder and of those in it, each as `copy_foreign` does; links in it are refused.
+
+    Args:
+        source: the folder.
+        target: where to; made if it is not there.
+        limit: bytes that each may have, see `copy_foreign`.
+        error: class of the error to raise.
+
+    Raises:
+        error: there is a link, or a file cannot be copied; names it and the reason.
+        OSError: `target` cannot be written.
+    """
+    target.mkdir(exist_ok=True)
+    for path in sorted(source.iterdir()):
+        if path.is_symlink():
+            raise error(f"{path}: is a link; files behind links are not copied")
+        if path.is_dir():
+            copy_foreign_folder(path, target / path.name, limit, error)
+        else:
+            copy_foreign(path, target / path.name, limit, error)
 
 
 def read_foreign_text(path: str | Path, error: type[GgslamError] = FormatError, limit: int = MAX_TEXT_BYTES) -> str:
@@ -98,10 +159,14 @@ def read_foreign_text(path: str | Path, error: type[GgslamError] = FormatError, 
 
 
 def is_plain_name(name: object) -> bool:
-    """Whether this is a name of a file in a folder, and nothing that leads elsewhere or is longer than names can be."""
+    """Whether this is a name of a file in a folder, and nothing that leads elsewhere, is longer than names can be or
+    has characters that the file system cannot write."""
     if not isinstance(name, str) or name in ("", ".", "..") or set(name) & {"/", "\\", "\0"}:
         return False
-    return len(name.encode(errors="surrogatepass")) <= _LONGEST_NAME
+    try:
+        return len(os.fsencode(name)) <= _LONGEST_NAME
+    except UnicodeEncodeError:  # half a pair of UTF-16, which JSON can hold
+        return False
 
 
 def member(folder: str | Path, name: str, error: type[GgslamError] = FormatError) -> Path:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Links where ggslam keeps files of its own: it makes none, so one that is there was planted or is a user's mistake.
+That goes for hard links, too, of files that are written in place: the same bytes may be somebody's file elsewhere.
 
 Whoever moves, replaces or deletes by name in such a folder asks here first. A folder that the user names may itself be
 a link: that is the user's choice.
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO
@@ -30,6 +32,29 @@ def refuse_link(path: Path, error: type[GgslamError] = RunFolderError) -> None:
         raise error(
             f"{path}: is a link to {_leads_to(path)}, and ggslam makes none there; nothing was moved or deleted. "
             "The link may be deleted"
+        )
+
+
+def refuse_shared_file(
+    path: Path, found: os.stat_result, advice: str = "it may be deleted", error: type[GgslamError] = RunFolderError
+) -> None:
+    """Refuses a file that is to be written in place, not replaced, unless it is a regular file with this name alone.
+
+    Args:
+        path: of a file that ggslam makes itself.
+        found: what the system says of it, best of a descriptor that is open already.
+        advice: what the user can do about it.
+        error: class of the error to raise.
+
+    Raises:
+        error: it is of another kind, or has another name (a hard link), which may be that of somebody's file.
+    """
+    if not stat.S_ISREG(found.st_mode):
+        raise error(f"{path}: is not a regular file; {advice}")
+    if found.st_nlink > 1:
+        raise error(
+            f"{path}: has another name on this disk (a hard link) and may be somebody's file; nothing was written to "
+            f"it; {advice}"
         )
 
 

@@ -14,7 +14,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,20 @@ def publish(staged: Path, target: Path, marker: str, old: Sequence[str], before:
                 raise _failure(target, text, error) from None
 
 
+def refuse_links_at(target: Path, names: Collection[str]) -> None:
+    """Refuses what `publish` will, before the work whose result it is to put into place.
+
+    Args:
+        target: where to.
+        names: of what may be replaced or deleted there.
+
+    Raises:
+        RunFolderError: one of them is a link.
+    """
+    for name in sorted(names):
+        refuse_link(target / name)
+
+
 def is_being_saved(target: Path, marker: str) -> bool:
     """Whether files of a folder are changing places, or were when the program that did it was killed.
 
@@ -161,8 +175,7 @@ def _refuse_links(staged: Path, target: Path, marker: str, stale: Sequence[str])
             f"{staged}: holds a link, {link.relative_to(staged)}, and ggslam makes none; nothing was moved or deleted. "
             "The hidden folder may be deleted"
         )
-    for name in sorted({marker, *stale, *(path.name for path in staged.iterdir())}):
-        refuse_link(target / name)
+    refuse_links_at(target, {marker, *stale, *(path.name for path in staged.iterdir())})
 
 
 def _failure(target: Path, text: str, error: OSError) -> RunFolderError:

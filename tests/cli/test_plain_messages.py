@@ -34,7 +34,27 @@ def test_printing() -> None:
     assert out.getvalue() == f"note: {SAID}\n"
 
 
-@pytest.mark.parametrize("text", ["[Errno] x", "Errno 5", "a/.staged-1-00000000: is a link", ".staged/x", "[0] a/b"])
+@pytest.mark.parametrize(("text", "said"), [
+    ("cannot write a/.staged-12-0123abcd: File too large", "cannot write a: File too large"),
+    ("cannot write a/.staged-12-0123abcd/renders/0.png: full", "cannot write a/renders/0.png: full"),
+    ("cannot write b/.e.ggz-coming-12-0123abcd/map.bin: full", "cannot write b/e.ggz: full"),
+    ("cannot write .e.ggz-coming-12-0123abcd/map.bin: full", "cannot write e.ggz: full"),
+    ("b/.my st.grid-coming-12-0123abcd: cannot be made: full", "b/my st.grid: cannot be made: full"),
+    ("st/.index-14532-89abcdef: disk I/O error", "st/index.sqlite: disk I/O error"),
+    ("full: 'a/.map.12-0123abcd.ply' -> 'a/map.ply'", "full: 'a/map.ply' -> 'a/map.ply'"),
+    ("cannot write a/.a b.tar.12-0123abcd.gz: full", "cannot write a/a b.tar.gz: full"),
+    ("cannot write a/.noending.12-0123abcd: full", "cannot write a/noending: full"),
+])  # fmt: skip
+def test_what_is_being_made_has_the_name_that_it_is_to_have(text: str, said: str) -> None:
+    assert plain(text) == said and plain(said) == said
+
+
+@pytest.mark.parametrize("text", [
+    "[Errno] x", "Errno 5", "a/.staged-1-00000000: is a link", ".staged/x", "[0] a/b",
+    "a/.a-coming-1-00000000: is a link", "a/.staged-1-00000000: holds a link, map.ply",
+    "a/.map.ply.lock: x", "a/room.12-0123abcd.ply", "a/.index/x",
+    "a/.staged-1-000000001/x",
+])  # fmt: skip
 def test_what_is_something_else_stays(text: str) -> None:
     assert plain(text) == text
 

@@ -292,3 +292,28 @@ def test_a_run_is_not_resumed_through_links(
     again = ggslam("run", room, "--out", run, "--overwrite", "--stop", 2)
     assert again.returncode == 2 and "is a link to" in again.stderr
     assert sums(other) == before
+
+
+@pytest.mark.parametrize(("name", "words"), [
+    ("frames.csv", ("edit", "--rename", "ID", "bob", "--in-place")),
+    ("renders/huge.png", ("edit", "--rename", "ID", "bob", "--in-place")),
+    ("steps.csv", ("refine", "--steps", "1")),
+])  # fmt: skip
+def test_a_file_of_holes_is_not_copied(
+    room_run: RunFolder, tmp_path: Path, name: str, words: tuple[str, ...]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(room_run.path, run)
+    (run / name).parent.mkdir(exist_ok=True)
+    (run / name).write_bytes(b"")
+    os.truncate(run / name, 50 << 30)
+    some = str(room_run.segmented_map().table.objects[0].id)
+
+    def state() -> dict[Path, tuple[int, int, int]]:
+        found = {path: path.stat() for path in run.rglob("*") if path.is_file()}
+        return {path: (stat.st_ino, stat.st_size, stat.st_mtime_ns) for path, stat in found.items()}
+
+    before = state()
+    done = ggslam(words[0], run, *(some if word == "ID" else word for word in words[1:]))
+    assert done.returncode == 2 and f"{name}: too large for what it is: 53,687,091,200 bytes" in done.stderr
+    assert state() == before

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -226,16 +227,27 @@ def test_other_work_is_not_gone_on_with(copy: Path, refined: Path) -> None:
     assert "thrown away" in outcome.notes[0] and not outcome.resumed and files_of(copy) == files_of(refined)
 
 
-def test_a_damaged_cell_stays_as_it_is(copy: Path) -> None:
+@pytest.mark.parametrize("fault", ["torn", "holes", "cell", "version"])
+def test_a_damaged_cell_stays_as_it_is(copy: Path, fault: str) -> None:
     with GridStore.open(copy) as opened:
         keys = [key for key in opened.cells() if GAUSSIANS in opened.cell(key).parts]
         file = copy / "cells" / "_".join(map(str, keys[4])) / str(opened.cell(keys[4]).parts[GAUSSIANS].version)
-    (file / GAUSSIANS).write_bytes(b"torn")
+    if fault == "torn":
+        (file / GAUSSIANS).write_bytes(b"torn")
+    elif fault == "holes":
+        os.truncate(file / GAUSSIANS, 50 << 30)
+    else:
+        linked = file if fault == "version" else file.parent
+        linked.rename(copy.parent / "elsewhere")
+        linked.symlink_to(copy.parent / "elsewhere")
+    held = (file / GAUSSIANS).stat()
     done = ggslam("refine", copy, "--steps", 2)
-    assert done.returncode == 1 and "damaged" in done.stdout and "as it was" in done.stdout
+    said = "damaged: " if fault in ("torn", "holes") else "is a link"
+    assert done.returncode == 2 and said in done.stdout and "as it was" in done.stdout
     with GridStore.open(copy) as opened:
         assert opened.cell(keys[3]).parts[GAUSSIANS].version != opened.cell(keys[4]).parts[GAUSSIANS].version
-    assert (file / GAUSSIANS).read_bytes() == b"torn"
+    now = (file / GAUSSIANS).stat()
+    assert (now.st_ino, now.st_size, now.st_mtime_ns) == (held.st_ino, held.st_size, held.st_mtime_ns)
 
 
 def test_without_its_recording_a_store_is_refused(copy: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import zipfile
 from pathlib import Path
 
@@ -233,6 +234,14 @@ def test_what_is_damaged_is_said(store: Path, coded: Path, room_run: RunFolder, 
     refuse(ggslam("decode", coded, tmp_path / "c.grid", "--slice", 1), "decoded as a whole")
     copy_store(store, tmp_path / "copy.grid")
     file = sorted((tmp_path / "copy.grid").rglob(GAUSSIANS))[2]
-    file.write_bytes(b"torn")
-    done = ggslam("encode", tmp_path / "copy.grid", tmp_path / "y.ggc")
-    assert done.returncode == 1 and "left out" in done.stdout and len(CodedCells(tmp_path / "y.ggc").members) > 3
+    for damage in (lambda: file.write_bytes(b"torn"), lambda: os.truncate(file, 50 << 30), lambda: swap(file.parent)):
+        damage()
+        done = ggslam("encode", tmp_path / "copy.grid", tmp_path / "y.ggc")
+        assert done.returncode == 2 and "left out" in done.stdout and len(CodedCells(tmp_path / "y.ggc").members) > 3
+
+
+def swap(folder: Path) -> None:
+    """Puts a link in the place of a folder, to where it is then."""
+    aside = folder.parents[3] / "aside"
+    folder.rename(aside)
+    folder.symlink_to(aside)

@@ -68,3 +68,17 @@ def test_a_probe_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(RunFolderError, match="No space left"):
         RunFolder.create(tmp_path / "run")
     assert list((tmp_path / "run").iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["map.ply", "volumes", "renders", "run.json"])
+def test_a_link_is_refused_before_the_work(result: SlamResult, tmp_path: Path, name: str) -> None:
+    folder = RunFolder.create(tmp_path / "run")
+    folder.save(load_config(), RECORDING, result)
+    place = folder.path / name
+    if place.exists():
+        place.rename(folder.path / "aside")
+    place.symlink_to("aside" if (folder.path / "aside").exists() else ".")
+    before = sorted(path.name for path in folder.path.iterdir())
+    with pytest.raises(RunFolderError, match=f"{name}: is a link to") as refused:
+        RunFolder.create(folder.path, overwrite=True)
+    assert refused.value.exit_code == 2 and sorted(path.name for path in folder.path.iterdir()) == before

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import sqlite3
 import time
 from collections.abc import Callable
@@ -172,6 +173,40 @@ def test_pipes_and_links_beside_an_index_are_refused(store: Path, name: str, tmp
     (store / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(FormatError, match=f"{name}: is (a link|not a regular file)"):
         GridStore.open(store)
+
+
+@pytest.mark.parametrize("write", [False, True])
+@pytest.mark.parametrize("name", ["index.sqlite-wal", "index.sqlite-shm", "index.sqlite-journal", "lock"])
+def test_somebodys_file_under_a_name_of_ours_is_not_written(
+    store: Path, name: str, write: bool, tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine.txt"
+    mine.write_text("my thesis")
+    (store / name).unlink(missing_ok=True)
+    (store / name).hardlink_to(mine)
+    if name == "lock" and not write:  # which readers do not touch
+        use_all(store)
+    else:
+        with pytest.raises(GgslamError, match=f"{name}: has another name on this disk") as refused:
+            GridStore.open(store, write=write)
+        assert refused.value.exit_code == 2
+    assert mine.read_text() == "my thesis"
+
+
+def test_a_store_copied_with_hard_links_is_read_and_not_written(store: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.grid"
+    shutil.copytree(store, copy, copy_function=os.link)
+    before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
+    use_all(copy)
+    with pytest.raises(GgslamError, match="lock: has another name on this disk"):
+        GridStore.open(copy, write=True)
+    (copy / "lock").unlink()
+    with pytest.raises(GgslamError, match=r"index.sqlite: has another name on this disk.*cp -r"):
+        GridStore.open(copy, write=True)
+    assert {path: path.read_bytes() for path in before} == before
+    shutil.copytree(copy, tmp_path / "own.grid")
+    with GridStore.open(tmp_path / "own.grid", write=True) as opened:
+        assert len(opened.cells()) == CELLS
 
 
 def test_a_part_that_is_a_pipe_is_refused(store: Path) -> None:

@@ -9,7 +9,16 @@ import pytest
 from little_memory import with_little_memory
 
 from ggslam.errors import FormatError, RunFolderError
-from ggslam.system.foreign import is_plain_name, member, printable, read_foreign, read_foreign_text, refuse_links
+from ggslam.system.foreign import (
+    copy_foreign,
+    copy_foreign_folder,
+    is_plain_name,
+    member,
+    printable,
+    read_foreign,
+    read_foreign_text,
+    refuse_links,
+)
 
 
 def test_a_file_is_read_within_its_limit(tmp_path: Path) -> None:
@@ -72,10 +81,11 @@ def test_text_may_have_any_line_ends_and_a_mark(tmp_path: Path) -> None:
         read_foreign_text(path)
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/etc", "..\\x", "a\0", "a" * 256, None, 3, ["x"]])
+@pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/etc", "..\\x", "a\0", "a" * 256, None, 3, ["x"], "\ud800"])
 def test_names_that_lead_elsewhere(name: object) -> None:
     assert not is_plain_name(name)
-    assert is_plain_name("map.ply") and is_plain_name("..map")
+    assert is_plain_name("map.ply") and is_plain_name("..map") and is_plain_name("Stra\xdfe \U0001f40e")
+    assert is_plain_name(os.fsdecode(b"caf\xe9"))  # of an old system: no UTF-8, but a name all the same
 
 
 def test_members_stay_in_their_folder(tmp_path: Path) -> None:
@@ -105,3 +115,30 @@ def test_links_out_of_a_folder_are_found_however_deep(tmp_path: Path) -> None:
 
 def test_control_characters_are_shown_not_sent() -> None:
     assert printable("mug \x1b[2J\x07\u202e\n\tä 杯") == "mug \\x1b[2J\\x07\\x202e\n\tä 杯"
+
+
+def test_a_copy_is_within_its_limit(tmp_path: Path) -> None:
+    data = os.urandom((1 << 21) + 17)
+    (tmp_path / "a").write_bytes(data)
+    copy_foreign(tmp_path / "a", tmp_path / "b", len(data))
+    assert (tmp_path / "b").read_bytes() == data
+    os.truncate(tmp_path / "a", 50 << 30)
+    with pytest.raises(RunFolderError, match=r"a: too large for what it is: 53,687,091,200 bytes"):
+        copy_foreign(tmp_path / "a", tmp_path / "c", 1 << 20, RunFolderError)
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize("leads_to", ["..", "b.txt", "/etc"])
+def test_a_folder_is_copied_without_its_links(tmp_path: Path, leads_to: str) -> None:
+    source = tmp_path / "source"
+    (source / "inner").mkdir(parents=True)
+    (source / "inner" / "b.txt").write_text("b")
+    (source / "a.txt").write_text("a")
+    copy_foreign_folder(source, tmp_path / "copy", 10)
+    assert sorted(p.relative_to(tmp_path / "copy").as_posix() for p in (tmp_path / "copy").rglob("*")) == [
+        "a.txt", "inner", "inner/b.txt",
+    ]  # fmt: skip
+    assert (tmp_path / "copy" / "inner" / "b.txt").read_text() == "b"
+    (source / "inner" / "z").symlink_to(leads_to)
+    with pytest.raises(FormatError, match="inner/z: is a link"):
+        copy_foreign_folder(source, tmp_path / "again", 10)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -83,3 +84,25 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
         with pytest.raises(RunFolderError, match="cannot be written to"), lock:
             pass
     assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize("kind", ["folder", "output"])
+def test_a_lock_that_is_somebodys_file_is_not_written(tmp_path: Path, kind: str) -> None:
+    mine, folder = tmp_path / "mine.txt", tmp_path / "run"
+    folder.mkdir()
+    mine.write_text("my thesis")
+    name = ".lock" if kind == "folder" else ".map.ply.lock"
+    (folder / name).hardlink_to(mine)
+    lock = folder_lock(folder) if kind == "folder" else output_lock(folder / "map.ply")
+    with pytest.raises(RunFolderError, match="has another name on this disk") as refused, lock:
+        pass
+    assert mine.read_text() == "my thesis" and refused.value.exit_code == 2 and str(folder / name) in str(refused.value)
+    (folder / name).unlink()
+    with folder_lock(folder), output_lock(folder / "map.ply"):
+        assert mine.read_text() == "my thesis"
+
+
+def test_a_lock_that_is_a_pipe_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / ".lock")
+    with pytest.raises(RunFolderError, match="not a regular file"), folder_lock(tmp_path):
+        pass

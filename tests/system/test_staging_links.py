@@ -167,6 +167,15 @@ def test_a_link_at_the_target_stops_publishing(tmp_path: Path, victim: Path, pla
     assert contents(victim) == mine and sorted(contents(target)) == [place]
 
 
+def test_a_name_that_no_file_can_have_stops_a_saving_before_it_begins(run: Path) -> None:
+    record = {"saving": {"from": waiting(run).name, "stale": ["points.ply", "\ud800"]}}
+    (run / MARKER).write_text(json.dumps(record))
+    before = contents(run)
+    with pytest.raises(RunFolderError, match=r"'saving' names what no run would .*nothing was moved") as refused:
+        finish_saving(run, MARKER)
+    assert contents(run) == before and refused.value.exit_code == 2 and str(refused.value).encode()
+
+
 def test_files_of_another_folder_are_not_published(tmp_path: Path, run: Path, victim: Path) -> None:
     (tmp_path / "out").mkdir()
     mine, before = contents(victim), contents(run)

@@ -74,13 +74,14 @@ class CodeTask:
 @dataclass
 class CodedStore:
     """A written file: Gaussians in it, bytes of them in the store, bytes by cell, cells that could not be coded and
-    why, and seconds."""
+    why, whose fault that is (`exit_code` of errors: 2: the store's), and seconds."""
 
     path: Path
     gaussians: int = 0
     store_bytes: int = 0
     sizes: dict[CellKey, int] = field(default_factory=dict)
     failures: dict[CellKey, str] = field(default_factory=dict)
+    exit_code: int = 2
     seconds: float = 0.0
 
 
@@ -168,6 +169,7 @@ class _Coding:
         """A cell was coded, or could not be."""
         if isinstance(found, Failure):
             self.outcome.failures[task.key] = found.line
+            self.outcome.exit_code = min(self.outcome.exit_code, found.exit_code)
         else:
             write_bytes(self.folder / _file_of(task.key), found)
             cell = self.store.cell(task.key)
@@ -180,7 +182,9 @@ class _Coding:
     def join(self, rate: str) -> None:
         """Writes the file."""
         if not self.members:
-            raise FormatError(next(iter(self.outcome.failures.values())))
+            error = FormatError(next(iter(self.outcome.failures.values())))
+            error.exit_code = self.outcome.exit_code
+            raise error
         keys, own, files = sorted(self.members), self.store.settings, self._files()
         head = CellsRecord(
             format=CELLS_FORMAT, version=CELLS_VERSION, ggslam=__version__, rate=rate, spacing=own.spacing,

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,13 +11,14 @@ import numpy as np
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
+from ggslam.runs.copied_files import copy_files
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
 from ggslam.runs.saving_parts import save_points
-from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRAJECTORIES, TRUTH_FILE, write_objects
+from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRUTH_FILE, write_objects
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import make_folder
@@ -74,13 +74,7 @@ def _stage(
 ) -> None:
     make_folder(staged / "renders")
     kept = (*COPIED, *SCORES, *POINTS, PLACES_FILE) if named_only else COPIED
-    for name in kept:
-        if (source.path / name).is_file():
-            shutil.copyfile(source.path / name, staged / name)
-    if (source.path / TRAJECTORIES).is_dir():
-        shutil.copytree(source.path / TRAJECTORIES, staged / TRAJECTORIES, dirs_exist_ok=True)
-    if named_only and (source.path / "renders").is_dir():
-        shutil.copytree(source.path / "renders", staged / "renders", dirs_exist_ok=True)
+    copy_files(source.path, staged, kept, renders=named_only)
     source.timing().model_copy(update={"gaussians": len(scene.gaussians)}).write(staged)
     for name, picture in pictures.items():
         write_picture(staged / "renders" / name, picture)

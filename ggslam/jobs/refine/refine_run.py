@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,13 +20,14 @@ from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
 from ggslam.mapping.scale import scale_settings
 from ggslam.native.loader import NativeContext
 from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.runs.copied_files import copy_files
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
 from ggslam.runs.saving_parts import save_points
-from ggslam.runs.writing import RUN_FILES, TRAJECTORIES, TRUTH_FILE, write_objects
+from ggslam.runs.writing import RUN_FILES, TRUTH_FILE, write_objects
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
 from ggslam.slam.saved_places import PLACES_FILE
@@ -145,11 +145,7 @@ def _save(
     """Writes the refined run; `steps`: made on each frame."""
 
     def write(staged: Path) -> RunRecord:
-        for name in _STAY:
-            if (source.path / name).is_file():
-                shutil.copyfile(source.path / name, staged / name)
-        if (source.path / TRAJECTORIES).is_dir():
-            shutil.copytree(source.path / TRAJECTORIES, staged / TRAJECTORIES, dirs_exist_ok=True)
+        copy_files(source.path, staged, _STAY)
         record = source.keyframes()
         changed = [
             k.model_copy(update={"iterations": k.iterations + steps.get(k.frame, 0)}) for k in record.keyframes

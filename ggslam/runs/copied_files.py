@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of a run that stay as they are in one made of it: copied within limits, for a run may be from elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from ggslam.errors import RunFolderError
+from ggslam.runs.writing import TRAJECTORIES
+from ggslam.system.foreign import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, copy_foreign, copy_foreign_folder
+
+_TEXT = (".txt", ".json", ".yaml", ".csv")
+
+
+def copy_files(run: Path, staged: Path, names: Iterable[str], renders: bool = False) -> None:
+    """Copies files of a run that are there, and its trajectories.
+
+    Args:
+        run: its folder.
+        staged: a folder to copy to.
+        names: of the files.
+        renders: its renders, too.
+
+    Raises:
+        RunFolderError: a file is larger than a run has it, no regular file, or a link in a folder; names it.
+        OSError: it cannot be written.
+    """
+    for name in names:
+        if (run / name).is_file():
+            limit = MAX_TEXT_BYTES if name.endswith(_TEXT) else None
+            copy_foreign(run / name, staged / name, limit, RunFolderError)
+    if (run / TRAJECTORIES).is_dir():
+        copy_foreign_folder(run / TRAJECTORIES, staged / TRAJECTORIES, MAX_TEXT_BYTES, RunFolderError)
+    if renders and (run / "renders").is_dir():
+        copy_foreign_folder(run / "renders", staged / "renders", MAX_IMAGE_BYTES, RunFolderError)
