@@ -130,8 +130,8 @@ class MaskReader:
                 nearest pixel.
 
         Raises:
-            SequenceError: missing, damaged, no image of ids, of too many pixels, of another aspect than the first expected size, or all
-                its ids are missing in pred.json; also as `prepare`.
+            SequenceError: missing, damaged, no image of ids, of too many pixels, of another aspect than the first
+                expected size, or all its ids are missing in pred.json; also as `prepare`.
         """
         self.prepare()
         image = read_mask_image(path, self._most)

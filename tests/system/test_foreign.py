@@ -8,8 +8,16 @@ from pathlib import Path
 import pytest
 from little_memory import with_little_memory
 
-from ggslam.errors import FormatError, RunFolderError
-from ggslam.system.foreign import is_plain_name, member, printable, read_foreign, read_foreign_text, refuse_links
+from ggslam.errors import ConfigError, FormatError, RunFolderError
+from ggslam.system.foreign import (
+    given_path,
+    is_plain_name,
+    member,
+    printable,
+    read_foreign,
+    read_foreign_text,
+    refuse_links,
+)
 
 
 def test_a_file_is_read_within_its_limit(tmp_path: Path) -> None:
@@ -105,3 +113,19 @@ def test_links_out_of_a_folder_are_found_however_deep(tmp_path: Path) -> None:
 
 def test_control_characters_are_shown_not_sent() -> None:
     assert printable("mug \x1b[2J\x07\u202e\n\tä 杯") == "mug \\x1b[2J\\x07\\x202e\n\tä 杯"
+
+
+@pytest.mark.parametrize(
+    "text", ["n" * 256, "a/" + "ü" * 128, "n" * 200 + "/" + "m" * 5000, "a/" * 2048, "a\0b", "\0", "a\ud800b"]
+)
+def test_paths_that_no_file_can_have(text: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        given_path(text)
+    assert len(str(error.value)) < 120 and "\0" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["n" * 255, "ü" * 127, "a/" * 2047 + "b", "", ".", "/", os.fsdecode(b"\xff" * 255)])
+def test_paths_that_files_can_have(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert given_path(text) == Path(text)
+    assert given_path(text).exists() == (text in ("", ".", "/"))  # no error
