@@ -126,8 +126,8 @@ def main() -> None:
         raise
     except OSError as error:
         too_long = error.errno == errno.ENAMETOOLONG
-        text = f"{str(error.filename)[:_SHOWN]!r}...: {error.strerror}" if too_long else error
-        errors.print(f"error: {text}", highlight=False, soft_wrap=True, markup=False)
+        said = f"{str(error.filename)[:_SHOWN]!r}...: {error.strerror}" if too_long else error
+        errors.print(f"error: {said}", highlight=False, soft_wrap=True, markup=False)
         sys.exit(2 if too_long else 1)
     except Exception as error:
         text = _in_words(error)

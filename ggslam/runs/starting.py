@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -204,6 +204,6 @@ def ancestors(folder: RunFolder) -> list[Path]:
     return paths
 
 
-def arrays_with_prefix(arrays: dict[str, Any], prefix: str) -> dict[str, np.ndarray]:
+def arrays_with_prefix(arrays: Mapping[str, Any], prefix: str) -> dict[str, np.ndarray]:
     """Those whose name begins so, by the rest of their names."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
