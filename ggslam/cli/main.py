@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -42,6 +43,8 @@ from ggslam.cli.old_names import Command
 from ggslam.errors import GgslamError
 from ggslam.system.interrupts import Interrupted, exit_code, stop_like_ctrl_c
 
+_SHOWN = 60
+"""Characters of a name that is far too long."""
 _TORCH_HAS_NO_MEMORY = "DefaultCPUAllocator: "
 """How torch says so; it has no class of errors for it."""
 
@@ -122,8 +125,10 @@ def main() -> None:
             errors.print("interrupted")
         raise
     except OSError as error:
-        errors.print(f"error: {error}", highlight=False, soft_wrap=True, markup=False)
-        sys.exit(1)
+        too_long = error.errno == errno.ENAMETOOLONG
+        said = f"{str(error.filename)[:_SHOWN]!r}...: {error.strerror}" if too_long else error
+        errors.print(f"error: {said}", highlight=False, soft_wrap=True, markup=False)
+        sys.exit(2 if too_long else 1)
     except Exception as error:
         text = _in_words(error)
         if text is None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from ggslam.slam.result import LearnedObjects
 from ggslam.slam.saved_places import KEYFRAME_CAMERAS, PLACES_FILE
 from ggslam.slam.slam import Slam
 from ggslam.system.array_forms import Form, PoseForm, check_arrays
+from ggslam.system.images import MAX_PIXELS
 from ggslam.tracking.settings import DepthNoise
 
 _NEEDED = "to grow its map, the images of its keyframes are needed"
@@ -36,8 +37,10 @@ class OtherImagesError(Exception):
 
 
 def camera_of(row: np.ndarray) -> Camera:
-    """The camera of a row of places.npz. Raises FormatError if it is none."""
+    """The camera of a row of places.npz. Raises FormatError if it is none, or has more pixels than images may have."""
     check_arrays({"camera": row}, {"camera": Form("float", 6, finite=True)}, "places")
+    if not (row[:2] >= 1).all() or row[0] * row[1] > MAX_PIXELS or not (row[2:4] > 0).all():
+        raise FormatError(f"places: 'camera': impossible: {row.tolist()}")
     return Camera(int(row[0]), int(row[1]), *(float(value) for value in row[2:]))
 
 
@@ -201,6 +204,6 @@ def ancestors(folder: RunFolder) -> list[Path]:
     return paths
 
 
-def arrays_with_prefix(arrays: dict[str, Any], prefix: str) -> dict[str, np.ndarray]:
+def arrays_with_prefix(arrays: Mapping[str, Any], prefix: str) -> dict[str, np.ndarray]:
     """Those whose name begins so, by the rest of their names."""
     return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}

@@ -19,6 +19,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.mask_images import EQUAL_CHANNELS, MaskImage, read_mask_image
 from ggslam.sequences.recording import read_text
+from ggslam.system.images import MAX_PIXELS
 
 LARGEST_ID = 65535
 _CODES = 1 << 24
@@ -56,8 +57,9 @@ class InstanceCodes:
         return np.where(listed, ids, 0).astype(np.uint16), (codes > 0) & ~listed
 
 
-def read_id_table(files: list[Path]) -> InstanceCodes:
-    """The codes of a set of masks: those that pred.json lists beside or above them, else all that occur in the files.
+def read_id_table(files: list[Path], most: int = MAX_PIXELS) -> InstanceCodes:
+    """The codes of a set of masks: those that pred.json lists beside or above them, else all that occur in the files of
+    at most so many pixels.
 
     Raises:
         SequenceError: more than 65535 of them.
@@ -67,7 +69,7 @@ def read_id_table(files: list[Path]) -> InstanceCodes:
         if path.is_file() and (listed := _listed_codes(path)) is not None:
             return _check_size(InstanceCodes(listed, str(path)), folder)
     _log.info("reading all %d masks in %s once for their ids", len(files), folder)
-    codes, coded = _occurring_codes(files)
+    codes, coded = _occurring_codes(files, most)
     return _check_size(InstanceCodes(codes, "the masks themselves", coded), folder)
 
 
@@ -104,12 +106,12 @@ def _segment_ids(content: Any) -> Iterator[int]:
             yield from (int(segment["id"]) for segment in entry["segments_info"])
 
 
-def _occurring_codes(files: Iterable[Path]) -> tuple[np.ndarray, bool]:
+def _occurring_codes(files: Iterable[Path], most: int) -> tuple[np.ndarray, bool]:
     """Sorted codes of all masks, int32, and whether any is RGB-coded: if not, images of equal channels are grey ids."""
     seen, seen_equal, any_coded = np.zeros(_CODES, bool), np.zeros(256, bool), False
     for path in files:
         try:
-            image = read_mask_image(path)
+            image = read_mask_image(path, most)
         except SequenceError:
             continue  # reported when it is read for its frame
         if image.equal_channels:

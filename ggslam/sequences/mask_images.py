@@ -15,12 +15,17 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.images import describe_channels
 from ggslam.system.foreign import open_foreign
-from ggslam.system.images import PNG_SIGNATURE, decode_image, read_image_bytes
+from ggslam.system.images import MAX_PIXELS, PNG_SIGNATURE, decode_image, read_image_bytes
 
 MaskKind = Literal["grey", "palette", "RGB"]
 
 EQUAL_CHANNELS = 1 + 256 + 65536
 """The code of a pixel whose three channels are v is v times this."""
+
+FINER_MASK = 4
+"""Masks are at most so many times as wide and high as the images."""
+SMALL = 4_000_000
+"""Pixels that a mask may have beside images of any size."""
 
 _KINDS: dict[int, MaskKind] = {0: "grey", 2: "RGB", 3: "palette", 4: "RGB", 6: "RGB"}
 """PNG colour types; grey with alpha (4) is decoded to three equal channels and alpha."""
@@ -60,18 +65,28 @@ def _format(content: bytes) -> tuple[int, MaskKind | None]:
     return content[24], _KINDS.get(content[25])
 
 
-def read_mask_image(path: Path) -> MaskImage:
+def most_pixels(*sizes: tuple[int, int]) -> int:
+    """Pixels that a mask may have beside images of these sizes (width, height): a black one of 100 megapixels is a
+    small file, and would take 2 GB."""
+    return max(SMALL, FINER_MASK**2 * max((width * height for width, height in sizes), default=0))
+
+
+def read_mask_image(path: Path, most: int = MAX_PIXELS) -> MaskImage:
     """Reads a PNG of grey ids (1 to 16 bits), palette indices, or RGB-coded ids.
 
+    Args:
+        path: of the file.
+        most: pixels that it may have, see `most_pixels`.
+
     Raises:
-        SequenceError: missing, damaged, no PNG, RGB of more than 8 bits, or partly transparent.
+        SequenceError: missing, damaged, no PNG, of more pixels, RGB of more than 8 bits, or partly transparent.
     """
     content = read_image_bytes(path, SequenceError)
     bits, kind = _format(content)
     if kind is None:
         raise SequenceError(f"{path}: expected a PNG mask (a JPEG does not keep ids), found another kind of image")
     pixels = _pixels_only(content, as_grey=kind == "palette")
-    raw = decode_image(path, pixels, cv2.IMREAD_UNCHANGED, error=SequenceError)
+    raw = decode_image(path, pixels, cv2.IMREAD_UNCHANGED, most, SequenceError)
     if kind != "RGB":
         if raw.ndim != 2 or raw.dtype not in (np.uint8, np.uint16):
             raise SequenceError(f"{path}: expected one channel of ids, found {describe_channels(raw)}")

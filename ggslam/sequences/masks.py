@@ -16,6 +16,7 @@ from ggslam.sequences.mask_ids import InstanceCodes, read_id_table
 from ggslam.sequences.mask_images import EQUAL_CHANNELS, MaskImage, mask_kind, read_mask_image
 from ggslam.sequences.pixel_grid import Size, same_aspect
 from ggslam.sequences.recording import ImageFile, image_files, last_number
+from ggslam.system.images import MAX_PIXELS
 
 USUAL_FOLDERS = ("semantic_instance", "Annotations", "instance-filt", "instance", "masks", "object_mask")
 """Where masks lie in a folder that is laid out like a recording, or that a segmenter wrote."""
@@ -80,8 +81,12 @@ class MaskReader:
     May be used from several threads.
     """
 
-    def __init__(self, files: Iterable[Path | None], void_id: int | None = None) -> None:
-        """Takes the mask files of all frames of the recording; none is opened yet. `void_id`: means "unlabelled"."""
+    def __init__(
+        self, files: Iterable[Path | None], void_id: int | None = None, most: int = MAX_PIXELS
+    ) -> None:
+        """Takes the mask files of all frames of the recording; none is opened yet. `void_id`: means "unlabelled".
+        `most`: pixels that a mask may have, see `most_pixels`."""
+        self._most = most
         self._void = void_id
         self._files = [path for path in files if path is not None]
         self._lock = threading.Lock()
@@ -102,7 +107,7 @@ class MaskReader:
                 self._prepared = True
                 try:
                     if any(mask_kind(path) == "RGB" for path in self._files):
-                        self._table = read_id_table(self._files)
+                        self._table = read_id_table(self._files, self._most)
                 except SequenceError as error:
                     self._failure = error
         if self._failure is not None:
@@ -125,11 +130,11 @@ class MaskReader:
                 nearest pixel.
 
         Raises:
-            SequenceError: missing, damaged, no image of ids, of another aspect than the first expected size, or all
-                its ids are missing in pred.json; also as `prepare`.
+            SequenceError: missing, damaged, no image of ids, of too many pixels, of another aspect than the first
+                expected size, or all its ids are missing in pred.json; also as `prepare`.
         """
         self.prepare()
-        image = read_mask_image(path)
+        image = read_mask_image(path, self._most)
         height, width = image.codes.shape
         if expected and (width, height) not in expected:
             self._check_aspect(path, (width, height), expected[0])

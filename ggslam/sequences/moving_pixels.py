@@ -21,11 +21,10 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.scene.frame import Frame
 from ggslam.system.array_forms import Form
+from ggslam.system.images import MAX_PIXELS
 
 MOVERS_FILE = "movers.npz"
 """Of runs in which something was found to move."""
-LARGEST_SIDE = 1 << 15
-"""Pixels of an image."""
 
 
 @dataclass
@@ -108,8 +107,8 @@ class MovingPixels:
         names = ("frames", "size", "offsets", "data")
         frames, size, offsets, data = (np.asarray(arrays.get(name)) for name in names)
         typed = [array.dtype for array in (frames, size, offsets, data)] == [np.int32, np.int32, np.int64, np.uint8]
-        shaped = typed and size.shape == (2,) and data.ndim == 1 and offsets.shape == (len(frames) + 1,)
-        if not shaped or not (size >= 1).all() or not (size <= LARGEST_SIDE).all():
+        shaped = typed and size.shape == (2,) and data.ndim == frames.ndim == 1 and offsets.shape == (len(frames) + 1,)
+        if not shaped or not (size >= 1).all() or int(size[0]) * int(size[1]) > MAX_PIXELS:
             raise FormatError("no masks of frames")
         if offsets[0] != 0 or offsets[-1] != len(data) or (np.diff(offsets) < 0).any():
             raise FormatError("offsets of masks that do not fit their data")

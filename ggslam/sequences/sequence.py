@@ -22,6 +22,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.depth_kind import PLAIN, DepthKind
 from ggslam.sequences.images import read_color, read_confidence, read_depth
+from ggslam.sequences.mask_images import most_pixels
 from ggslam.sequences.masks import MaskReader
 from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.sequences.pixel_grid import ImageGeometry, image_size, rays_of_depth
@@ -129,7 +130,6 @@ class Sequence:
         self.time_source: str = recording.time_source
         self.camera_source: str = recording.camera_source
         self.warnings: list[str] = list(recording.warnings)
-        self._masks = _mask_reader(recording)
         masked = self._select(selection)
         if masked < len(self) and any(entry.mask is not None for entry in recording.files):
             self.warnings.append(f"{len(self) - masked} of {len(self)} frames have no mask")
@@ -138,6 +138,7 @@ class Sequence:
             more = f" (and {len(known) - 1} more damaged frames)" if len(known) > 1 else ""
             raise SequenceError(recording.problems[known[0]] + more)
         self._geometry = self._measure(scale)
+        self._masks = self._mask_reader()
         self.color_size: tuple[int, int] = self._geometry.color_size
         self.depth_size: tuple[int, int] = self._geometry.depth_size
         self.stated_size: tuple[int, int] | None = None
@@ -220,7 +221,11 @@ class Sequence:
         self._process = os.getpid()
         if self._reopen is not None:
             self._recording = self._reopen()
-            self._masks = _mask_reader(self._recording)
+            self._masks = self._mask_reader()
+
+    def _mask_reader(self) -> MaskReader:
+        most = most_pixels(self._geometry.color_size, self._geometry.depth_size)
+        return MaskReader((entry.mask for entry in self._recording.files), self._recording.void_id, most)
 
     def default_camera(self, scale: float = 1.0) -> Camera:
         """The camera of images that come with `scale`; 1: by default."""
@@ -405,10 +410,6 @@ def _scale_note(stated: Camera, size: tuple[int, int]) -> str:
     """That intrinsics are brought to the size of the images, in words; "" where they are of that size."""
     own = (stated.width, stated.height)
     return "" if own == size else f", scaled from {own[0]}x{own[1]} to images of {size[0]}x{size[1]}"
-
-
-def _mask_reader(recording: Recording) -> MaskReader:
-    return MaskReader((entry.mask for entry in recording.files), recording.void_id)
 
 
 def _lens(recording: Recording) -> str:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.mask_images import EQUAL_CHANNELS, read_mask_image
+from ggslam.sequences.mask_images import EQUAL_CHANNELS, most_pixels, read_mask_image
 from ggslam.sequences.sequence import Sequence
 
 VOID = 255
@@ -21,11 +21,11 @@ def has_void_id(sequence: Sequence) -> bool:
     """Whether 255 stands in most masks of a recording, far from all other ids, and no name says that it is a thing."""
     if not sequence.has_masks or VOID in sequence.instance_names or sequence.void_id == VOID:
         return False
-    held, others = [], 0
+    held, others, most = [], 0, most_pixels(sequence.color_size, sequence.depth_size)
     for number in np.unique(np.linspace(0, len(sequence) - 1, LOOKS).round().astype(int)):
         path = sequence.files(int(number)).mask
         try:
-            image = None if path is None else read_mask_image(path)
+            image = None if path is None else read_mask_image(path, most)
         except SequenceError:
             continue
         if image is None:

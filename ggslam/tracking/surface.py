@@ -39,6 +39,15 @@ _SAVED = {
 }  # fmt: skip
 
 
+def check_surface_arrays(arrays: Mapping[str, np.ndarray]) -> None:
+    """Raises FormatError unless these could be what `MeasuredSurface.to_arrays` gave."""
+    check_arrays(arrays, _SAVED, "surface")
+    if np.abs(arrays["reach"]).max(initial=0) > PoseForm.FARTHEST_M:
+        raise FormatError(f"surface: 'reach': expected points within {PoseForm.FARTHEST_M:g} m of their keyframes")
+    if arrays["counts"].astype(np.int64).sum() != len(arrays["points"]):
+        raise FormatError("surface: points do not fit their numbers")
+
+
 class _Part:
     """One keyframe's points and normals in its camera's frame, float32 [n, 3]; in an archive if there is one."""
 
@@ -263,10 +272,8 @@ class MeasuredSurface:
         Raises:
             FormatError: arrays that do not fit together.
         """
-        check_arrays(arrays, _SAVED, "surface")
+        check_surface_arrays(arrays)
         counts, poses = arrays["counts"].astype(np.int64), arrays["poses"]
-        if counts.sum() != len(arrays["points"]):
-            raise FormatError("surface: points do not fit their numbers")
         ends = np.cumsum(counts)[:-1]
         for q, n, r, T in zip(
             np.split(arrays["points"], ends), np.split(arrays["normals"], ends), arrays["reach"], poses, strict=True

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -104,9 +105,12 @@ def _settings(path: str | Path, arrays: dict[str, np.ndarray]) -> TsdfSettings:
     try:
         if int(arrays["version"]) != _VERSION:
             raise FormatError(f"{path}: TSDF of version {int(arrays['version'])}, expected {_VERSION}")
-        names, values = arrays["setting_names"], arrays["setting_values"]
-        return TsdfSettings(**{str(n): float(v) for n, v in zip(names, values, strict=True)})
-    except (KeyError, TypeError, ValueError, ConfigError) as error:
+        values = dict(zip(arrays["setting_names"].tolist(), arrays["setting_values"].tolist(), strict=True))
+        known = {field.name for field in dataclasses.fields(TsdfSettings)}
+        if not known.issuperset(values) or not all(type(v) is float and math.isfinite(v) for v in values.values()):
+            raise ValueError("its settings are no finite numbers of a TSDF")
+        return TsdfSettings(**values)
+    except (KeyError, TypeError, ValueError, OverflowError, ConfigError) as error:
         raise FormatError(f"{path}: not {_CONTENT} written by ggslam: {error}") from None
 
 

@@ -80,3 +80,15 @@ def test_files_that_cannot_change_places(tmp_path: Path, monkeypatch: pytest.Mon
     text = str(failed.value)
     assert text.startswith(f"{tmp_path}: not all files could be put into place; the next command on it will go on: ")
     assert text.endswith("Read-only file system") and staged.is_dir()  # what waits is kept
+
+
+@pytest.mark.parametrize("count", [300, 5000])
+@pytest.mark.parametrize(
+    "words", [("inspect", "LONG"), ("run", "a", "--out", "LONG"), ("submaps", "LONG"), ("batch", "LONG"),
+              ("verify", "LONG"), ("view", "LONG"), ("synth", "LONG")],
+    ids=" ".join,
+)  # fmt: skip
+def test_names_that_are_too_long(words: tuple[str, ...], count: int, tmp_path: Path) -> None:
+    done = ggslam(*("x" * count if word == "LONG" else word for word in words))
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ") and len(done.stderr) < 500, done.stderr

@@ -76,6 +76,14 @@ def test_a_short_manifest(tmp_path: Path) -> None:
         ("recordings: [a]\nout: linked/elsewhere", "out: linked/elsewhere lies outside"),
         ("recordings: [a, b/a]", "two runs would have the folder a/default/seed0"),
         ("recordings: [a", "experiments.yaml: "),
+        ('recordings: [{path: "a\\0b"}]', "a path cannot have a zero byte"),
+        ('recordings: [a]\nout: "x\\0y"', "a path cannot have a zero byte"),
+        (f"recordings: [{'a' * 5000}]", "a{60}...': too long for a path: 5,000 characters$"),
+        (f"recordings: [a]\nout: {'x' * 300}", "x{60}...': too long for a path: 300 characters$"),
+        (f"recordings: [a]\nout: {'x/' * 2048}y", "too long for a path: 4,097 characters$"),
+        (f"recordings: [{{path: a, name: {'n' * 300}}}]", "a name that is too long: n{60}...$"),
+        (f"recordings: [a]\nsettings: {{{'s' * 300}: ''}}", "a name that is too long: a/s{58}...$"),
+        (f"recordings: [a]\nseeds: [1{'0' * 300}]", "a name that is too long: a/default/seed10{45}...$"),
     ],
 )
 def test_what_is_wrong_is_named(

@@ -5,20 +5,25 @@ from __future__ import annotations
 
 import io
 import shutil
+import sqlite3
 from collections import Counter
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from command_line import ggslam, refuse, succeed
+from little_memory import with_little_memory
 from small_runs import store_of
 
+from ggslam.errors import ConfigError
 from ggslam.formats.triangle_mesh import read_mesh
 from ggslam.jobs.submaps.visit_records import records_of_store
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.jobs.volumes.cell_volumes import mesh_from_bytes
-from ggslam.jobs.volumes.store_volumes import ESDF, MESH, TSDF, make_store_volumes
+from ggslam.jobs.volumes.store_volumes import ESDF, MESH, TSDF, _Work, make_store_volumes
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recorded
 from ggslam.submaps.grid import GridStore
@@ -117,6 +122,34 @@ def test_what_cannot_be_made_of_a_store(store: Path, room_run: RunFolder, tmp_pa
     shutil.rmtree(tmp_path / "other.grid" / "visits")
     refuse(ggslam("volumes", tmp_path / "other.grid"), "nothing is known of the recordings")
     assert not (tmp_path / "other.grid" / "volumes").exists()
+
+
+@pytest.mark.parametrize("far", [100_000, 1_000_000, 2**31 - 5])
+def test_cells_anywhere_size_nothing(store: Path, tmp_path: Path, far: int) -> None:
+    """An index from elsewhere: the box around its cells and the cameras is counted before anything is made of it."""
+    copy_store(store, tmp_path / "far.grid")
+    with closing(sqlite3.connect(tmp_path / "far.grid" / "index.sqlite")) as index, index:
+        for table in ("cells", "parts"):
+            index.execute(f"UPDATE {table} SET x = x + {far}")
+    before = "from ggslam.jobs.volumes.store_volumes import make_store_volumes"
+    ended = with_little_memory(before, "make_store_volumes(path)", tmp_path / "far.grid", 256 << 20)
+    assert (ended.kind, ended.exit_code) == ("ConfigError", 2) and ended.taken < 32 << 20
+    assert "far.grid: its cells reach from" in ended.message and "is the index damaged?" in ended.message
+    assert not (tmp_path / "far.grid" / "volumes").exists()
+    refuse(ggslam("refine", tmp_path / "far.grid", "--steps", 1), "no part of its", "gaussians.npz")
+    assert not (tmp_path / "far.grid" / "refining").exists()
+
+
+def test_cells_and_cameras_that_are_both_far_away(store: Path) -> None:
+    """Together they span few cells, whose blocks have no coordinates."""
+    with GridStore.open(store) as opened:
+        far = [(x + 2**30, y, z) for x, y, z in opened.cells()]
+        (record,) = records_of_store(opened)
+        shift = np.zeros((4, 4))
+        shift[0, 3] = 2**30 * opened.grid.spacing
+        moved = record.model_copy(update={"poses": {frame: T + shift for frame, T in record.poses.items()}})
+        with patch.object(GridStore, "cells", return_value=far), pytest.raises(ConfigError, match="too far away"):
+            _Work(opened, [moved], COARSE)
 
 
 def test_from_the_command_line(store: Path, tmp_path: Path) -> None:

@@ -72,6 +72,11 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
         (lambda m: m["frames"][2].update(T_world_mover=[[1, 0], [0, 1]]), "expected a 4x4 matrix"),
         (lambda m: m["frames"][2].update(T_world_mover=[[None] * 4] * 4), "expected a 4x4 matrix of finite numbers"),
         (lambda m: m["frames"][0].update(box_min=[0, 1]), "expected three finite numbers"),
+        (lambda m: m["frames"][0].update(box_max=[0, 0, 1e300]), r"expected three finite numbers up to 1e\+06"),
+        (lambda m: m["frames"][2].update(T_world_mover=[[1e7] * 4] * 4), r"4x4 matrix of finite numbers up to 1e\+06"),
+        (lambda m: m.update(id=65536), "id"),
+        (lambda m: m.update(id=-1), "id"),
+        (lambda m: m["frames"][0].update(frame=2**31), "frame"),
     ],
 )
 def test_a_damaged_record_is_refused_with_its_place(tmp_path: Path, change: object, words: str) -> None:

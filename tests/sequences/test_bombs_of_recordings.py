@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import struct
 import zipfile
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +49,34 @@ def test_a_member_of_an_archive_that_expands(tmp_path: Path, way: int, megabytes
     reason = "has 314,572,800 bytes; at most" if way == zipfile.ZIP_DEFLATED else "packed by a method that is not read"
     assert ended.kind == "SequenceError" and reason in ended.message
     assert ended.taken < 30 << 20
+
+
+def black_png(path: Path, side: int, rgb: bool) -> None:
+    """All zero, written row by row."""
+    packer, row = zlib.compressobj(9), bytes(1 + side * (3 if rgb else 1))
+    rows = b"".join([packer.compress(row) for _ in range(side)]) + packer.flush()
+    header = struct.pack(">IIBBBBB", side, side, 8, 2 if rgb else 0, 0, 0, 0)
+    with path.open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for kind, data in ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b"")):
+            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+
+
+@pytest.mark.parametrize("rgb", [True, False], ids=["RGB", "grey"])
+def test_masks_of_98_megapixels(make: Callable[[str], Path], rgb: bool) -> None:
+    """All ids, the doubts of an inspection, and each frame's mask: their headers are enough."""
+    path = make("replica")
+    for mask in (path / "semantic_instance").iterdir():
+        black_png(mask, 9900, rgb)
+    assert mask.stat().st_size < 300_000
+    code = "inspect_sequence(opened := open_sequence(path)); opened.frame(3)"
+    before = (
+        "from ggslam.sequences import open_sequence; from ggslam.sequences.inspection import inspect_sequence\n"
+        "open_sequence(path := Path(sys.argv[1])).frame(0, masks=False)"
+    )
+    ended = with_little_memory(before, code, path, 300 << 20)
+    assert ended.kind == "SequenceError" and "claims 9900x9900 pixels; at most 4,000,000 are read" in ended.message
+    assert ended.taken < 60 << 20
 
 
 @pytest.mark.parametrize("count", [1, 100, 4095, 5000, 196_608, 2_000_000])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ def test_selected_and_joined(moving: MovingPixels, masks: dict[int, np.ndarray])
     assert both.frames == [3, 5, 9, 33, 35, 39] and np.array_equal(both.mask(33, (121, 161)), masks[3])
 
 
-@pytest.mark.parametrize("damage", ["data", "offsets", "size", "frames", "nothing"])
+@pytest.mark.parametrize("damage", ["data", "offsets", "size", "bomb", "one frame", "frames", "nothing"])
 def test_damaged_masks(moving: MovingPixels, damage: str) -> None:
     arrays = moving.to_arrays()
     if damage == "data":
@@ -61,6 +62,12 @@ def test_damaged_masks(moving: MovingPixels, damage: str) -> None:
         arrays["offsets"] = arrays["offsets"][::-1].copy()
     elif damage == "size":
         arrays["size"] = np.array([500, 500], np.int32)
+    elif damage == "bomb":
+        arrays["size"] = np.array([30_000, 30_000], np.int32)
+        arrays["data"] = np.frombuffer(zlib.compress(bytes(30_000 * 30_000 // 8)), np.uint8)
+        arrays |= {"offsets": np.array([0, len(arrays["data"])]), "frames": arrays["frames"][:1]}
+    elif damage == "one frame":
+        arrays["frames"] = np.array(3, np.int32)
     elif damage == "frames":
         arrays["frames"] = arrays["frames"][:-1]
     else:

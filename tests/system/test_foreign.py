@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from little_memory import with_little_memory
 
-from ggslam.errors import FormatError, RunFolderError
+from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.system.foreign import (
     copy_foreign,
     copy_foreign_folder,
+    given_path,
     is_plain_name,
     member,
     printable,
@@ -142,3 +143,19 @@ def test_a_folder_is_copied_without_its_links(tmp_path: Path, leads_to: str) -> 
     (source / "inner" / "z").symlink_to(leads_to)
     with pytest.raises(FormatError, match="inner/z: is a link"):
         copy_foreign_folder(source, tmp_path / "again", 10)
+
+
+@pytest.mark.parametrize(
+    "text", ["n" * 256, "a/" + "ü" * 128, "n" * 200 + "/" + "m" * 5000, "a/" * 2048, "a\0b", "\0", "a\ud800b"]
+)
+def test_paths_that_no_file_can_have(text: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        given_path(text)
+    assert len(str(error.value)) < 120 and "\0" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["n" * 255, "ü" * 127, "a/" * 2047 + "b", "", ".", "/", os.fsdecode(b"\xff" * 255)])
+def test_paths_that_files_can_have(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert given_path(text) == Path(text)
+    assert given_path(text).exists() == (text in ("", ".", "/"))  # no error

@@ -50,11 +50,17 @@ def test_damaged_files_are_refused(tmp_path: Path, wall: TsdfMap) -> None:
         "cut": data[: len(data) // 2], "empty": b"", "text": b"no map",
         "flipped": data[:5000] + bytes([data[5000] ^ 255]) + data[5001:],
     }  # fmt: skip
+    no_unicode = good["setting_names"].copy()
+    no_unicode.view(np.uint32)[3] = 0x00F00041  # beyond all characters
     changes: list[dict[str, np.ndarray]] = [
         {"version": np.array(99)}, {"version": np.zeros(3)}, {"value": good["value"][:-1]},
         {"value": good["value"].astype(float)}, {"dense": good["dense"].astype(np.int64)},
         {"free": np.zeros((2, 3), np.int32)},
         {"setting_values": 0 * good["setting_values"]}, {"setting_names": good["setting_names"][:-1]},
+        {"setting_values": good["setting_values"] * np.nan}, {"setting_values": good["setting_values"] * 1j},
+        {"setting_values": good["setting_values"].reshape(-1, 1)}, {"version": np.array(np.inf)},
+        {"setting_names": np.array(["\ud800" * 20] * len(good["setting_names"]))},
+        {"setting_names": no_unicode}, {"setting_names": good["setting_names"].astype(bytes)},
         {"dense": np.repeat(good["dense"][:1], len(good["dense"]), 0)},
     ]  # fmt: skip
     cases |= {f"change {n}": arrays_to_bytes(**{**good, **change}) for n, change in enumerate(changes)}

@@ -13,7 +13,7 @@ from typing import Any
 from ggslam.errors import ConfigError
 from ggslam.sequences import recognise_format
 from ggslam.slam.config import load_config
-from ggslam.system.foreign import given_path, read_foreign_text
+from ggslam.system.foreign import given_path, is_plain_name, read_foreign_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 
 REPLICA = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
@@ -149,6 +149,8 @@ def _jobs(
         for name, path, own in recordings for setting, words in settings.items() for seed in seeds
     ]  # fmt: skip
     folders = [job.name for job in jobs]
+    if long := next((name for name in folders if not all(map(is_plain_name, name.split("/")))), None):
+        raise ConfigError(f"{where}: a run's folder would have a name that is too long: {long[:60]}...")
     twice = sorted({name for name in folders if folders.count(name) > 1})
     if twice:
         raise ConfigError(f"{where}: two runs would have the folder {twice[0]}: give recordings and settings own names")

@@ -81,6 +81,7 @@ def refine_store(
 
     Raises:
         ConfigError: it has no Gaussians, or nothing is known of the recordings that they are from.
+        FormatError: the Gaussians of all cells are missing or damaged.
         GgslamError: a recording is not there any more, the store is damaged or cannot be written, or workers died; the
             cells that were done are kept for the next call.
     """
@@ -162,6 +163,9 @@ class _Refinement:
             raise error
         self._tell(outcome, cells)
         self.done.finish()
+        if len(self.failures) == self.total:
+            first = next(iter(outcome.failures.values()))
+            raise FormatError(f"{self.store.path}: no part of its {self.total} cells can be used: {first}")
         outcome.seconds = time.perf_counter() - start
         return outcome
 

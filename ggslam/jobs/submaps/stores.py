@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import RunFolderError
+from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.cloud_files import SUFFIXES, read_cloud_file
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, arrays_of_map, gaussians_to_bytes
 from ggslam.jobs.submaps.visit_records import remember_run
@@ -19,6 +19,7 @@ from ggslam.localization.surface import NORMAL
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint
+from ggslam.runs.starting import arrays_with_prefix, camera_of
 from ggslam.scene.arrays import read_all_arrays
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -30,6 +31,8 @@ from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.array_forms import PoseForm, check_arrays
+from ggslam.tracking.surface import check_surface_arrays
 
 INDOORS = SubmapSettings(voxel=0.02)
 """For maps of depth cameras."""
@@ -84,8 +87,11 @@ def store_of_run(
     try:
         points, attributes = _surface(arrays) if arrays else _cloud(folder.path / "points.ply")
         views, camera = _views(arrays) if arrays else ([], None)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise RunFolderError(f"{folder.path / PLACES_FILE}: not the places of a run: {error}") from None
+    except (KeyError, ValueError, IndexError, TypeError, FormatError) as error:
+        if not arrays:
+            raise
+        reason = f"lacks {error}" if isinstance(error, KeyError) else error
+        raise RunFolderError(f"{folder.path / PLACES_FILE}: not the places of a run: {reason}") from None
     others = list(_gaussian_parts(store, folder.gaussians()))
     if camera is not None:
         others += _place_parts(store, views, camera)
@@ -166,11 +172,11 @@ def _cloud(path: Path, columns: int | None = None) -> tuple[np.ndarray, dict[str
 
 def _surface(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """World points [n, 3] of the keyframes' surface as places.npz has it, with normals."""
-    ends = np.cumsum(arrays["surface_counts"])[:-1]
-    parts = zip(
-        np.split(arrays["surface_points"], ends), np.split(arrays["surface_normals"], ends), arrays["surface_reach"],
-        arrays["surface_poses"], strict=True,
-    )  # fmt: skip
+    held = arrays_with_prefix(arrays, "surface_")
+    check_surface_arrays(held)
+    ends = np.cumsum(held["counts"])[:-1]
+    each = (np.split(held["points"], ends), np.split(held["normals"], ends), held["reach"], held["poses"])
+    parts = zip(*each, strict=True)
     points, normals = [np.zeros((0, 3))], [np.zeros((0, 3), np.int8)]
     for steps, turned, reach, T in parts:
         points.append(transform_points(steps * (float(reach) / 32767), T))
@@ -179,11 +185,9 @@ def _surface(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np
 
 
 def _views(arrays: Mapping[str, np.ndarray]) -> tuple[list[StoredView], Camera]:
-    row = arrays["camera"]
-    camera = Camera(int(row[0]), int(row[1]), *(float(value) for value in row[2:]))
-    prefix = "loops_places_"
-    index = PlaceIndex.from_arrays(camera, {n.removeprefix(prefix): a for n, a in arrays.items() if prefix in n})
-    numbers = arrays[prefix + "numbers"].tolist()
+    camera, held = camera_of(arrays["camera"]), arrays_with_prefix(arrays, "loops_places_")
+    index, numbers = PlaceIndex.from_arrays(camera, held), held["numbers"].tolist()
+    check_arrays(arrays, {"loops_poses": PoseForm("float", None)}, "loops")
     places: list[Place] = [index[number] for number in numbers]
     return [StoredView(place, arrays["loops_poses"][n]) for place, n in zip(places, numbers, strict=True)], camera
 

@@ -53,6 +53,7 @@ from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import INDEX, GridStore
 from ggslam.volumes.esdf import FieldSettings
 from ggslam.volumes.mesh import Mesh, join_meshes, without_small_pieces
+from ggslam.volumes.tsdf import MOST_VOXELS
 from ggslam.volumes.tsdf_file import blocks_within, join_blocks
 from ggslam.volumes.volume_settings import VolumeSettings
 
@@ -64,6 +65,10 @@ _FUSED = "fused"
 """A visit of the results, begun when all cells are fused."""
 _LOOKS = 16
 """Frames that a worker looks through at a time."""
+MOST_CELLS = 500_000
+"""In the box around a store's cells and cameras, all of which are looked at; 1 KB each."""
+MOST_LOOKS = 1_000_000_000
+"""At so many cells, for all frames together; a byte each."""
 
 
 @dataclass
@@ -102,7 +107,7 @@ def make_store_volumes(
         observer: receives progress updates.
 
     Raises:
-        ConfigError: nothing is known of the recordings that the store is from.
+        ConfigError: nothing is known of the recordings that the store is from, or its cells lie too far apart.
         GgslamError: a recording is not there any more, or the results cannot be written.
     """
     path, settings = Path(path), settings or VolumeSettings()
@@ -138,12 +143,14 @@ def _is_ours(out: Path) -> bool:
 
 
 class _Work:
-    """Which cells are made of which frames."""
+    """Which cells are made of which frames. Raises ConfigError if the cells lie too far from one another or the
+    origin."""
 
     def __init__(self, store: GridStore, records: list[VisitRecord], settings: VolumeSettings) -> None:
         self.store, self.settings = store, settings
         self.texts = tuple(json.dumps(r.model_copy(update={"poses": {}}).values()) for r in records)
         self.poses = [(visit, frame, T) for visit, r in enumerate(records) for frame, T in sorted(r.poses.items())]
+        self._low, self._high = self._extent()
         self.seen = np.zeros((len(self.poses), 0), bool)
         """Which of the cells `keys` each frame may tell about, once that was looked up."""
 
@@ -159,11 +166,25 @@ class _Work:
 
     def keys(self) -> list[CellKey]:
         """Cells that may have blocks, sorted: those around the store's cells and the cameras."""
-        there = [*self.store.cells(), *(self.store.key_of(T[:3, 3]) for _, _, T in self.poses)]
-        spans = self.store.grid.spans
-        low, high = np.min(there, axis=0) - spans, np.max(there, axis=0) + spans
+        low, high = self._low, self._high
         return [(x, y, z) for x in range(low[0], high[0] + 1) for y in range(low[1], high[1] + 1)
                 for z in range(low[2], high[2] + 1)]  # fmt: skip
+
+    def _extent(self) -> tuple[list[int], list[int]]:
+        """Least and greatest coordinates of cells that may have blocks. An index from elsewhere may hold cells
+        anywhere: all in between can be looked at, and their blocks have coordinates."""
+        grid, voxel = self.store.grid, self.settings.tsdf.voxel
+        there = [*self.store.cells(), *(self.store.key_of(T[:3, 3]) for _, _, T in self.poses)]
+        if not there:
+            raise ConfigError(f"{self.store.path}: has no cells, and no frame of its runs has a pose")
+        low, high = np.min(there, axis=0) - grid.spans, np.max(there, axis=0) + grid.spans
+        where = f"{self.store.path}: its cells reach from {low.tolist()} to {high.tolist()}"
+        most = min(MOST_CELLS, MOST_LOOKS // max(1, len(self.poses)))
+        if math.prod((high - low + 1).tolist()) > most:
+            raise ConfigError(f"{where}; volumes are made of at most {most:,} cells together: is the index damaged?")
+        if np.abs([low, high]).max() * grid.spacing > MOST_VOXELS * voxel:
+            raise ConfigError(f"{where}; too far away for voxels of {voxel:g} m: is the index damaged?")
+        return low.tolist(), high.tolist()
 
     def looks(self, keys: list[CellKey]) -> list[LookTask]:
         """What finding out which frames tell about which cells needs."""

@@ -14,24 +14,29 @@ from ggslam.movers.point_files import POINTS_FILE
 from ggslam.objects.colors import id_palette
 from ggslam.runs.records.record import Array, Number, Record, RecordFile
 from ggslam.scene.poses import inverse, separation
+from ggslam.sequences.mask_ids import LARGEST_ID
 from ggslam.sequences.moving_pixels import MOVERS_FILE
 from ggslam.slam.result import SlamResult
+from ggslam.system.array_forms import PoseForm
 
 
 def _pose(value: np.ndarray) -> np.ndarray:
-    if value.shape != (4, 4) or not np.isfinite(value).all():
-        raise ValueError("expected a 4x4 matrix of finite numbers")
+    if value.shape != (4, 4) or not (np.abs(value) <= PoseForm.FARTHEST_M).all():
+        raise ValueError(f"expected a 4x4 matrix of finite numbers up to {PoseForm.FARTHEST_M:g}")
     return value
 
 
 def _corner(value: np.ndarray) -> np.ndarray:
-    if value.shape != (3,) or not np.isfinite(value).all():
-        raise ValueError("expected three finite numbers")
+    if value.shape != (3,) or not (np.abs(value) <= PoseForm.FARTHEST_M).all():
+        raise ValueError(f"expected three finite numbers up to {PoseForm.FARTHEST_M:g}")
     return value
 
 
 Pose = Annotated[Array, pydantic.AfterValidator(_pose)]
 Corner = Annotated[Array, pydantic.AfterValidator(_corner)]
+FrameIndex = Annotated[int, pydantic.Field(ge=0, lt=2**31)]
+MoverNumber = Annotated[int, pydantic.Field(ge=0, le=LARGEST_ID)]
+"""One that has a colour of its own, see `id_palette`."""
 
 
 class MoverFrameRecord(Record):
@@ -46,7 +51,7 @@ class MoverFrameRecord(Record):
         share: of the image that shows it.
     """
 
-    frame: int
+    frame: FrameIndex
     T_world_mover: Pose
     box_min: Corner
     box_max: Corner
@@ -100,7 +105,7 @@ class MoverRecord(Record):
         displacement: from the one to the other; None without both.
     """
 
-    id: int
+    id: MoverNumber
     name: str | None = None
     instance: int | None = None
     kind: Literal["rigid", "not rigid", "unknown"]
