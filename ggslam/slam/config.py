@@ -24,7 +24,7 @@ from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.object_masks import MaskSettings
 from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.system.atomic import write_text
-from ggslam.system.foreign import read_foreign_text
+from ggslam.system.foreign import given_path, read_foreign_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
@@ -133,7 +133,7 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
     values: dict[str, Any] = {}
     origin = "settings"
     if preset_or_file is not None:
-        path = Path(preset_or_file)
+        path = given_path(preset_or_file)
         if not path.suffix and str(preset_or_file) in presets():
             path = presets()[str(preset_or_file)]
         values, origin = _read_yaml(path), str(path)
