@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from little_memory import with_little_memory
 
-from ggslam.errors import ConfigError, FormatError, RunFolderError
+from ggslam.errors import FormatError, RunFolderError, SequenceError
 from ggslam.system.foreign import (
     given_path,
     is_plain_name,
@@ -119,7 +119,7 @@ def test_control_characters_are_shown_not_sent() -> None:
     "text", ["n" * 256, "a/" + "ü" * 128, "n" * 200 + "/" + "m" * 5000, "a/" * 2048, "a\0b", "\0", "a\ud800b"]
 )
 def test_paths_that_no_file_can_have(text: str) -> None:
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(SequenceError) as error:
         given_path(text)
     assert len(str(error.value)) < 120 and "\0" not in str(error.value)
 
