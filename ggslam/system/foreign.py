@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from ggslam.errors import ConfigError, FormatError, GgslamError, MemoryFullError
+from ggslam.errors import FormatError, GgslamError, MemoryFullError, SequenceError
 from ggslam.system.process_memory import most_memory_bytes
 
 MAX_TEXT_BYTES = 256 << 20
@@ -29,22 +29,26 @@ _SHOWN = 60
 """Characters of a path that is far too long."""
 
 
-def given_path(path: str | Path) -> Path:
+def given_path(path: str | Path, error: type[GgslamError] = SequenceError) -> Path:
     """A path as somebody wrote it, with `~` for a home; that of an unknown user stays as it is.
 
+    Args:
+        path: mostly of a recording, or of what belongs to one.
+        error: class of the error to raise.
+
     Raises:
-        ConfigError: no file can have this path: it, or a name in it, is too long, or it has a zero byte.
+        error: no file can have this path: it, or a name in it, is too long, or it has a zero byte.
     """
     text = os.fspath(path)
     shown = repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
     if "\0" in text:
-        raise ConfigError(f"{shown}: a path cannot have a zero byte")
+        raise error(f"{shown}: a path cannot have a zero byte")
     try:
         sizes = [len(os.fsencode(name)) for name in text.split("/")]
     except UnicodeEncodeError:
-        raise ConfigError(f"{shown}: a path cannot have these characters") from None
+        raise error(f"{shown}: a path cannot have these characters") from None
     if max(sizes) > _LONGEST_NAME or sum(sizes) + len(sizes) > _LONGEST_PATH:
-        raise ConfigError(f"{shown}: too long for a path: {len(text):,} characters")
+        raise error(f"{shown}: too long for a path: {len(text):,} characters")
     return Path(os.path.expanduser(path))  # noqa: PTH111 (Path's raises for unknown users)
 
 

@@ -155,7 +155,7 @@ def test_impossible_options(make: Make, options: dict[str, object], message: str
 
 @pytest.mark.parametrize("name", ["x" * 300, "~nobody-of-that-name/room", "room\0"])
 def test_impossible_names(name: str) -> None:
-    with pytest.raises(SequenceError, match="no such folder or file"):
+    with pytest.raises(SequenceError, match="no such folder or file|too long for a path|zero byte"):
         open_sequence(name)
 
 
