@@ -133,7 +133,7 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
     values: dict[str, Any] = {}
     origin = "settings"
     if preset_or_file is not None:
-        path = given_path(preset_or_file)
+        path = given_path(preset_or_file, ConfigError)
         if not path.suffix and str(preset_or_file) in presets():
             path = presets()[str(preset_or_file)]
         values, origin = _read_yaml(path), str(path)

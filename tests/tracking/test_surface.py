@@ -4,6 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ggslam.errors import FormatError
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import quaternion_to_matrix, se3_exp
@@ -142,5 +143,5 @@ def test_a_surface_comes_back_from_its_arrays() -> None:
     points = extract_points(corner_depth(truth), CAMERA, settings.points, DepthNoise(), context)
     found = align(points, again.target, truth, settings.align, DepthNoise(), context)
     assert np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]) < 1e-3 and found.overlap > 0.8
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(FormatError, match=r"'normals': expected int8 \[points, 3\]"):
         again.load({**surface.to_arrays(), "normals": np.zeros((3, 3), np.int8)})
