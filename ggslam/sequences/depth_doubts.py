@@ -25,6 +25,7 @@ from ggslam.sequences.edge_evidence import (
     stretches,
 )
 from ggslam.sequences.glances import Glance, look_over
+from ggslam.sequences.hung_pairs import judge_hung_pairs
 from ggslam.sequences.hung_streams import judge_hung
 from ggslam.sequences.noise_doubts import judge_noise, judge_views
 from ggslam.sequences.orientation import WORDS as ORIENTATIONS
@@ -78,7 +79,8 @@ class DepthDoubts:
         found += self._judge_edges(bool(hung)) if not found else []
         found += self._judge_measure() if not found else []
         still = judge_views(self.sequence, self._glances)
-        return [*found, *self._judge_repeats(hung), *self._judge_codes(), *still]
+        pairs = judge_hung_pairs(self.sequence)
+        return [*found, *self._judge_repeats(hung), *pairs, *self._judge_codes(), *still]
 
     @cached_property
     def _glances(self) -> list[Glance]:

@@ -53,10 +53,10 @@ def _judge(sequence: Sequence, glances: list[Glance], kind: str) -> list[Verdict
         text = f"colour images are blank: {told} show one and the same colour while depth moves on; take the cover off"
         return [Verdict("color_repeats", "doubtful", f"{text} the lens, or look how the images were written")]
     text = f"{same} images hang: {told} hold the {same} image of the first of them while {other} moves on"
-    return [Verdict(f"{kind}_repeats", "doubtful", f"{text}; {_remedy(sequence, found)}")]
+    return [Verdict(f"{kind}_repeats", "doubtful", f"{text}; {remedy_for(sequence, found)}")]
 
 
-def _remedy(sequence: Sequence, found: list[Stretch]) -> str:
+def remedy_for(sequence: Sequence, found: list[Stretch]) -> str:
     """How to leave them out, where they lie at one end."""
     numbers, (one, *more) = sequence.selection, found
     if not more and one.last == len(sequence) - 1 and one.first > 0:
@@ -69,7 +69,7 @@ def _remedy(sequence: Sequence, found: list[Stretch]) -> str:
 def find_hung(sequence: Sequence, glances: list[Glance], kind: str) -> list[Stretch]:
     """Stretches in which "color" or "depth" (`kind`) hangs, in order."""
     same, moved = _tests(kind)
-    spans = _same_files([getattr(sequence.files(k), kind) for k in range(len(sequence))])
+    spans = same_files([getattr(sequence.files(k), kind) for k in range(len(sequence))])
     found = [one for span in spans[:MOST_STRETCHES] if (one := _confirm(sequence, *span, same, moved))]
     for first, last in _same_views(sequence, glances, same, moved):
         if not any(one.first <= last and first <= one.last for one in found):
@@ -120,7 +120,7 @@ def _edge(sequence: Sequence, a: Glance, near: int, far: int, same: Test) -> int
     return near
 
 
-def _same_files(files: list[ImageFile]) -> list[tuple[int, int]]:
+def same_files(files: list[ImageFile]) -> list[tuple[int, int]]:
     """First and last of the frames whose files hold the same bytes, the longest first; none of other images."""
     spans, begin, unequal = [], 0, 0
     for k in range(1, len(files) + 1):

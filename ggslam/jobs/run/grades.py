@@ -95,7 +95,7 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
         _at_most((lost + doubted) / max(1, total), LOST_SHARE, BADLY_LOST),
         "doubtful" if searched > MUCH_SEARCHED * total or len(jumps) or codes & {"degenerate", "dropped"} else "good",
         "bad" if codes & {"textureless", "depth_noise"} else "good",
-        "doubtful" if stopped or total < FEWEST_FRAMES or "no_motion" in codes else "good",
+        "doubtful" if stopped or total < FEWEST_FRAMES or codes & {"no_motion", "both_repeat"} else "good",
     ]
     words = [f"{total - lost} of {total} frames located"]
     words += [f"{searched} of them by search"] if searched else []
@@ -105,6 +105,7 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
     words += [f"the path jumps {len(jumps)} times (the first: frame {jumps[0]})"] if jumps else []
     words += [f"{dropped} frames dropped"] if dropped else []
     words += ["the depth images show noise"] if "depth_noise" in codes else []
+    words += ["both streams hang"] if "both_repeat" in codes else []
     one = ["too few to tell"] if total < FEWEST_FRAMES else ["one frame shows no motion"]
     words += one if total < FEWEST_FRAMES or "no_motion" in codes else []
     words += ["stopped before the end of the recording"] if stopped else []
