@@ -319,6 +319,17 @@ def test_a_run_that_stopped_early_or_saw_hardly_anything_is_not_called_good(soun
     assert grade_tracked(replace(sound.result, frames=sound.result.frames[:3]), []).grade == "good"
 
 
+def test_a_map_that_fits_badly_asks_for_the_principal_point_of_a_crop(sound: RunOutcome) -> None:
+    """A run of sound images with the same numbers is not doubted: lenses may look aside."""
+    first, *others = sound.result.keyframes
+    aside = replace(first.camera, cx=first.camera.cx + 0.12 * first.camera.width)
+    result = replace(sound.result, keyframes=[replace(first, camera=aside), *others])
+    blurred = replace(fit_of(sound), structure=0.94)
+    advice = judge_result(result, [], blurred, None, None, "room").next
+    assert advice.startswith(f"check cx {aside.cx:.1f} and cy") and "crop" in advice
+    assert judge_result(result, [], fit_of(sound), None, None, "room").next == ""
+
+
 def test_a_dark_beginning_does_not_spoil_a_run(spoilt: Copy, tmp_path: Path) -> None:
     for path, gain in zip(spoilt.paths("rgb"), (0.12, 0.15), strict=False):
         image = cv2.imread(str(path)).astype(np.float32)

@@ -24,14 +24,15 @@ from ggslam.objects.table import ObjectTable
 from ggslam.rendering.exposure import change_of
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import AspectRecord, FitRecord, Grade, RunVerdict, worst
+from ggslam.sequences.camera_doubts import doubt_centre
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.tracking.tracker import TrackingStatus
 
 _CAUSES = (
     "depth_noise", "color_noise", "unrelated", "no_motion", "orientation", "depth_side", "depth_kind", "depth_delay",
-    "registration", "depth_codes", "depth_repeats", "color_repeats", "depth_scale", "intrinsics", "poses", "mirrored",
-    "alignment", "step", "time", "textureless", "degenerate",
+    "registration", "depth_codes", "depth_repeats", "color_repeats", "both_repeat", "depth_scale", "intrinsics",
+    "poses", "mirrored", "alignment", "step", "time", "textureless", "degenerate",
 )  # fmt: skip
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 _SAME_GAIN = 1.3
@@ -144,11 +145,18 @@ def _advice(
             return _slower(result, look)
         if "sharp" in weak and fit is not None and fit.located:
             return "ggslam update, which brings the map up to date, or a map made in the same light"
+        if "sharp" in weak and (centre := _doubt_centre(result)):
+            return centre
         if "sharp" in weak and grade == "bad":
             return f"{look} (do depth and colour belong to one frame and one camera?)"
         if "sharp" in weak:
             return _REFINE
     return _WITH_MASKS  # only the objects are left
+
+
+def _doubt_centre(result: SlamResult) -> str:
+    """To check the principal point where it lies as that of a crop does; "": it does not."""
+    return doubt_centre(result.keyframes[0].camera) if result.keyframes else ""
 
 
 def _slower(result: SlamResult, look: str) -> str:
