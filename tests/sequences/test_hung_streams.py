@@ -104,6 +104,7 @@ def test_colour_of_another_room_does_not_belong_to_depth(spoilt: Path, tmp_path:
     for path, image in zip(paths(spoilt, "rgb"), paths(other, "rgb"), strict=True):
         shutil.copy(image, path)
     severity, text = told(spoilt)["unrelated"]
+    assert "cropped" in text and "`depth_delay`" in text and "JPEG" in text
     assert severity == "doubtful" and float(text.partition("strength ")[2].split(",")[0]) < 0.2
 
 
