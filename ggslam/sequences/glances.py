@@ -74,7 +74,7 @@ class Glance:
         return bool(np.percentile(np.abs(self.grey - other.grey), EVERYWHERE) < SAME_VIEW)
 
     def same_depth(self, other: Glance) -> bool:
-        """Whether both hold one depth image: bit by bit, or but for noise in a scene whose jumps of depth would move."""
+        """Whether both hold one depth image: bit by bit, or but for noise, where jumps of depth would move."""
         return np.array_equal(self.depth, other.depth) or self._depth_again(other)
 
     def _depth_again(self, other: Glance) -> bool:

@@ -131,8 +131,11 @@ def jumps_of(places: np.ndarray, index: np.ndarray) -> list[int]:
     return [int(i) for i in index[2:][np.nan_to_num(changes) > limit]]
 
 
-def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] | None = None) -> AspectRecord:
-    """Whether the map looks like the keyframes, and these like the place; `found`: what seems wrong with them."""
+def grade_sharp(
+    fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] | None = None, unrefined: bool = False
+) -> AspectRecord:
+    """Whether the map looks like the keyframes, and these like the place; `found`: what seems wrong with them;
+    `unrefined`: the final refinement was cut short."""
     if fit is None:
         return AspectRecord(text="no keyframe of this run to compare with")
     limits = LOCATED_STRUCTURE if fit.located else (DOUBTFUL_STRUCTURE, BAD_STRUCTURE)
@@ -140,7 +143,7 @@ def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] 
     overfit = scored.overfit_db is not None and scored.overfit_db > OVERFIT_DB
     grades: list[Grade] = [
         _at_least(fit.structure, *limits), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
-        "doubtful" if overfit else "good",
+        "doubtful" if overfit or unrefined else "good",
     ]  # fmt: skip
     codes = {verdict.code for verdict in found or []} & OF_RECORDING.keys()
     grades += ["doubtful" if codes == {"color_repeats"} else "bad"] if codes else []
@@ -149,6 +152,7 @@ def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] 
         words.append(f"the map is {fit.brightness:.2f} times as bright as they are")
     words += [f"held-out frames are {scored.overfit_db:.1f} dB worse"] if overfit else []
     words += ["the map looks otherwise than the frames"] if fit.located and fit.structure < limits[0] else []
+    words += ["the refinement was cut short"] if unrefined else []
     words += [text for code, text in OF_RECORDING.items() if code in codes]
     return _aspect(grades, fit.psnr, "dB", words)
 

@@ -42,7 +42,7 @@ _REFINE, _WITH_MASKS = "`refine` 3000", "`masks` FOLDER, with masks of a segment
 
 def judge_result(
     result: SlamResult, found: list[Verdict], fit: MapFit | None, table: ObjectTable | None,
-    metrics: MetricsRecord | None, recording: str, stopped: bool = False,
+    metrics: MetricsRecord | None, recording: str, stopped: bool = False, unrefined: bool = False,
 ) -> RunVerdict:  # fmt: skip
     """The verdict on a run that has ended.
 
@@ -54,10 +54,11 @@ def judge_result(
         metrics: its scores; None: it was not scored.
         recording: its path, for commands.
         stopped: whether it ended before the recording did, by an error or by the user.
+        unrefined: whether it ended in the final refinement, after all frames.
     """
     scored = _figures_of_scores(metrics)
     aspects = {
-        "tracked": grade_tracked(result, found, stopped), "sharp": grade_sharp(fit, scored, found),
+        "tracked": grade_tracked(result, found, stopped), "sharp": grade_sharp(fit, scored, found, unrefined),
         "geometry": grade_geometry(fit, found), "objects": grade_objects(table, scored),
         "movers": grade_movers(result),
     }  # fmt: skip
