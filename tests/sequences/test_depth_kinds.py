@@ -86,7 +86,7 @@ def test_depth_that_was_subtracted_from_a_constant_is_no_disparity(room: Path, t
 CASES = [
     ("ray", "depth_kind", "wrong", "try `depth_kind` ray", {"depth_kind": "ray"}, 0),
     ("inverse", "depth_kind", "wrong", "try `depth_kind` inverse:20000", {"depth_kind": "inverse:20000"}, 0),
-    ("mirrored", "depth_side", "wrong", "mirror them back, else try `depth_kind` mirrored", {"depth_kind": "mirrored"}, 0),
+    ("mirrored", "depth_side", "wrong", "back, else try `depth_kind` mirrored", {"depth_kind": "mirrored"}, 0),
     ("turned", "depth_side", "wrong", "try `depth_kind` mirrored,flipped", {"depth_kind": "mirrored,flipped"}, 0),
     ("late", "depth_delay", "wrong", "try `depth_delay` 1f", {"depth_delay": "1f"}, 1),
     ("early", "depth_delay", "wrong", "try `depth_delay` -1f", {"depth_delay": "-1f"}, 0),
