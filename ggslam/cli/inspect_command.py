@@ -33,6 +33,9 @@ EPILOG = """
   ggslam inspect kitchen.ggz
 """
 
+SAME_TIME_S = 0.005
+"""Seconds between depth and colour that are none: generated recordings without any measure up to 0.0032."""
+
 
 def inspect(
     sequence: Annotated[
@@ -213,23 +216,24 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     ]  # fmt: skip
     if r.native_camera != r.camera:
         lines.insert(3, ("stored as", _camera(r.native_camera)))
-    if r.clocks is not None:
+    if r.clocks is not None and abs(r.clocks.seconds) > max(SAME_TIME_S, 2 * r.clocks.error):
         side = "after" if r.clocks.seconds > 0 else "before"
         apart, error = 1e3 * abs(r.clocks.seconds), 1e3 * r.clocks.error
         words = f"depth {apart:.1f} ms {side} colour (to {error:.1f} ms, by the motion in {r.clocks.frames} frames)"
         lines.append(("clocks", words))
+    elif r.clocks is not None and not r.verdicts:
+        lines.append(("clocks", f"depth and colour are of the same time, to {1e3 * SAME_TIME_S:.0f} ms"))
     if r.motion is not None:
         step, turn = r.motion.step_m, r.motion.turn_deg
         lines.append(("motion", f"path {r.motion.path_m:.2f} m; a frame: {step[0] * 100:.1f} cm and {turn[0]:.1f} deg "
                                 f"(median), {step[2] * 100:.1f} cm and {turn[2]:.1f} deg (most)"))  # fmt: skip
     if r.pose_depth_error is not None:
         lines.append(("consistency", f"depth agrees with the poses to {r.pose_depth_error:.1%}"))
-    if r.alignment is not None:
+    if r.alignment is not None and r.alignment.doubtful:
         away = f"{r.alignment.off * r.camera.width:.1f} pixels away"
-        if not r.alignment.doubtful:
-            away += ", hardly better than where they are"
-        best = "where they are" if r.alignment.off == 0 else away
-        lines.append(("alignment", f"outlines of depth fit the edges of colour best {best}"))
+        lines.append(("alignment", f"outlines of depth fit the edges of colour best {away}"))
+    elif r.alignment is not None and not r.verdicts:
+        lines.append(("alignment", "outlines of depth lie on edges of colour, as they should"))
     if r.mask_kinds:
         kinds = ", ".join(f"{count} {kind}" for kind, count in r.mask_kinds.items())
         masks = f"{len(r.mask_ids)} ids, {r.named_ids} named, {r.labelled_share:.0%} of pixels"

@@ -19,6 +19,13 @@ OTHER_SIZE, SAME_SIZE = 1.4, 0.06
 """Twice the principal point over the size of the image, or the reverse, from which the intrinsics seem to be of another
 size; and how nearly rows and columns have to say the same (natural logarithm)."""
 
+TURNED, LEAST_OBLONG = 0.5, 1.05
+"""Pixels by which the principal point may miss the middle of images of the exchanged size, and width over height (or
+the reverse) from which that is no chance."""
+BESIDE = 0.05
+"""Share of the image by which principal points of lenses lie beside its middle at most, mostly 0.03; those of crops lie
+farther off."""
+
 Size = tuple[int, int]
 """(width, height) in pixels."""
 
@@ -33,7 +40,7 @@ def judge_intrinsics(camera: Camera, stated: Size | None = None, source: str = "
     """
     told = f" ({source.partition(', scaled')[0]})" if source else ""
     inside = 0 <= camera.cx <= camera.width - 1 and 0 <= camera.cy <= camera.height - 1
-    text = _other_size(camera, stated, told) or _off_centre(camera, inside, told)
+    text = _quarter_turn(camera, told) or _other_size(camera, stated, told) or _off_centre(camera, inside, told)
     if not inside:
         return [Verdict("intrinsics", "wrong", text)]
     text = text or _odd_focal(camera, told)
@@ -47,9 +54,37 @@ def _odd_focal(camera: Camera, told: str) -> str:
         return f"intrinsics{told} are suspicious: horizontal angle of view {angle:.0f} degrees ({size}); check fx"
     wide = abs(camera.fy / camera.fx)
     if not 1 / WIDEST_PIXEL <= wide <= WIDEST_PIXEL:
-        text = f"fx {camera.fx:.1f} and fy {camera.fy:.1f} mean pixels {wide:.2f} times as wide as high; check both"
-        return f"intrinsics{told} are suspicious: {text}"
+        text = f"fx {camera.fx:.1f} and fy {camera.fy:.1f} mean pixels {wide:.2f} times as wide as high"
+        return f"intrinsics{told} are suspicious: {text}; check fx and fy"
     return ""
+
+
+def doubt_centre(camera: Camera) -> str:
+    """What to check of a principal point that lies clearly beside the middle, as that of a crop does; "": nothing. It
+    may be right, so that it is no doubt of its own."""
+    if _beside(camera) <= BESIDE:
+        return ""
+    middle = f"{(camera.width - 1) / 2:g}, {(camera.height - 1) / 2:g}"
+    here = f"cx {camera.cx:.1f} and cy {camera.cy:.1f}"
+    return f"check {here}, of images before a crop perhaps: the middle of {camera.width}x{camera.height} is {middle}"
+
+
+def _beside(camera: Camera) -> float:
+    """Distance of the principal point from the middle, share of the image."""
+    return max(abs((camera.cx + 0.5) / camera.width - 0.5), abs((camera.cy + 0.5) / camera.height - 0.5))
+
+
+def _quarter_turn(camera: Camera, told: str) -> str:
+    """That the principal point is the middle of images with width and height exchanged; "" if it is not."""
+    width, height = camera.width, camera.height
+    off = max(abs(camera.cx - (height - 1) / 2), abs(camera.cy - (width - 1) / 2))
+    if off > TURNED or max(width, height) < LEAST_OBLONG * min(width, height):
+        return ""
+    point = f"the principal point {camera.cx:.1f}, {camera.cy:.1f} is the middle of {height}x{width}"
+    return (
+        f"intrinsics{told} are of images turned by 90 degrees: {point}, and the images are {width}x{height}; exchange "
+        "fx with fy and cx with cy, or turn the images back"
+    )
 
 
 def _off_centre(camera: Camera, inside: bool, told: str) -> str:
@@ -58,7 +93,7 @@ def _off_centre(camera: Camera, inside: bool, told: str) -> str:
     if not inside:
         text = f"the principal point {camera.cx:.1f}, {camera.cy:.1f} lies outside of the images of {size}"
         return f"intrinsics{told} cannot be of these images: {text}; check cx and cy, and the size they are for"
-    off = max(abs((camera.cx + 0.5) / camera.width - 0.5), abs((camera.cy + 0.5) / camera.height - 0.5))
+    off = _beside(camera)
     if off <= FARTHEST_OFF:
         return ""
     text = f"the principal point lies {off:.0%} of the image away from its middle"

@@ -25,7 +25,9 @@ from ggslam.sequences.edge_evidence import (
     stretches,
 )
 from ggslam.sequences.glances import Glance, look_over
+from ggslam.sequences.hung_pairs import judge_hung_pairs
 from ggslam.sequences.hung_streams import judge_hung
+from ggslam.sequences.inverted_depth import Inversion, find_inversion
 from ggslam.sequences.noise_doubts import judge_noise, judge_views
 from ggslam.sequences.orientation import WORDS as ORIENTATIONS
 from ggslam.sequences.orientation import orientation_of
@@ -56,6 +58,12 @@ SIDES = {
     "mirrored": "mirrored (left and right exchanged)", "flipped": "upside down",
     "mirrored,flipped": "turned by 180 degrees",
 }  # fmt: skip
+COLOR_AT_FAULT = {
+    "mirrored": "if text in the colour images reads backwards, mirror them back",
+    "flipped": "if the colour images are upside down, flip them back",
+    "mirrored,flipped": "if the colour images are upside down, turn them back",
+}
+"""Outlines tell only that one of the two is not as it should be; these tell which."""
 
 
 @dataclass
@@ -78,7 +86,8 @@ class DepthDoubts:
         found += self._judge_edges(bool(hung)) if not found else []
         found += self._judge_measure() if not found else []
         still = judge_views(self.sequence, self._glances)
-        return [*found, *self._judge_repeats(hung), *self._judge_codes(), *still]
+        pairs = judge_hung_pairs(self.sequence)
+        return [*found, *self._judge_repeats(hung), *pairs, *self._judge_codes(), *still]
 
     @cached_property
     def _glances(self) -> list[Glance]:
@@ -131,12 +140,14 @@ class DepthDoubts:
         text = (
             f"colour and depth do not belong together: outlines of depth lie on edges of colour no more often than by "
             f"chance (strength {strength:.2f}, of sound recordings 0.5 and more); look whether both folders are of one "
-            "recording"
+            "recording, whether one of the two is cropped or has another field of view, whether depth comes several "
+            "frames later (`depth_delay`), and whether it was compressed with losses (JPEG)"
         )
         return Verdict("unrelated", "doubtful", text)
 
     def _side_verdict(self, name: str, better: Better) -> Verdict:
-        how = f"its outlines fit the edges of colour then (strength {better.best:.2f}, as it is {better.strength:.2f})"
+        strength = f"(strength {better.best:.2f}, as it is {better.strength:.2f})"
+        how = f"outlines of depth fit the edges of colour then {strength}"
         tag = 1 if self.sequence.upright else orientation_of(self.sequence.files(0).color)
         if UNDONE_BY_TAG.get(tag) == name:
             text = (
@@ -145,7 +156,8 @@ class DepthDoubts:
             )
             return Verdict("orientation", "wrong", text)
         remedy = self._kind.with_words(name)
-        text = f"depth is {SIDES[name]} against colour: {how}; try `depth_kind` {remedy}"
+        text = f"depth or colour is {SIDES[name]} against the other: {how}"
+        text += f"; {COLOR_AT_FAULT[name]}, else try `depth_kind` {remedy}"
         return Verdict("depth_side", "wrong", text)
 
     def _judge_measure(self) -> list[Verdict]:
@@ -167,6 +179,8 @@ class DepthDoubts:
                          f"{spreads[1] / 2:.1%}")  # fmt: skip
         contradicted = tell and by_poses != measure
         severity = "wrong" if by_planes == measure and not contradicted else "doubtful"
+        if measure == "inverse" and by_planes == measure and (inversion := find_inversion(self.spread)):
+            return [Verdict("depth_kind", severity, self._inversion_text(inversion))]  # type: ignore[arg-type]
         what = "measured along the ray of each pixel, not along the optical axis" if measure == "ray" else (
             "inverse (disparity): the larger the number, the nearer"
         )  # fmt: skip
@@ -174,6 +188,15 @@ class DepthDoubts:
         hint = "" if measure == "ray" or tell else " (with which the median depth is that of a room)"
         text = f"depth is {what}: {', '.join(words)}; try `depth_kind` {remedy}{hint}"
         return [Verdict("depth_kind", severity, text)]  # type: ignore[arg-type]
+
+    def _inversion_text(self, found: Inversion) -> str:
+        """Of depth that was subtracted from a constant: no option undoes it."""
+        number = float(f"{found.constant * self.sequence.depth_scale:.2g}")
+        return (
+            f"depth is inverted, a constant minus the distance: walls and floors are flat to {found.residual:.2%} if "
+            f"it is about {number:g}, to {found.as_inverse:.2%} as inverse depth (disparity); write the depth images "
+            "anew: the constant minus what they hold, and 0 where nothing was measured"
+        )
 
     def _measure_by_poses(self) -> str | None:
         points = self.points

@@ -19,6 +19,16 @@ SIZE = (40, 30)
 SAME_GREY, EVERYWHERE = 2.0, 98.0
 """Grey levels by which an image differs from itself at most, in this percentile of the pixels, once it was compressed
 again."""
+SAME_VIEW = 3.0
+"""The same, of images of other compression: once a stream hangs on both sides, views that are so near are one."""
+SAME_DEPTH, MOST_DEPTHS, SAME_JUMPS = 0.004, 0.02, 0.02
+"""Shares of the depth by which half of the pixels, nine in ten, and half of those at jumps of depth differ at most if a
+depth image comes again with fresh noise. A camera at rest has 0.001 and 0.004, a frame of slow motion 0.008."""
+JUMP, FEWEST_JUMPS = 0.1, 8
+"""Share of the depth by which neighbours in a small view differ at a jump, and how many there have to be across and
+down: along walls and floors one may move far and measure the same."""
+OTHER_EDGES = 0.3
+"""Correlation of edges below which two colour images show other things, whatever the light."""
 LEAST_CONTRAST = 8.0
 """Standard deviation in grey levels."""
 OTHER_GREY, OTHER_DEPTH, MOVED = 4.0, 0.04, 0.25
@@ -59,9 +69,33 @@ class Glance:
         change = np.abs(self.grey - other.grey)
         return bool(self.grey.std() > LEAST_CONTRAST and np.percentile(change, EVERYWHERE) < SAME_GREY)
 
+    def like_color(self, other: Glance) -> bool:
+        """Whether both may hold one colour image, compressed otherwise."""
+        return bool(np.percentile(np.abs(self.grey - other.grey), EVERYWHERE) < SAME_VIEW)
+
     def same_depth(self, other: Glance) -> bool:
-        """Whether both hold one depth image: no sensor measures the same twice."""
-        return np.array_equal(self.depth, other.depth)
+        """Whether both hold one depth image: bit by bit, or but for noise, where jumps of depth would move."""
+        return np.array_equal(self.depth, other.depth) or self._depth_again(other)
+
+    def _depth_again(self, other: Glance) -> bool:
+        known = (self.depth > 0) & (other.depth > 0)
+        if known.sum() < FEWEST_DEPTHS:
+            return False
+        change = np.abs(self.depth - other.depth) / np.maximum(np.minimum(self.depth, other.depth), 1e-6)
+        if np.median(change[known]) > SAME_DEPTH or np.percentile(change[known], 90) > MOST_DEPTHS:
+            return False
+        jumps = [at & known for at in _jumps(self.depth)]
+        return all(at.sum() >= FEWEST_JUMPS and np.median(change[at]) < SAME_JUMPS for at in jumps)
+
+    def color_moved_on(self, other: Glance) -> bool:
+        """Whether the colour images show other things beside what `same_depth` calls the same: a lamp that is switched
+        on before a camera at rest is none."""
+        if not self.color_moved(other):
+            return False
+        if np.array_equal(self.depth, other.depth):
+            return True
+        here, there = _edges(self.grey), _edges(other.grey)
+        return float((here * there).mean()) < OTHER_EDGES
 
     def color_moved(self, other: Glance) -> bool:
         """Whether the colour images show other things, exposure forgiven."""
@@ -102,6 +136,25 @@ def glance_of(sequence: Sequence, index: int) -> Glance | None:
         return glance_at(sequence.frame(index, masks=False))
     except SequenceError:
         return None
+
+
+def _jumps(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels beside a jump of depth to the right of them, and below, bool [H, W] each."""
+    found = []
+    for axis in (1, 0):
+        there = np.roll(depth, -1, axis)
+        nearer = np.minimum(depth, there)
+        at = (nearer > 0) & (np.abs(depth - there) > JUMP * nearer)
+        (at[:, -1:] if axis else at[-1:])[:] = False
+        found.append(at)
+    return found[0], found[1]
+
+
+def _edges(grey: np.ndarray) -> np.ndarray:
+    """Strength of edges, of mean 0 and deviation 1."""
+    down, right = np.gradient(grey)
+    strength = np.hypot(down, right)
+    return (strength - strength.mean()) / (strength.std() + np.float32(1e-6))
 
 
 def _grain(grey: np.ndarray) -> float:

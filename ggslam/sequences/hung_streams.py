@@ -17,6 +17,8 @@ from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
 
 FEWEST = 4
 """Frames that hold one image, from which a stream hangs: cameras of other rates repeat images once or twice."""
+CLOSE = 3
+"""Frames from the end of a stretch to the beginning of another one that may be its continuation."""
 MOST_COMPARED, MOST_STRETCHES = 64, 12
 """Neighbouring files of one size that are read though they differ, and stretches that are looked at, of each stream."""
 
@@ -53,10 +55,10 @@ def _judge(sequence: Sequence, glances: list[Glance], kind: str) -> list[Verdict
         text = f"colour images are blank: {told} show one and the same colour while depth moves on; take the cover off"
         return [Verdict("color_repeats", "doubtful", f"{text} the lens, or look how the images were written")]
     text = f"{same} images hang: {told} hold the {same} image of the first of them while {other} moves on"
-    return [Verdict(f"{kind}_repeats", "doubtful", f"{text}; {_remedy(sequence, found)}")]
+    return [Verdict(f"{kind}_repeats", "doubtful", f"{text}; {remedy_for(sequence, found)}")]
 
 
-def _remedy(sequence: Sequence, found: list[Stretch]) -> str:
+def remedy_for(sequence: Sequence, found: list[Stretch]) -> str:
     """How to leave them out, where they lie at one end."""
     numbers, (one, *more) = sequence.selection, found
     if not more and one.last == len(sequence) - 1 and one.first > 0:
@@ -69,12 +71,30 @@ def _remedy(sequence: Sequence, found: list[Stretch]) -> str:
 def find_hung(sequence: Sequence, glances: list[Glance], kind: str) -> list[Stretch]:
     """Stretches in which "color" or "depth" (`kind`) hangs, in order."""
     same, moved = _tests(kind)
-    spans = _same_files([getattr(sequence.files(k), kind) for k in range(len(sequence))])
+    spans = same_files([getattr(sequence.files(k), kind) for k in range(len(sequence))])
     found = [one for span in spans[:MOST_STRETCHES] if (one := _confirm(sequence, *span, same, moved))]
     for first, last in _same_views(sequence, glances, same, moved):
         if not any(one.first <= last and first <= one.last for one in found):
             found.append(Stretch(first, last))
-    return sorted(found, key=lambda one: one.first)
+    found.sort(key=lambda one: one.first)
+    return _merge(sequence, found, Glance.like_color if kind == "color" else Glance.same_depth)
+
+
+def _merge(sequence: Sequence, found: list[Stretch], like: Test) -> list[Stretch]:
+    """Stretches in order; neighbours that hold one view become one."""
+    merged: list[Stretch] = []
+    for one in found:
+        last = merged[-1] if merged else None
+        if last is not None and one.first - last.last <= CLOSE and _are_alike(sequence, last.last, one.first, like):
+            merged[-1] = Stretch(last.first, one.last, last.blank and one.blank)
+        else:
+            merged.append(one)
+    return merged
+
+
+def _are_alike(sequence: Sequence, first: int, second: int, like: Test) -> bool:
+    a, b = glance_of(sequence, first), glance_of(sequence, second)
+    return a is not None and b is not None and like(a, b)
 
 
 def _same_views(sequence: Sequence, glances: list[Glance], same: Test, moved: Test) -> list[tuple[int, int]]:
@@ -97,7 +117,7 @@ def _tests(kind: str) -> tuple[Test, Test]:
     """That images of the kind are the same, and that those of the other kind are not."""
     if kind == "color":
         return Glance.same_color, Glance.depth_moved
-    return Glance.same_depth, Glance.color_moved
+    return Glance.same_depth, Glance.color_moved_on
 
 
 def _confirm(sequence: Sequence, first: int, last: int, same: Test, moved: Test) -> Stretch | None:
@@ -120,7 +140,7 @@ def _edge(sequence: Sequence, a: Glance, near: int, far: int, same: Test) -> int
     return near
 
 
-def _same_files(files: list[ImageFile]) -> list[tuple[int, int]]:
+def same_files(files: list[ImageFile]) -> list[tuple[int, int]]:
     """First and last of the frames whose files hold the same bytes, the longest first; none of other images."""
     spans, begin, unequal = [], 0, 0
     for k in range(1, len(files) + 1):

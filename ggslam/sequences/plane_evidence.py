@@ -78,28 +78,43 @@ def look_at_planes(frames: list[Frame]) -> PlaneEvidence:
 
 def _residuals(frame: Frame) -> dict[tuple[int, int], list[float]]:
     """Of the windows of a frame that show a plane, by place, the median relative residual of each reading."""
+    found: dict[tuple[int, int], list[float]] = {}
+    for window in windows_of(frame):
+        d, rays = window.depth, window.rays
+        row = [residual_of(values, rays) for values in (1 / d, np.linalg.norm(rays, axis=1) / d, d)]
+        if min(row) < FLAT:
+            found[window.place] = row
+    return found
+
+
+@dataclass(frozen=True)
+class Window:
+    """Pixels with depth of a part of an image: its place (row, column), depth [n], rays [n, 3] with z = 1."""
+
+    place: tuple[int, int]
+    depth: np.ndarray
+    rays: np.ndarray
+
+
+def windows_of(frame: Frame) -> list[Window]:
+    """Parts of a frame, overlapping by half, that are full of depth."""
     step = max(1, frame.depth.shape[1] // COLUMNS)
     depth = frame.depth[::step, ::step].astype(np.float64)
     rays = frame.camera.rays()[::step, ::step].astype(np.float64)
-    length = np.linalg.norm(rays, axis=2)
     height, width = depth.shape[0] // WINDOW, depth.shape[1] // WINDOW
-    found: dict[tuple[int, int], list[float]] = {}
+    found: list[Window] = []
     if min(height, width) < SMALLEST:
         return found
     for top in range(0, depth.shape[0] - height + 1, max(1, height // 2)):
         for left in range(0, depth.shape[1] - width + 1, max(1, width // 2)):
-            window = np.s_[top : top + height, left : left + width]
-            known = depth[window] > 0
-            if known.mean() < FULL:
-                continue
-            d, along, ray = depth[window][known], length[window][known], rays[window][known]
-            row = [_residual(values, ray) for values in (1 / d, along / d, d)]
-            if min(row) < FLAT:
-                found[top, left] = row
+            part = np.s_[top : top + height, left : left + width]
+            known = depth[part] > 0
+            if known.mean() >= FULL:
+                found.append(Window((top, left), depth[part][known], rays[part][known]))
     return found
 
 
-def _residual(values: np.ndarray, rays: np.ndarray) -> float:
+def residual_of(values: np.ndarray, rays: np.ndarray) -> float:
     """Median relative residual of values [n] that should change linearly over the image; rays [n, 3] with z = 1."""
     weights = np.ones(len(values))
     relative = np.zeros(len(values))

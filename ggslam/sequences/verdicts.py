@@ -141,6 +141,9 @@ def judge_times(timestamps: np.ndarray, nominal: bool = False) -> list[Verdict]:
     intervals = np.diff(timestamps)
     verdicts = []
     back = np.flatnonzero(intervals <= 0)
+    if len(intervals) and not intervals.any():
+        text = f"all {len(timestamps)} time stamps are the same, {timestamps[0]:.6g} s; delete them (times then follow "
+        return [Verdict("time", "doubtful", f"{text}from the frame rate) or write them again")]
     if len(back):
         where, step = int(back[0]) + 1, intervals[back[0]]
         text = f"{len(back)} timestamps are not later than the one before (frame {where}: {step:+.3g} s)"

@@ -106,6 +106,9 @@ def test_time_that_goes_back_or_jumps() -> None:
     back = times.copy()
     back[40:] -= 0.5
     assert [v.code for v in judge_times(back)] == ["time"] and "frame 40: -0.467 s" in judge_times(back)[0].text
+    same, longer = judge_times(np.full(40, 5.0)), judge_times(np.r_[np.full(40, 5.0), 6.0])
+    assert [v.code for v in same] == ["time"] and "all 40 time stamps are the same, 5 s; delete them" in same[0].text
+    assert "sort the recording" in longer[0].text
     gap = np.delete(times, range(50, 80))
     assert [v.code for v in judge_times(gap)] == ["frames_missing"]
     assert "about 30 frames are missing in 1 gaps" in judge_times(gap)[0].text

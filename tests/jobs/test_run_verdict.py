@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from command_line import ggslam
 
+from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.evaluate_run import evaluate_run
 from ggslam.jobs.run.grades import (
@@ -317,6 +318,33 @@ def test_a_run_that_stopped_early_or_saw_hardly_anything_is_not_called_good(soun
     assert "skip_bad_frames" in stopped.next
     assert grade_tracked(replace(sound.result, frames=sound.result.frames[:2]), []).grade == "doubtful"
     assert grade_tracked(replace(sound.result, frames=sound.result.frames[:3]), []).grade == "good"
+
+
+def test_a_map_that_fits_badly_asks_for_the_principal_point_of_a_crop(sound: RunOutcome) -> None:
+    """A run of sound images with the same numbers is not doubted: lenses may look aside."""
+    first, *others = sound.result.keyframes
+    aside = replace(first.camera, cx=first.camera.cx + 0.12 * first.camera.width)
+    result = replace(sound.result, keyframes=[replace(first, camera=aside), *others])
+    blurred = replace(fit_of(sound), structure=0.94)
+    advice = judge_result(result, [], blurred, None, None, "room").next
+    assert advice.startswith(f"check cx {aside.cx:.1f} and cy") and "crop" in advice
+    assert judge_result(result, [], fit_of(sound), None, None, "room").next == ""
+
+
+class StopsInRefinement(SilentObserver):
+    """Asks the run to stop after the first step of the refinement."""
+
+    def advance(self, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+
+def test_a_run_whose_refinement_was_cut_short_saw_all_frames(room: Path, tmp_path: Path) -> None:
+    few = ["mapping.iterations_per_frame=2", "loops.enabled=false", "refine_iterations=500"]
+    request = RunRequest(SequenceRequest(room, stop=6), out=tmp_path / "run", overrides=few)
+    outcome = execute(request, StopsInRefinement())
+    assert isinstance(outcome.error, KeyboardInterrupt) and outcome.verdict is not None
+    assert outcome.verdict.tracked.text == "6 of 6 frames located" and outcome.verdict.tracked.grade == "good"
+    assert "the refinement was cut short" in outcome.verdict.sharp.text and outcome.verdict.grade != "good"
 
 
 def test_a_dark_beginning_does_not_spoil_a_run(spoilt: Copy, tmp_path: Path) -> None:

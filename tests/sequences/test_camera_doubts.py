@@ -13,7 +13,7 @@ from command_line import ggslam, refuse
 
 from ggslam.scene.camera import Camera
 from ggslam.sequences import inspect_sequence, open_sequence
-from ggslam.sequences.camera_doubts import judge_intrinsics
+from ggslam.sequences.camera_doubts import doubt_centre, judge_intrinsics
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 
@@ -24,6 +24,9 @@ CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
         (Camera(640, 480, 525, 525, 700, 239.5), "wrong", "700.0, 239.5 lies outside of the images of 640x480"),
         (Camera(640, 480, 525, 525, 639.6, 479.6), "wrong", "the middle of images of 1280x960, not of 640x480"),
         (Camera(640, 480, 525, 525, 159.5, 119.5), "doubtful", "the middle of images of 320x240, not of 640x480"),
+        (Camera(480, 640, 525, 525, 319.5, 239.5), "doubtful", "turned by 90 degrees: the principal point 319.5"),
+        (Camera(120, 160, 120, 120, 79.5, 59.5), "doubtful", "the middle of 160x120, and the images are 120x160"),
+        (Camera(540, 1280, 525, 525, 640, 270), "wrong", "turned by 90 degrees"),
         (Camera(640, 480, 525, 525, 519.5, 239.5), "doubtful", "31% of the image away from its middle"),
         (Camera(640, 480, 1900, 1900, 319.5, 239.5), "doubtful", "angle of view 19 degrees"),
         (Camera(640, 480, 140, 140, 319.5, 239.5), "doubtful", "angle of view 133 degrees"),
@@ -39,10 +42,19 @@ def test_what_is_odd_is_told(camera: Camera, severity: str, words: str) -> None:
 @pytest.mark.parametrize(
     "camera",
     [CAMERA, CAMERA.resize(160, 120), Camera(256, 192, 212, 212, 127, 95), Camera(1242, 375, 718.9, 718.9, 607, 185),
-     Camera(640, 480, 300, 300, 300, 260), Camera(360, 540, 430, 430, 180, 270)],
+     Camera(640, 480, 300, 300, 300, 260), Camera(480, 640, 525, 525, 239.5, 319.5),
+     Camera(500, 490, 500, 500, 245, 250),
+     Camera(360, 540, 430, 430, 180, 270)],
 )  # fmt: skip
 def test_usual_cameras_are_not_doubted(camera: Camera) -> None:
     assert judge_intrinsics(camera) == []
+
+
+def test_a_principal_point_of_a_crop_is_to_be_checked() -> None:
+    assert "cx 79.5 and cy 59.5" in (text := doubt_centre(Camera(120, 90, 120, 120, 79.5, 59.5)))
+    assert text.endswith("the middle of 120x90 is 59.5, 44.5")
+    for camera in (CAMERA, Camera(1242, 375, 718.9, 718.9, 607, 173), Camera(640, 480, 585, 585, 328.9, 253.7)):
+        assert doubt_centre(camera) == ""
 
 
 def written(room: Path, folder: Path, change: Callable[[dict[str, float]], dict[str, float]]) -> Path:

@@ -47,6 +47,7 @@ def changes(camera: Camera) -> dict[str, Change]:
     return {
         "ray": lambda d: stored(d * ray),
         "inverse": lambda d: stored(np.where(d > 0, 20000 * UNITS / np.maximum(d, 1), 0)),
+        "inverted": lambda d: stored(np.where(d > 0, 1.25 * d.max() - d, 0)),
         "mirrored": lambda d: d[:, :, ::-1],
         "turned": lambda d: d[:, ::-1, ::-1],
         "late": lambda d: np.concatenate([d[1:], d[-1:]]),
@@ -74,10 +75,18 @@ def depth_verdicts(folder: Path, **options: object) -> list[tuple[str, str, str]
     return [(verdict.code, verdict.severity, verdict.text) for verdict in report.verdicts]
 
 
+def test_depth_that_was_subtracted_from_a_constant_is_no_disparity(room: Path, tmp_path: Path) -> None:
+    folder = write(room, tmp_path / "inverted", "inverted")
+    ((code, severity, text),) = depth_verdicts(folder)
+    assert (code, severity) == ("depth_kind", "wrong") and "`depth_kind`" not in text
+    largest = max(frame.depth.max() for frame in open_sequence(room).stream()) * UNITS
+    assert float(text.partition("is about ")[2].split(",")[0]) == pytest.approx(1.25 * largest, rel=0.1)
+
+
 CASES = [
     ("ray", "depth_kind", "wrong", "try `depth_kind` ray", {"depth_kind": "ray"}, 0),
     ("inverse", "depth_kind", "wrong", "try `depth_kind` inverse:20000", {"depth_kind": "inverse:20000"}, 0),
-    ("mirrored", "depth_side", "wrong", "try `depth_kind` mirrored", {"depth_kind": "mirrored"}, 0),
+    ("mirrored", "depth_side", "wrong", "back, else try `depth_kind` mirrored", {"depth_kind": "mirrored"}, 0),
     ("turned", "depth_side", "wrong", "try `depth_kind` mirrored,flipped", {"depth_kind": "mirrored,flipped"}, 0),
     ("late", "depth_delay", "wrong", "try `depth_delay` 1f", {"depth_delay": "1f"}, 1),
     ("early", "depth_delay", "wrong", "try `depth_delay` -1f", {"depth_delay": "-1f"}, 0),

@@ -221,6 +221,14 @@ def test_poses_whose_times_go_backwards_are_told_of(make: Make) -> None:
     np.testing.assert_allclose(sequence.ground_truth[0], expected_pose(4), atol=1e-6)
 
 
+@pytest.mark.parametrize("word", ["nan", "inf", "-inf", "noon"])
+def test_a_time_that_is_none_is_named_with_its_line(make: Make, word: str) -> None:
+    folder = make("folder")
+    (folder / "timestamps.txt").write_text("# seconds\n" + "".join(f"{t}\n" for t in (0.0, 0.1, word, 0.3, 0.4)))
+    with pytest.raises(SequenceError, match=rf"timestamps.txt, line 4: expected a time in seconds, found '{word}'"):
+        open_sequence(folder)
+
+
 def test_a_missing_colour_image_shifts_no_pose_of_a_folder(make: Make) -> None:
     folder = make("folder")
     lines = [" ".join(map(str, [i / 30, *expected_pose(i)[:3, 3], 0, 0, 0, 1])) for i in range(5)]

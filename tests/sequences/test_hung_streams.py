@@ -70,6 +70,39 @@ def test_colour_that_was_compressed_again_hangs_too(spoilt: Path) -> None:
     assert find_hung(sequence, few, "color") == [Stretch(7, 19)]
 
 
+def test_colour_of_changing_compression_is_one_stretch(spoilt: Path) -> None:
+    """Of 95, then 72 per cent: these differ too much to be taken for one image at first."""
+    hold(spoilt, "rgb", 7, 23)
+    for k, path in enumerate(paths(spoilt, "rgb")):
+        image = cv2.imread(str(path))
+        assert image is not None and cv2.imwrite(str(path.with_suffix(".jpg")), image, [1, 95 if k < 15 else 72])
+        path.unlink()
+    sequence = open_sequence(spoilt)
+    assert find_hung(sequence, look_over(sequence), "color") == [Stretch(7, 23)]
+    assert told(spoilt)["color_repeats"][1].endswith("try `stop` 8")
+
+
+def test_depth_that_hangs_with_fresh_noise(spoilt: Path) -> None:
+    """No two files are the same, nor two small views."""
+    random = np.random.default_rng(0)
+    hold(spoilt, "depth", 6, 23)
+    edit(spoilt, "depth", lambda i: np.rint(i * (1 + random.normal(0, 0.002, i.shape))).astype(np.uint16))
+    sequence = open_sequence(spoilt)
+    assert find_hung(sequence, look_over(sequence), "depth") == [Stretch(6, 23)]
+
+
+def test_a_lamp_before_a_tripod_is_no_depth_that_hangs(tmp_path: Path) -> None:
+    """From frame 8 on one half of the image is lit by a third of the light, and the other by more: depth goes on."""
+    folder = tmp_path / "room"
+    write_synthetic_sequence(folder, frames=16, width=160, height=120, seed=4, trajectory="still")
+    light = np.linspace(0.3, 1.4, 160)[None, :, None]
+    edit(folder, "rgb", lambda i: np.clip(i * light, 0, 255).astype(np.uint8), first=8)
+    sequence = open_sequence(folder)
+    views = look_over(sequence)
+    assert views[0].same_depth(views[-1]) and views[0].color_moved(views[-1])
+    assert find_hung(sequence, views, "depth") == []
+
+
 def test_every_other_image_is_told_as_repeats(spoilt: Path) -> None:
     for first in range(0, FRAMES, 2):
         hold(spoilt, "rgb", first, first + 1)
@@ -104,6 +137,7 @@ def test_colour_of_another_room_does_not_belong_to_depth(spoilt: Path, tmp_path:
     for path, image in zip(paths(spoilt, "rgb"), paths(other, "rgb"), strict=True):
         shutil.copy(image, path)
     severity, text = told(spoilt)["unrelated"]
+    assert "cropped" in text and "`depth_delay`" in text and "JPEG" in text
     assert severity == "doubtful" and float(text.partition("strength ")[2].split(",")[0]) < 0.2
 
 

@@ -95,7 +95,7 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
         _at_most((lost + doubted) / max(1, total), LOST_SHARE, BADLY_LOST),
         "doubtful" if searched > MUCH_SEARCHED * total or len(jumps) or codes & {"degenerate", "dropped"} else "good",
         "bad" if codes & {"textureless", "depth_noise"} else "good",
-        "doubtful" if stopped or total < FEWEST_FRAMES or "no_motion" in codes else "good",
+        "doubtful" if stopped or total < FEWEST_FRAMES or codes & {"no_motion", "both_repeat"} else "good",
     ]
     words = [f"{total - lost} of {total} frames located"]
     words += [f"{searched} of them by search"] if searched else []
@@ -105,6 +105,7 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
     words += [f"the path jumps {len(jumps)} times (the first: frame {jumps[0]})"] if jumps else []
     words += [f"{dropped} frames dropped"] if dropped else []
     words += ["the depth images show noise"] if "depth_noise" in codes else []
+    words += ["both streams hang"] if "both_repeat" in codes else []
     one = ["too few to tell"] if total < FEWEST_FRAMES else ["one frame shows no motion"]
     words += one if total < FEWEST_FRAMES or "no_motion" in codes else []
     words += ["stopped before the end of the recording"] if stopped else []
@@ -130,8 +131,11 @@ def jumps_of(places: np.ndarray, index: np.ndarray) -> list[int]:
     return [int(i) for i in index[2:][np.nan_to_num(changes) > limit]]
 
 
-def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] | None = None) -> AspectRecord:
-    """Whether the map looks like the keyframes, and these like the place; `found`: what seems wrong with them."""
+def grade_sharp(
+    fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] | None = None, unrefined: bool = False
+) -> AspectRecord:
+    """Whether the map looks like the keyframes, and these like the place; `found`: what seems wrong with them;
+    `unrefined`: the final refinement was cut short."""
     if fit is None:
         return AspectRecord(text="no keyframe of this run to compare with")
     limits = LOCATED_STRUCTURE if fit.located else (DOUBTFUL_STRUCTURE, BAD_STRUCTURE)
@@ -139,7 +143,7 @@ def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] 
     overfit = scored.overfit_db is not None and scored.overfit_db > OVERFIT_DB
     grades: list[Grade] = [
         _at_least(fit.structure, *limits), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
-        "doubtful" if overfit else "good",
+        "doubtful" if overfit or unrefined else "good",
     ]  # fmt: skip
     codes = {verdict.code for verdict in found or []} & OF_RECORDING.keys()
     grades += ["doubtful" if codes == {"color_repeats"} else "bad"] if codes else []
@@ -148,6 +152,7 @@ def grade_sharp(fit: MapFit | None, scored: ScoredFigures, found: list[Verdict] 
         words.append(f"the map is {fit.brightness:.2f} times as bright as they are")
     words += [f"held-out frames are {scored.overfit_db:.1f} dB worse"] if overfit else []
     words += ["the map looks otherwise than the frames"] if fit.located and fit.structure < limits[0] else []
+    words += ["the refinement was cut short"] if unrefined else []
     words += [text for code, text in OF_RECORDING.items() if code in codes]
     return _aspect(grades, fit.psnr, "dB", words)
 

@@ -175,6 +175,7 @@ class _Run:
     stop: StopRequest
     depth: list[Verdict] | None = None
     fit: MapFit | None = None
+    saw_all: bool = False
 
     def run(self, resumption: Resumption | None) -> RunOutcome:
         """From the first frame, or from where it was, to the report."""
@@ -191,6 +192,7 @@ class _Run:
             if resumption is not None and checkpointing is not None:
                 loop.resume = lambda slam: resumption.restore(slam, checkpoints, checkpointing, observer)
             result, error = loop.run()
+            self.saw_all = loop.saw_all
         except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
             if resumption is None:
                 checkpoints.remove()
@@ -296,8 +298,11 @@ class _Run:
         folder = outcome.folder
         table = folder.object_table() if folder.has_objects() else None
         recording = str(self.request.sequence.path)
-        stopped = outcome.error is not None
-        return judge_result(outcome.result, outcome.verdicts, self.fit, table, outcome.metrics, recording, stopped)
+        cut = outcome.error is not None and outcome.error is not outcome.failure
+        return judge_result(
+            outcome.result, outcome.verdicts, self.fit, table, outcome.metrics, recording,
+            cut and not self.saw_all, cut and self.saw_all,
+        )  # fmt: skip
 
 
 def _objects_notes(

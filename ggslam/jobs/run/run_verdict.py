@@ -24,14 +24,15 @@ from ggslam.objects.table import ObjectTable
 from ggslam.rendering.exposure import change_of
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import AspectRecord, FitRecord, Grade, RunVerdict, worst
+from ggslam.sequences.camera_doubts import doubt_centre
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.tracking.tracker import TrackingStatus
 
 _CAUSES = (
     "depth_noise", "color_noise", "unrelated", "no_motion", "orientation", "depth_side", "depth_kind", "depth_delay",
-    "registration", "depth_codes", "depth_repeats", "color_repeats", "depth_scale", "intrinsics", "poses", "mirrored",
-    "alignment", "step", "time", "textureless", "degenerate",
+    "registration", "depth_codes", "depth_repeats", "color_repeats", "both_repeat", "depth_scale", "intrinsics",
+    "poses", "mirrored", "alignment", "step", "time", "textureless", "degenerate",
 )  # fmt: skip
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 _SAME_GAIN = 1.3
@@ -41,7 +42,7 @@ _REFINE, _WITH_MASKS = "`refine` 3000", "`masks` FOLDER, with masks of a segment
 
 def judge_result(
     result: SlamResult, found: list[Verdict], fit: MapFit | None, table: ObjectTable | None,
-    metrics: MetricsRecord | None, recording: str, stopped: bool = False,
+    metrics: MetricsRecord | None, recording: str, stopped: bool = False, unrefined: bool = False,
 ) -> RunVerdict:  # fmt: skip
     """The verdict on a run that has ended.
 
@@ -53,10 +54,11 @@ def judge_result(
         metrics: its scores; None: it was not scored.
         recording: its path, for commands.
         stopped: whether it ended before the recording did, by an error or by the user.
+        unrefined: whether it ended in the final refinement, after all frames.
     """
     scored = _figures_of_scores(metrics)
     aspects = {
-        "tracked": grade_tracked(result, found, stopped), "sharp": grade_sharp(fit, scored, found),
+        "tracked": grade_tracked(result, found, stopped), "sharp": grade_sharp(fit, scored, found, unrefined),
         "geometry": grade_geometry(fit, found), "objects": grade_objects(table, scored),
         "movers": grade_movers(result),
     }  # fmt: skip
@@ -144,11 +146,18 @@ def _advice(
             return _slower(result, look)
         if "sharp" in weak and fit is not None and fit.located:
             return "ggslam update, which brings the map up to date, or a map made in the same light"
+        if "sharp" in weak and (centre := _doubt_centre(result)):
+            return centre
         if "sharp" in weak and grade == "bad":
             return f"{look} (do depth and colour belong to one frame and one camera?)"
         if "sharp" in weak:
             return _REFINE
     return _WITH_MASKS  # only the objects are left
+
+
+def _doubt_centre(result: SlamResult) -> str:
+    """To check the principal point where it lies as that of a crop does; "": it does not."""
+    return doubt_centre(result.keyframes[0].camera) if result.keyframes else ""
 
 
 def _slower(result: SlamResult, look: str) -> str:

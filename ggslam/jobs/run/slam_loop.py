@@ -47,6 +47,7 @@ class SlamLoop:
         checkpointing: saves the state; None: never.
         stop: says when to end early.
         resume: brings a fresh `Slam` to where it was, and tells which frame comes next, None if it was nowhere yet.
+        saw_all: whether all frames were tracked, and what is left is the refinement.
     """
 
     sequence: Sequence | LiveSequence
@@ -59,6 +60,7 @@ class SlamLoop:
     checkpointing: Checkpointing | None = None
     stop: StopRequest = field(default_factory=StopRequest)
     resume: Callable[[Slam], int | None] | None = None
+    saw_all: bool = False
     _between_steps: bool = False
 
     def run(self) -> tuple[SlamResult, BaseException | None]:
@@ -126,6 +128,7 @@ class SlamLoop:
         self.stop.raise_if_any()
 
     def _refine(self, slam: Slam) -> SlamResult:
+        self.saw_all = True
         slam.settle_parts()
         wanted = slam.refinement_steps
         if wanted:

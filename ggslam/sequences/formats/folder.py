@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -125,10 +126,7 @@ def _timestamps(
 ) -> tuple[np.ndarray, str]:
     path, colors = folder / "timestamps.txt", pairs.colors
     if path.is_file() and pairs.delays is None:  # else names are times, and some images are left out
-        try:
-            times = np.array([float(line.split()[0]) for _, line in data_lines(path)])
-        except ValueError:
-            raise SequenceError(f"{path}: expected one time in seconds on each line") from None
+        times = np.array([_time_in(path, number, line) for number, line in data_lines(path)])
         if len(times) != len(colors):
             raise SequenceError(f"{path}: expected {len(colors)} times, one an image, found {len(times)}")
         return times, path.name
@@ -139,6 +137,17 @@ def _timestamps(
         raise SequenceError(f"{camera_file}: expected a positive 'frame_rate', found {rate:g}")
     source = f"{rate:g} frames/s of {camera_file.name}" if "frame_rate" in settings else f"nominal {rate:g} frames/s"
     return _numbered_times(folder, colors) / rate, source
+
+
+def _time_in(path: Path, number: int, line: str) -> float:
+    word = line.split()[0]
+    try:
+        time = float(word)
+    except ValueError:
+        time = math.nan
+    if not math.isfinite(time):
+        raise SequenceError(f"{path}, line {number}: expected a time in seconds, found '{word[:40]}'")
+    return time
 
 
 def _numbered_times(folder: Path, colors: list[Path]) -> np.ndarray:

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings whose two streams hang at once: for some frames colour and depth are both those of one frame. A camera at
+rest records that only without noise, so that noise in the repeated depth, or a jump where images go on, has to tell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ggslam.errors import SequenceError
+from ggslam.sequences.glances import Glance, glance_of
+from ggslam.sequences.hung_streams import FEWEST, Stretch, remedy_for, same_files
+from ggslam.sequences.sequence import Sequence
+from ggslam.sequences.verdicts import Verdict
+
+LEAST_NOISE, LEAST_STEPS = 0.0003, 2.0
+"""Second difference of neighbouring inverse depths from which a depth image shows noise: share of the depth, and steps
+of the stored numbers. Exact depth is rounded to those steps, and inverse depth of a plane is linear."""
+FEWEST_TRIPLES = 500
+JUMP, LEAST_JUMP = 2.0, 2.0
+"""Change of the small view where images go on, in changes of usual neighbours, and in grey levels."""
+AROUND = 3
+"""Neighbours on either side that tell the usual change."""
+
+
+def judge_hung_pairs(sequence: Sequence) -> list[Verdict]:
+    """Whether colour and depth hang at once in a part of the recording."""
+    found = find_hung_pairs(sequence)
+    if not found:
+        return []
+    numbers = sequence.selection
+    where = ", ".join(f"{numbers[one.first]} to {numbers[one.last]}" for one in found[:3])
+    where += f" and those of {len(found) - 3} more places" if len(found) > 3 else ""
+    text = f"colour and depth hang: frames {where} hold the images of the first of them"
+    return [Verdict("both_repeat", "doubtful", f"{text}; {remedy_for(sequence, found)}")]
+
+
+def find_hung_pairs(sequence: Sequence) -> list[Stretch]:
+    """Stretches in which both files of all frames hold the same bytes though the camera does not rest, in order; none
+    if the whole recording is one."""
+    files = [sequence.files(k) for k in range(len(sequence))]
+    colors, depths = same_files([one.color for one in files]), same_files([one.depth for one in files])
+    both = [(max(a, c), min(b, d)) for a, b in colors for c, d in depths]
+    spans = sorted(span for span in both if span[1] - span[0] + 1 >= FEWEST)
+    if not spans or spans == [(0, len(sequence) - 1)]:
+        return []
+    noisy = _shows_noise(sequence, spans[0][0])
+    return [Stretch(first, last) for first, last in spans if noisy or _jumps(sequence, first, last)]
+
+
+def _shows_noise(sequence: Sequence, index: int) -> bool:
+    """Whether depth of a frame has the noise of a sensor."""
+    try:
+        depth = sequence.frame(index, masks=False).depth
+    except SequenceError:
+        return False
+    left, middle, right = (depth[:, k::3][:, : depth.shape[1] // 3] for k in range(3))
+    known = (left > 0) & (middle > 0) & (right > 0)
+    if known.sum() < FEWEST_TRIPLES or sequence.depth_kind.measure == "inverse":
+        return False
+    left, middle, right = (values[known].astype(np.float64) for values in (left, middle, right))
+    bend = np.abs(middle / left - 2 + middle / right)
+    step = LEAST_STEPS / sequence.depth_scale / middle
+    return bool(np.median(bend / np.maximum(step, LEAST_NOISE)) > 1)
+
+
+def _jumps(sequence: Sequence, first: int, last: int) -> bool:
+    """Whether images go on after a stretch as if the camera had moved on meanwhile."""
+    before = [glance_of(sequence, k) for k in range(max(first - AROUND, 0), first + 1)]
+    after = [glance_of(sequence, k) for k in range(last + 1, min(last + 2 + AROUND, len(sequence)))]
+    usual = [c for views in (before, after) for a, b in zip(views, views[1:], strict=False) if (c := _change(a, b))]
+    jump = _change(before[-1], after[0]) if after else None
+    return bool(usual) and jump is not None and jump > max(JUMP * float(np.max(usual)), LEAST_JUMP)
+
+
+def _change(a: Glance | None, b: Glance | None) -> float | None:
+    return None if a is None or b is None else float(np.abs(a.grey - b.grey).mean())
