@@ -150,7 +150,7 @@ def _camera(path: Path, number: int, entry: Any) -> RigCamera:
     if not isinstance(recording, str) or not recording:
         raise SequenceError(f"{place}: expected 'recording' to name a folder or file, found '{recording}'")
     return RigCamera(
-        name, path.parent / given_path(recording), transform_entry(place, entry, "T_rig_camera"),
+        name, path.parent / given_path(recording, where=place), transform_entry(place, entry, "T_rig_camera"),
         _number(place, entry, "time_offset", -_LARGEST_OFFSET, _LARGEST_OFFSET) or 0.0,
         _number(place, entry, "scale", 1e-3, 1.0), _options(path, place, entry),
     )  # fmt: skip
@@ -163,7 +163,7 @@ def _options(path: Path, place: str, entry: dict[str, Any]) -> dict[str, Any]:
         if key in entry:
             if not isinstance(entry[key], str):
                 raise SequenceError(f"{place}: expected a text for '{key}', found '{entry[key]}'")
-            options[key] = path.parent / given_path(entry[key]) if key in _PATHS else entry[key]
+            options[key] = path.parent / given_path(entry[key], where=place) if key in _PATHS else entry[key]
     if "depth_scale" in entry:
         options["depth_scale"] = _number(place, entry, "depth_scale", 0.0, np.inf)
     if "upright" in entry:

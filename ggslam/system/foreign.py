@@ -29,18 +29,20 @@ _SHOWN = 60
 """Characters of a path that is far too long."""
 
 
-def given_path(path: str | Path, error: type[GgslamError] = SequenceError) -> Path:
+def given_path(path: str | Path, error: type[GgslamError] = SequenceError, where: str = "") -> Path:
     """A path as somebody wrote it, with `~` for a home; that of an unknown user stays as it is.
 
     Args:
         path: mostly of a recording, or of what belongs to one.
         error: class of the error to raise.
+        where: the file and entry that name the path, for the message.
 
     Raises:
         error: no file can have this path: it, or a name in it, is too long, or it has a zero byte.
     """
     text = os.fspath(path)
-    shown = repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
+    shown = f"{where}: " if where else ""
+    shown += repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
     if "\0" in text:
         raise error(f"{shown}: a path cannot have a zero byte")
     try:

@@ -22,7 +22,8 @@ def inspect(*arguments: object) -> str:
 def test_what_was_recognised(room: Path) -> None:
     printed = inspect(room)
     for text in ("room (synthetic)", "24,", "160x120", "units a metre", "colour 160x120, depth 160x120", "24 frames",
-                 "depth agrees with the poses", "outlines of depth fit", "ids"):  # fmt: skip
+                 "depth agrees with the poses", "outlines of depth lie on edges of colour, as they should",
+                 "ids"):  # fmt: skip
         assert text in printed
     assert "warning" not in printed
 

@@ -149,7 +149,7 @@ BAD: dict[str, tuple[list[dict[str, Any]], dict[str, Any], str]] = {
     "one recording": ([entry("a", TUM), entry("b", TUM)], {}, "cameras 'a' and 'b' have one recording"),
     "twice": ([entry("a", TUM), entry("a", "folder")], {}, "camera 'a' is there twice"),
     "no recording": ([entry("a", TUM), entry("b", "nowhere")], {}, "camera 'b': .*nowhere: no such folder or file"),
-    "long name": ([entry("a", TUM), entry("b", "x" * 300)], {}, "no such folder or file"),
+    "long name": ([entry("a", TUM), entry("b", "x" * 300)], {}, "camera 'b': 'x+...': too long for a path: 300"),
     "no home": ([entry("a", TUM), entry("b", "~nobody-of-that-name/x")], {}, "no such folder or file"),
     "unknown entry": ([entry("a", TUM), entry("b", "folder", T_rig_camra=1)], {}, "did you mean 'T_rig_camera'"),
     "unknown name": ([entry("a", TUM), entry("b", "folder")], {"tollerance": 1}, "did you mean 'tolerance'"),

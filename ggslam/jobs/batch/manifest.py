@@ -165,14 +165,14 @@ def _recording(path: Path, number: int, item: Any) -> tuple[str, Path, tuple[str
         item = {"path": item}
     if not isinstance(item, dict) or set(item) - {"path", "name", "options"} or not isinstance(item.get("path"), str):
         raise ConfigError(f"{path}: {where}: expected a path, or path, name and options, found {item!r}")
-    place = (path.parent / given_path(item["path"], ConfigError)).absolute()
+    place = (path.parent / given_path(item["path"], ConfigError, f"{path}: {where}")).absolute()
     name = str(item.get("name") or place.resolve().name)
     return name, place, _options(path, f"{where}.options", item.get("options"))
 
 
 def _own_folder(path: Path, out: str) -> Path:
     """The folder that a manifest names."""
-    folder = path.parent / given_path(out, ConfigError)
+    folder = path.parent / given_path(out, ConfigError, f"{path}: out")
     if not any(folder.resolve().is_relative_to(place.resolve()) for place in (path.parent, Path.cwd())):
         raise ConfigError(f"{path}: out: {out} lies outside the manifest's folder; choose it with {option('out')}")
     return folder
