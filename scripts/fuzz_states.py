@@ -105,7 +105,7 @@ def repaired_array_file(data: bytes, sizes: dict[int, list[int]] | None = None) 
     start = data.find(b"{", 8)
     try:
         header, length = json.JSONDecoder().raw_decode(data[start:].decode("latin-1"))
-    except ValueError:
+    except (ValueError, RecursionError):
         return data
     said_length = struct.unpack("<Q", data[start - 8 : start])[0]
     arrays = data[start + (said_length if length <= said_length <= length + 64 else length) : -4]
