@@ -142,10 +142,9 @@ def change_png(data: bytes, rng: random.Random) -> bytes:
 def change_json(data: bytes, rng: random.Random) -> bytes:
     """Puts strange values in the place of some, or takes away, doubles or exchanges them; it stays JSON."""
     try:
-        tree = json.loads(data)
-    except (ValueError, RecursionError):
+        return json.dumps(change_tree(json.loads(data), rng)).encode()
+    except (ValueError, RecursionError, OverflowError, TypeError):  # no JSON, or sums of what cannot be summed
         return change(data, rng)
-    return json.dumps(change_tree(tree, rng)).encode()
 
 
 def change_tree(tree: Any, rng: random.Random) -> Any:
@@ -307,9 +306,10 @@ def fuzz(target: Target, seeds: list[Path], inputs: int, seed: int, place: Path,
 
 def keep(said: str, tally: Tally, folder: Path, findings: Path) -> None:
     """Counts a finding; the first input of each kind is kept."""
-    if not tally.findings[said] and folder.exists():
-        findings.mkdir(parents=True, exist_ok=True)
-        shutil.move(folder, findings / folder.name)
+    if not tally.findings[said]:
+        if folder.exists():
+            findings.mkdir(parents=True, exist_ok=True)
+            shutil.move(folder, findings / folder.name)
         print(f"    {folder.name}: {said}", flush=True)
     tally.findings[said] += 1
     shutil.rmtree(folder, ignore_errors=True)
