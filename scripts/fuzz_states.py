@@ -16,7 +16,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -173,15 +173,13 @@ def _read_cell(store: Any, key: Any) -> None:
 
 def repair_store(path: Path) -> None:
     """Sizes and sums of all parts as the index says them, made right."""
-    with suppress(Exception):
-        connection = sqlite3.connect(path / "index.sqlite")
+    with suppress(Exception), closing(sqlite3.connect(path / "index.sqlite")) as connection:
         rows = connection.execute("SELECT x, y, z, name, version FROM parts").fetchall()
         for *key, name, version in rows:
             data = (path / "cells" / "_".join(map(str, key)) / str(version) / name).read_bytes()
             said = (len(data), zlib.crc32(data), *key, name)
             connection.execute("UPDATE parts SET bytes=?, crc=? WHERE x=? AND y=? AND z=? AND name=?", said)
         connection.commit()
-        connection.close()
 
 
 def index_scripts(folder: Path) -> list[Path]:
