@@ -150,6 +150,7 @@ def test_one_frame_shows_no_motion(spoilt: Path) -> None:
     assert told(spoilt).keys() == {"no_motion"} and "all 24 frames hold the same images" in told(spoilt)["no_motion"][1]
 
 
+@pytest.mark.long("rooms that are drawn")
 @pytest.mark.parametrize(
     ("path", "movers", "seed"), [("loop", (), 3), ("still", (), 4), ("still", ("walker", "mug"), 5), ("pan", (), 6)]
 )
