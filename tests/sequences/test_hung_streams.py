@@ -131,6 +131,7 @@ def test_noise_of_some_frames_is_a_doubt_that_names_them(spoilt: Path) -> None:
     assert severity == "doubtful" and "in 9 of 24 frames that were looked at, from 15 to 23" in text
 
 
+@pytest.mark.long("rooms that are drawn")
 def test_colour_of_another_room_does_not_belong_to_depth(spoilt: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     write_synthetic_sequence(other, frames=FRAMES, width=160, height=120, seed=7, trajectory="pan")
