@@ -26,7 +26,7 @@ from ggslam.sequences.edge_evidence import (
 )
 from ggslam.sequences.glances import Glance, look_over
 from ggslam.sequences.hung_pairs import judge_hung_pairs
-from ggslam.sequences.hung_streams import judge_hung
+from ggslam.sequences.hung_streams import judge_hung, spans_of
 from ggslam.sequences.inverted_depth import Inversion, find_inversion
 from ggslam.sequences.noise_doubts import judge_noise, judge_views
 from ggslam.sequences.orientation import WORDS as ORIENTATIONS
@@ -81,12 +81,13 @@ class DepthDoubts:
     def judge(self) -> list[Verdict]:
         """All doubts. One about units, place or kind of depth hides those that it may be the cause of."""
         found = judge_noise(self._glances, self.sequence.selection)
-        hung = judge_hung(self.sequence, self._glances)
+        spans = spans_of(self.sequence)
+        hung = judge_hung(self.sequence, self._glances, spans)
         found += self._judge_units() if not found else []
         found += self._judge_edges(bool(hung)) if not found else []
         found += self._judge_measure() if not found else []
         still = judge_views(self.sequence, self._glances)
-        pairs = judge_hung_pairs(self.sequence)
+        pairs = judge_hung_pairs(self.sequence, spans)
         return [*found, *self._judge_repeats(hung), *pairs, *self._judge_codes(), *still]
 
     @cached_property

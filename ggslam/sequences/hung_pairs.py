@@ -8,7 +8,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.glances import Glance, glance_of
-from ggslam.sequences.hung_streams import FEWEST, Stretch, remedy_for, same_files
+from ggslam.sequences.hung_streams import FEWEST, MOST_NAMED, Spans, Stretch, numbers_of, remedy_for, spans_of
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.verdicts import Verdict
 
@@ -22,29 +22,27 @@ AROUND = 3
 """Neighbours on either side that tell the usual change."""
 
 
-def judge_hung_pairs(sequence: Sequence) -> list[Verdict]:
-    """Whether colour and depth hang at once in a part of the recording."""
-    found = find_hung_pairs(sequence)
+def judge_hung_pairs(sequence: Sequence, spans: Spans | None = None) -> list[Verdict]:
+    """Whether colour and depth hang at once in a part of the recording; `spans`: see `spans_of`."""
+    found = find_hung_pairs(sequence, spans)
     if not found:
         return []
-    numbers = sequence.selection
-    where = ", ".join(f"{numbers[one.first]} to {numbers[one.last]}" for one in found[:3])
-    where += f" and those of {len(found) - 3} more places" if len(found) > 3 else ""
+    where = numbers_of(sequence, found)
+    where += f" and those of {len(found) - MOST_NAMED} more places" if len(found) > MOST_NAMED else ""
     text = f"colour and depth hang: frames {where} hold the images of the first of them"
     return [Verdict("both_repeat", "doubtful", f"{text}; {remedy_for(sequence, found)}")]
 
 
-def find_hung_pairs(sequence: Sequence) -> list[Stretch]:
+def find_hung_pairs(sequence: Sequence, spans: Spans | None = None) -> list[Stretch]:
     """Stretches in which both files of all frames hold the same bytes though the camera does not rest, in order; none
     if the whole recording is one."""
-    files = [sequence.files(k) for k in range(len(sequence))]
-    colors, depths = same_files([one.color for one in files]), same_files([one.depth for one in files])
-    both = [(max(a, c), min(b, d)) for a, b in colors for c, d in depths]
-    spans = sorted(span for span in both if span[1] - span[0] + 1 >= FEWEST)
-    if not spans or spans == [(0, len(sequence) - 1)]:
+    known = spans_of(sequence) if spans is None else spans
+    both = [(max(a, c), min(b, d)) for a, b in known["color"] for c, d in known["depth"]]
+    long = sorted(span for span in both if span[1] - span[0] + 1 >= FEWEST)
+    if not long or long == [(0, len(sequence) - 1)]:
         return []
-    noisy = _shows_noise(sequence, spans[0][0])
-    return [Stretch(first, last) for first, last in spans if noisy or _jumps(sequence, first, last)]
+    noisy = _shows_noise(sequence, long[0][0])
+    return [Stretch(first, last) for first, last in long if noisy or _jumps(sequence, first, last)]
 
 
 def _shows_noise(sequence: Sequence, index: int) -> bool:

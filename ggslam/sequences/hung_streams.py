@@ -26,6 +26,10 @@ MOST_COMPARED, MOST_STRETCHES = 64, 12
 Test = Callable[[Glance, Glance], bool]
 """Whether two views are the same, or are not."""
 
+Spans = dict[str, list[tuple[int, int]]]
+MOST_NAMED = 3
+"""Stretches that a sentence names."""
+
 
 @dataclass(frozen=True)
 class Stretch:
@@ -36,19 +40,26 @@ class Stretch:
     blank: bool = False
 
 
-def judge_hung(sequence: Sequence, glances: list[Glance]) -> list[Verdict]:
-    """Whether colour hangs while depth moves on, or depth while colour does."""
-    return [verdict for kind in ("color", "depth") for verdict in _judge(sequence, glances, kind)]
+def spans_of(sequence: Sequence) -> Spans:
+    """First and last of the frames whose files hold the same bytes, by "color" and "depth", the longest first. Reads
+    files of one size, so it is asked for once."""
+    files = [sequence.files(k) for k in range(len(sequence))]
+    return {kind: _same_files([getattr(one, kind) for one in files]) for kind in ("color", "depth")}
 
 
-def _judge(sequence: Sequence, glances: list[Glance], kind: str) -> list[Verdict]:
-    found = find_hung(sequence, glances, kind)
+def judge_hung(sequence: Sequence, glances: list[Glance], spans: Spans | None = None) -> list[Verdict]:
+    """Whether colour hangs while depth moves on, or depth while colour does; `spans`: see `spans_of`."""
+    known = spans_of(sequence) if spans is None else spans
+    return [verdict for kind in ("color", "depth") for verdict in _judge(sequence, glances, kind, known)]
+
+
+def _judge(sequence: Sequence, glances: list[Glance], kind: str, spans: Spans) -> list[Verdict]:
+    found = find_hung(sequence, glances, kind, spans)
     if not found:
         return []
-    numbers = sequence.selection
     frames = sum(one.last - one.first + 1 for one in found)
-    where = ", ".join(f"{numbers[one.first]} to {numbers[one.last]}" for one in found[:3])
-    where += f" and in {len(found) - 3} more places" if len(found) > 3 else ""
+    where = numbers_of(sequence, found)
+    where += f" and in {len(found) - MOST_NAMED} more places" if len(found) > MOST_NAMED else ""
     same, other = ("colour", "depth") if kind == "color" else ("depth", "colour")
     told = f"{frames} of {len(sequence)} frames, {where},"
     if all(one.blank for one in found):
@@ -56,6 +67,12 @@ def _judge(sequence: Sequence, glances: list[Glance], kind: str) -> list[Verdict
         return [Verdict("color_repeats", "doubtful", f"{text} the lens, or look how the images were written")]
     text = f"{same} images hang: {told} hold the {same} image of the first of them while {other} moves on"
     return [Verdict(f"{kind}_repeats", "doubtful", f"{text}; {remedy_for(sequence, found)}")]
+
+
+def numbers_of(sequence: Sequence, found: list[Stretch]) -> str:
+    """The first `MOST_NAMED` stretches, by the numbers that their frames have in the recording."""
+    numbers = sequence.selection
+    return ", ".join(f"{numbers[one.first]} to {numbers[one.last]}" for one in found[:MOST_NAMED])
 
 
 def remedy_for(sequence: Sequence, found: list[Stretch]) -> str:
@@ -68,11 +85,11 @@ def remedy_for(sequence: Sequence, found: list[Stretch]) -> str:
     return "record again: check the cable, the disk and what else the computer does"
 
 
-def find_hung(sequence: Sequence, glances: list[Glance], kind: str) -> list[Stretch]:
-    """Stretches in which "color" or "depth" (`kind`) hangs, in order."""
+def find_hung(sequence: Sequence, glances: list[Glance], kind: str, spans: Spans | None = None) -> list[Stretch]:
+    """Stretches in which "color" or "depth" (`kind`) hangs, in order; `spans`: see `spans_of`."""
     same, moved = _tests(kind)
-    spans = same_files([getattr(sequence.files(k), kind) for k in range(len(sequence))])
-    found = [one for span in spans[:MOST_STRETCHES] if (one := _confirm(sequence, *span, same, moved))]
+    files = (spans_of(sequence) if spans is None else spans)[kind]
+    found = [one for span in files[:MOST_STRETCHES] if (one := _confirm(sequence, *span, same, moved))]
     for first, last in _same_views(sequence, glances, same, moved):
         if not any(one.first <= last and first <= one.last for one in found):
             found.append(Stretch(first, last))
@@ -140,7 +157,7 @@ def _edge(sequence: Sequence, a: Glance, near: int, far: int, same: Test) -> int
     return near
 
 
-def same_files(files: list[ImageFile]) -> list[tuple[int, int]]:
+def _same_files(files: list[ImageFile]) -> list[tuple[int, int]]:
     """First and last of the frames whose files hold the same bytes, the longest first; none of other images."""
     spans, begin, unequal = [], 0, 0
     for k in range(1, len(files) + 1):
