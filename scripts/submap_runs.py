@@ -27,7 +27,8 @@ from kdtree_gicp import TreeSurface, TreeTracker
 from ggslam.jobs.localize.report import LocalizationReport
 from ggslam.jobs.submaps.stores import INDOORS
 from ggslam.localization.frames import FrameTracker
-from ggslam.localization.localizer import Localization, Localizer, ScanTracker, ScanTrackerSettings
+from ggslam.localization.localizer import Localization, Localizer
+from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
 from ggslam.localization.scans import ScanSequence, scan_files
 from ggslam.localization.surface import NORMAL, SCAN_TARGET, FullSurface, PartialSurface, packed_normals
 from ggslam.localization.visits import FrameSights, record_visit

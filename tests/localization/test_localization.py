@@ -12,8 +12,9 @@ import pytest
 
 from ggslam.jobs.submaps.stores import INDOORS
 from ggslam.localization.frames import FrameTracker
-from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer, ScanTracker, ScanTrackerSettings
+from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
 from ggslam.localization.places import StoredPlaces
+from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
 from ggslam.localization.scans import LaserScan
 from ggslam.localization.surface import (
     NORMAL,

@@ -17,7 +17,7 @@ import yaml
 from ggslam.coding.settings import AttributeSettings, CodecSettings
 from ggslam.errors import ConfigError
 from ggslam.localization.frames import LookUpSettings
-from ggslam.localization.localizer import ScanTrackerSettings
+from ggslam.localization.scan_tracker import ScanTrackerSettings
 from ggslam.objects.inpainting import InpaintSettings
 from ggslam.objects.membership import MembershipSettings
 from ggslam.slam.config import Config, config_to_dict, load_config

@@ -17,8 +17,9 @@ from ggslam.jobs.localize.report import LocalizationReport, write_localization
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
 from ggslam.localization.frames import FrameTracker
-from ggslam.localization.localizer import Localization, Localizer, ScanTracker, ScanTrackerSettings
+from ggslam.localization.localizer import Localization, Localizer
 from ggslam.localization.places import StoredPlaces
+from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
 from ggslam.localization.scans import ScanSequence, scan_files
 from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface
 from ggslam.native.loader import NativeContext
