@@ -4,12 +4,14 @@
 Labels alone leave specks behind and take strangers along: an identity vector that was seen twice is a guess. Four rules
 mend that, in this order:
 
-1. A Gaussian is claimed when the classifier gives the object at least `threshold`, or when its stored label says so.
+1. A Gaussian is claimed when its stored label says so, or when the classifier gives the object at least `threshold`.
+   Where the two disagree, the stored label has nearly always been right (it has the votes as well): then the object
+   must have at least as many of the neighbours as the label has.
 2. A claimed Gaussian whose neighbours nearly all carry other labels is a wrong label on another object's surface, and
    is given back. (A floater hangs in the air, where it has no such neighbours.)
 3. Claimed Gaussians are joined to components. Small components far from the large ones are floaters.
 4. What lies among members (most neighbours are members), or inside the convex hull of a compact object without being
-   any other object's, is taken along.
+   any other object's or lying on one, is taken along.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ class MembershipSettings:
     """Whether floaters count as members: yes for removing (they look like the object), no for moving (they would fly
     along as a swarm)."""
     neighbours: int = setting(12, 1, 1000)
-    """Neighbours that are asked in rules 2 and 4."""
+    """Neighbours that are asked in rules 1, 2 and 4."""
     lonely: float = setting(0.1, 0, 1)
     """With no more than this share of its labelled neighbours on its side a label is taken for wrong (rule 2)."""
     agreement: float = setting(0.75, 0, 1)
@@ -86,10 +88,12 @@ def members(
     if not settings.repair:
         return union
     surroundings = _Surroundings(gaussians.means.numpy())
-    claimed = (evidence.stored[:, None] == ids) | (evidence.own >= settings.threshold)
-    for own, object_id in zip(claimed.T, ids, strict=True):
-        chosen |= _repair(own, object_id, evidence, surroundings, settings)
-    common = union & ~claimed.any(1)  # claimed by the sum alone: on the border of two of the objects
+    told = evidence.own >= settings.threshold
+    for column, object_id in enumerate(ids):
+        claimed = _claims(told[:, column], object_id, evidence.stored, surroundings, settings)
+        chosen |= _repair(claimed, object_id, evidence, surroundings, settings)
+    # claimed by the sum alone: on the border of two of the objects
+    common = union & ~told.any(1) & ~np.isin(evidence.stored, ids)
     return chosen | (common & surroundings.near(chosen, settings)) if common.any() else chosen
 
 
@@ -164,6 +168,18 @@ def _median_spacing(points: np.ndarray) -> float:
     count = min(3, len(points))
     distance, _ = cKDTree(points).query(points, k=[count])
     return float(np.median(distance)) + 1e-9
+
+
+def _claims(
+    told: np.ndarray, object_id: int, stored: np.ndarray, surroundings: _Surroundings, s: MembershipSettings
+) -> np.ndarray:
+    """Whom an object claims, bool [N] (rule 1); `told`: whom the classifier gives it."""
+    out = (stored == object_id) | (told & (stored == 0))
+    disputed = np.flatnonzero(told & ~out)
+    if len(disputed):
+        around = stored[surroundings.of(disputed, s.neighbours)[1]]
+        out[disputed] = (around == object_id).sum(1) >= (around == stored[disputed, None]).sum(1)
+    return out
 
 
 def _repair(
@@ -243,8 +259,10 @@ def _find_enclosed(
     own = chosen[index].sum(1)
     counted = np.where(other[candidates], index.shape[1], (chosen | (evidence.label() > 0))[index].sum(1))
     out[candidates[(own >= s.agreement * counted) & (own >= s.few * index.shape[1])]] = True
-    inside = candidates[in_hull(core, means[candidates])]
-    strangers = other[inside]
+    among_others = ((evidence.label() > 0) & ~chosen)[index].sum(1) > own
+    hull = in_hull(core, means[candidates])
+    inside, on_others = candidates[hull], among_others[hull]
+    strangers = other[inside] | on_others
     if max(strangers.sum(), (~strangers).sum()) <= s.crowding * len(core):
         out[inside[~strangers]] = True
     return out

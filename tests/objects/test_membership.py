@@ -94,3 +94,26 @@ def test_settings_out_of_range_are_refused() -> None:
 def test_flat_sets_have_a_hull() -> None:
     flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], float)
     assert in_hull(flat, np.array([[0.5, 0.5, 0], [0.5, 0.5, 0.2], [2, 0, 0]])).tolist() == [True, False, False]
+
+
+def test_a_wall_takes_nothing_of_what_stands_before_it() -> None:
+    """Of a cupboard's front 22 cm before a wall some Gaussians look like the wall to the classifier, some have none;
+    so has a speck of the wall that looks like the cupboard."""
+    rng = np.random.default_rng(1)
+    front = wall()[rng.permutation(1681)] * [0.4, 0.4, 1] - [0, 0, 0.22]
+    speck = np.array([[0.51, 0.52, 2.0]])
+    parts = ((wall(), WALL, WALL), (front[:1200], CUP, CUP), (front[1200:1400], CUP, WALL), (front[1400:], 0, 0),
+             (speck, CUP, WALL))  # fmt: skip
+    chosen = members(map_of(*parts), CLASSIFIER, [WALL])
+    assert chosen[:1681].all() and chosen[-1]
+    assert not chosen[1681:-1].any()
+    alone = members(map_of(*parts), CLASSIFIER, [CUP])
+    assert alone[1681:3081].all() and alone[3081:-1].mean() > 0.95 and not alone[:1681].any()
+
+
+def test_the_hull_of_a_bent_wall_takes_nothing_that_lies_on_another_object() -> None:
+    side = wall()[:, [2, 1, 0]] - [1, 0, -1]
+    corner = np.concatenate([wall(), side])
+    board = np.array([[x, y, 1.78] for x in np.linspace(-0.3, 0.6, 16) for y in np.linspace(-0.5, 0.5, 16)])
+    gaussians = map_of((corner, WALL, WALL), (board[::2], CUP, CUP), (board[1::2], 0, 0))
+    assert not members(gaussians, CLASSIFIER, [WALL])[len(corner) :].any()
