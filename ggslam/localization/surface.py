@@ -56,8 +56,8 @@ def packed_normals(normals: np.ndarray) -> np.ndarray:
 def load_surface(
     store: GridStore, key: CellKey, origin: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Points, relative to an origin [3] (None: the world's), and unit normals of a cell, float32 [n, 3], and whether the
-    normals point to the side that was seen.
+    """Points, relative to an origin [3] (None: the world's), and unit normals of a cell, float32 [n, 3]; and whether
+    the normals point to the side that was seen.
 
     Raises:
         KeyError: there is no such cell, or it has no points.
