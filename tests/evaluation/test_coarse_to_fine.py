@@ -31,7 +31,7 @@ def errors(T_true: np.ndarray, T_found: np.ndarray, source: np.ndarray) -> tuple
 
 @pytest.fixture(scope="module")
 def scans() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Pairs of scans of a generated world, 16 rings each, and T_target_source: 0.4 m and 3 degrees, half overlapping."""
+    """Pairs of scans of a generated world, 16 rings each, and T_target_source: 0.4 m and 3 degrees."""
     world = make_world(60.0, seed=1)
     poses, pairs = walk(world, 4.0, seed=1), []
     for number in (0, 10, 25):
