@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from command_line import succeed
+from command_line import ggslam, refuse, succeed
 from scipy.spatial import cKDTree
 
+from ggslam.formats.ply import write_ply
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
 from ggslam.formats.trajectory import read_tum, write_tum
 from ggslam.formats.triangle_mesh import read_mesh
@@ -332,3 +333,56 @@ def test_runs_do_not_know_where_the_world_is(inputs: tuple[Input, Input], tmp_pa
     one, other = compared
     assert one["overlap"]["a_on_b"]["fitness"] > 0.5
     assert _difference(one["overlap"], other["overlap"]) < 2e-3 and _difference(one["surface"], other["surface"]) < 1e-4
+
+
+# --- what cannot be where it is --------------------------------------------------------------------------------------
+
+
+def test_single_precision_far_away_is_named(
+    inputs: tuple[Input, Input], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    points = read_point_cloud(inputs[1].folder / "other.ply").points
+    write_point_cloud(tmp_path / "rounded.ply", points.astype(np.float32), {})
+    caplog.clear()
+    read_point_cloud(tmp_path / "rounded.ply")
+    assert "reach 54270" in caplog.text and "steps of 0.5 there" in caplog.text
+    caplog.clear()
+    read_point_cloud(inputs[1].folder / "other.ply")
+    read_point_cloud(inputs[0].folder / "other.ply")
+    assert not caplog.text
+
+
+def test_gaussians_are_not_taken_far_away(tmp_path: Path) -> None:
+    names = ("x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
+    rows = np.zeros(40, [(name, "f8") for name in names])
+    for axis, values in zip("xyz", np.random.default_rng(0).normal(size=(3, 40)), strict=True):
+        rows[axis] = values
+    rows["rot_0"] = 1
+    write_ply(tmp_path / "near.ply", {"vertex": rows})
+    for axis, offset in zip("xyz", UTM, strict=True):
+        rows[axis] += offset
+    write_ply(tmp_path / "far.ply", {"vertex": rows})
+    succeed("export", tmp_path / "near.ply", "--out", tmp_path / "near.spz")
+    refuse(
+        ggslam("export", tmp_path / "far.ply", "--out", tmp_path / "far.spz"),
+        "far.ply", "542700", "steps of 0.5 m", "subtract an offset",
+    )  # fmt: skip
+    moved = ggslam("edit", tmp_path / "near.ply", "--move", "all", "463000 5427000 300", "--out", tmp_path / "at.ply")
+    refuse(moved, "single precision", "steps of 0.5 m", "large offsets")
+
+
+def test_a_map_of_the_field(shared_data: Path, tmp_path: Path) -> None:
+    """KITTI's scans in a map at UTM coordinates, against the same map near zero."""
+    field, found = shared_data / "field" / "maps" / "utm_map", []
+    points, poses = read_point_cloud(field / "map.ply").points, read_tum(field / "trajectory.txt")
+    for name, offset in (("near", -UTM), ("far", np.zeros(3))):
+        given, out = tmp_path / name, tmp_path / f"{name}.out"
+        shutil.copytree(field / "scans", given / "scans")
+        write_point_cloud(given / "map.ply", points + offset, {})
+        write_tum(given / "trajectory.txt", poses.timestamps, _moved(poses.T_world_camera, offset))
+        options = ["--columns", 3, "--full-map", "--start-pose", "given"]
+        succeed("localize", given / "map.ply", given, *options, "--out", out)
+        located, true = (read_tum(f / "trajectory.txt").T_world_camera[:, :3, 3] for f in (out, given))
+        found.append(located - true)
+        assert np.linalg.norm(found[-1], axis=1).max() < 0.006
+    assert np.abs(found[0] - found[1]).max() < 0.1 * MM

@@ -107,7 +107,8 @@ class SurfaceLoader:
 def _rank(key: CellKey) -> int:
     """A number that no two cells within 2^21 cells share."""
     mask = (1 << _RANK_BITS) - 1
-    return sum((coordinate & mask) << (_RANK_BITS * axis) for axis, coordinate in enumerate(key))
+    half = 1 << (_RANK_BITS - 1)  # neighbours about zero are in order, too
+    return sum(((coordinate + half) & mask) << (_RANK_BITS * axis) for axis, coordinate in enumerate(key))
 
 
 def surface_normals(points: np.ndarray) -> np.ndarray:
