@@ -306,6 +306,19 @@ def test_encode(inputs: tuple[Input, Input], tmp_path: Path, options: tuple[str,
         assert _farthest(*found) < 0.1 * MM
 
 
+def test_a_box_of_a_stream(inputs: tuple[Input, Input], tmp_path: Path) -> None:
+    found = []
+    for given in inputs:
+        stream, out = tmp_path / f"{given.folder.name}.bin", tmp_path / f"{given.folder.name}.ply"
+        succeed("encode", given.folder / "other.ply", stream, "--voxel", 0.05, "--slices", 4)
+        middle = np.median(given.back(read_point_cloud(given.folder / "other.ply").points), axis=0).round(1) + 0.013
+        corners = np.concatenate([middle - 3, middle + 3]) + np.tile(given.offset, 2)
+        succeed("decode", stream, out, "--box", " ".join(f"{value:.3f}" for value in corners))
+        found.append(given.back(read_point_cloud(out).points))
+        assert np.abs(found[-1] - middle).max() <= 3 + 0.05
+    assert len(found[0]) == len(found[1]) > 100 and _farthest(*found) < 0.1 * MM
+
+
 # --- runs ------------------------------------------------------------------------------------------------------------
 
 
