@@ -17,6 +17,7 @@ from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
     from ggslam.geometry.clouds import Overlap
+    from ggslam.geometry.surface_distances import SurfaceDistances
     from ggslam.jobs.compare.comparison import Comparison
     from ggslam.runs.records.metrics import MetricsRecord
 
@@ -63,7 +64,8 @@ def compare(
                      "positions at common times; auto: truth where that clearly fits better than none."),
     ] = AlignmentName.auto,
     max_distance: Annotated[
-        float, typer.Option(help="Farthest partners that fitness, RMSE and ICP count, metres.")
+        float, typer.Option(help="Farthest partners that fitness and inlier RMSE count, metres; distances to the "
+                            "surface count all points.")
     ] = 0.05,
     thresholds: Annotated[str, typer.Option(help="Distances for precision, recall and F1, metres.")] = "0.01,0.02,0.05",
     seed: Annotated[int, typer.Option(help="Seed of the random samples.", min=0)] = 0,
@@ -114,7 +116,14 @@ def _print(c: Comparison, max_distance: float) -> None:
         console.print(f"{name}: {side.path}, {len(side.points)} points", highlight=False, markup=False)
     if c.align != "none":
         console.print(f"A is moved into the frame of B: {_ALIGNED[c.align]}", highlight=False)
-    console.print(table(f"overlap within {100 * max_distance:g} cm", ["", "fitness", "inlier RMSE"], _overlaps(c)))
+    console.print(table(f"overlap within {100 * max_distance:g} cm", _COLUMNS, _overlaps(c)))
+    if c.pair_distance_m > max_distance:
+        console.print(
+            f"note: the points of B are far apart: a partner within {100 * max_distance:g} cm is chance, so fitness "
+            f"and the table below say little (--max-distance {c.pair_distance_m:.2f} would); go by the distances to "
+            "the surface",
+            highlight=False, markup=False, soft_wrap=True,
+        )  # fmt: skip
     if max(c.a_on_b.fitness, c.b_on_a.fitness) < _HARDLY:
         console.print(
             "note: hardly anything of the two lies together: they show different places, or lie in different worlds "
@@ -149,13 +158,19 @@ _HARDLY = 0.05
 """Share of points with a partner below which the two do not show the same thing as they lie."""
 
 
-def _overlaps(c: Comparison) -> list[list[str]]:
-    def row(name: str, o: Overlap) -> list[str]:
-        return [name, f"{o.fitness:.4f}", f"{100 * o.inlier_rmse_m:.2f} cm"]
+_COLUMNS = ["", "fitness", "inlier RMSE", "to the surface: median", "90 %"]
 
-    rows = [row("A on B", c.a_on_b), row("B on A", c.b_on_a)]
-    if c.icp is not None and c.b_on_a_after_icp is not None and c.align != "icp":
-        rows += [row("A on B after ICP", c.icp.overlap), row("B on A after ICP", c.b_on_a_after_icp)]
+
+def _overlaps(c: Comparison) -> list[list[str]]:
+    def row(name: str, o: Overlap, to: SurfaceDistances) -> list[str]:
+        distances = (o.inlier_rmse_m, to.median_m, to.p90_m)
+        return [name, f"{o.fitness:.4f}", *(f"{100 * distance:.2f} cm" for distance in distances)]
+
+    rows = [row("A on B", c.a_on_b, c.surface[0]), row("B on A", c.b_on_a, c.surface[1])]
+    after = c.surface_after_icp
+    if c.icp is not None and c.b_on_a_after_icp is not None and after is not None and c.align != "icp":
+        rows.append(row("A on B after ICP", c.icp.overlap, after[0]))
+        rows.append(row("B on A after ICP", c.b_on_a_after_icp, after[1]))
     return rows
 
 

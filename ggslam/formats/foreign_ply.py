@@ -20,6 +20,7 @@ import torch
 from ggslam.errors import FormatError
 from ggslam.formats.gaussian_ply import object_ids
 from ggslam.formats.gaussian_rows import BLOCK, GaussianRows
+from ggslam.formats.positions import COARSE, coordinate_step
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_repair import THINNER, SplatFaults, columns_of, logits_of, map_of_columns, mend
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
@@ -114,6 +115,7 @@ class SplatLayout:
             sh[:, 1:, channel] = _stack(vertex, self.rest[start : start + self.coefficients])
         ids = object_ids(path, vertex, first) if self.has_ids else None
         quaternions = _stack(vertex, ("rot_0", "rot_1", "rot_2", "rot_3"))
+        _refuse_far(path, vertex)
         return columns_of(_stack(vertex, ("x", "y", "z")), sizes, quaternions, logits, sh, ids)
 
     def _base_colors(self, vertex: np.ndarray) -> np.ndarray:
@@ -233,6 +235,20 @@ def _in_order(path: Path, names: Sequence[str], prefix: str) -> tuple[str, ...]:
     if set(found) != set(expected):
         raise FormatError(f"{path}: the properties {prefix}* are not numbered 0 to {len(found) - 1}: {sorted(found)}")
     return expected
+
+
+def _refuse_far(path: Path, vertex: np.ndarray) -> None:
+    """Raises FormatError if Gaussians, which are in single precision, could not be where a file has them in double."""
+    doubles = [vertex[axis] for axis in "xyz" if vertex.dtype[axis] == np.float64]
+    if not doubles or not len(vertex):
+        return
+    typical = float(np.nanmax(np.median(np.abs(doubles), axis=1)))  # some may be anywhere
+    step = coordinate_step(typical)
+    if step > COARSE:
+        raise FormatError(
+            f"{path}: its Gaussians lie {typical:.0f} m from zero, in double precision; maps are in single precision, "
+            f"with steps of {step:.3g} m there: subtract an offset first"
+        )
 
 
 def _stack(vertex: np.ndarray, names: Sequence[str]) -> np.ndarray:

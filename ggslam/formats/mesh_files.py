@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes meshes with normals, colours and objects: PLY by itself, OBJ and GLB (glTF 2.0) through trimesh.
 
-Coordinates are written as they are: metres, in the map's frame or a frame with z upwards. glTF viewers take y for
+Coordinates are written as they are: metres, in the map's frame or a frame with z upwards. Far from zero, where single
+precision would move them by a tenth of a millimetre and more, a PLY has doubles, and a GLB vertices near its origin and
+the way there in its nodes' matrices. glTF viewers take y for
 upwards, and colours at vertices for linear light, see `linear_light`.
 
 The material of a GLB is unlit (KHR_materials_unlit): colours of a scan were photographed and hold the room's light, so
@@ -25,6 +27,8 @@ from ggslam.formats.linear_light import vertex_colors
 from ggslam.formats.optional_package import package_for
 from ggslam.formats.ply import write_ply
 from ggslam.formats.triangle_mesh import majority_labels
+from ggslam.scene.origin import local_origin, stored_positions
+from ggslam.scene.poses import translation
 from ggslam.system.atomic import write_bytes
 
 GLTF_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -96,7 +100,7 @@ def _write_ply(
     path: str | Path, vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray | None,
     colors: np.ndarray | None, labels: np.ndarray | None,
 ) -> None:  # fmt: skip
-    columns: dict[str, np.ndarray] = dict(zip("xyz", vertices.T.astype(np.float32), strict=True))
+    columns: dict[str, np.ndarray] = dict(zip("xyz", stored_positions(vertices).T, strict=True))
     if normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), normals.T.astype(np.float32), strict=True))
     if colors is not None:
@@ -120,6 +124,9 @@ def _of_trimesh(
     colors: np.ndarray | None, labels: np.ndarray | None, names: Mapping[int, str], z_up: bool,
 ) -> bytes:  # fmt: skip
     trimesh, is_glb = _trimesh(path), Path(path).suffix.lower() == ".glb"
+    origin = local_origin(vertices[0]) if is_glb else np.zeros(3)
+    if origin.any():
+        vertices = vertices - origin
 
     def geometry(chosen: np.ndarray) -> Any:
         used, corners = np.unique(chosen, return_inverse=True)
@@ -139,7 +146,7 @@ def _of_trimesh(
     for label in np.unique(of_triangle).tolist():
         name = _node_name(label, names) if labels is not None else "mesh"
         part = geometry(triangles[of_triangle == label])
-        T_gltf_mesh = GLTF_FROM_Z_UP if z_up else GLTF_AXES
+        T_gltf_mesh = (GLTF_FROM_Z_UP if z_up else GLTF_AXES) @ translation(origin)
         scene.add_geometry(part, node_name=name, geom_name=name, transform=T_gltf_mesh)
     data: bytes = scene.export(file_type="glb", include_normals=normals is not None, tree_postprocessor=_finish_gltf)
     return data

@@ -15,8 +15,8 @@ import numpy as np
 
 from ggslam.errors import InputError
 from ggslam.geometry.clouds import Cloud, Overlap, Points, as_cloud, check_distance, overlap
-from ggslam.geometry.normals import estimate_normals
-from ggslam.scene.poses import orthonormalize, se3_exp, transform_points, turning_angle
+from ggslam.geometry.surface_distances import LazyNormals
+from ggslam.scene.poses import orthonormalize, se3_exp, transform_points, translation, turning_angle
 
 FEWEST_MATCHES = 10
 """Fewer pairs of points than this leave a pose open."""
@@ -47,18 +47,20 @@ class CloudRegistration:
 def register(
     source: Points, target: Points, target_normals: np.ndarray | None = None,
     max_distances: Sequence[float] = (0.25, 0.10, 0.05), T_start: np.ndarray | None = None, iterations: int = 30,
-    sample: int = 50_000, seed: int = 0,
+    sample: int = 50_000, seed: int = 0, kernels: Sequence[float] | None = None,
 ) -> CloudRegistration:  # fmt: skip
     """Finds the motion that brings a source upon a target.
 
     Args:
         source, target: [N, 3] and [M, 3] metres.
-        target_normals: [M, 3]; None: estimated where they are needed.
+        target_normals: [M, 3]; None: estimated where they are needed. Pairs with a normal of zero do not count.
         max_distances: pairs farther apart are no pairs; from the first to the last. The last counts for the overlap.
         T_start: T_target_source to begin with; None: the identity.
         iterations: at most, at each distance.
         sample: the source's points that steer the motion, drawn at random.
         seed: of the draw.
+        kernels: at each distance, the size in metres from which on a point-to-plane distance counts for less (Geman and
+            McClure); None: all count alike.
 
     Raises:
         InputError: a cloud is empty or not finite, a distance is not positive, or fewer than 10 points have a partner
@@ -66,15 +68,17 @@ def register(
     """
     source, target = as_cloud(source), as_cloud(target)
     distances = [check_distance(d) for d in max_distances]
-    normals = _LazyNormals(target, target_normals)
+    centre = target.points.mean(0)
+    normals = LazyNormals(target, target_normals)
     chosen = source.points[source.sample(sample, seed)]
     start = np.eye(4) if T_start is None else np.asarray(T_start, np.float64)
     T, made, converged = start, 0, False
-    for distance in distances:
+    sizes = [np.inf] * len(distances) if kernels is None else [check_distance(size) for size in kernels]
+    for distance, size in zip(distances, sizes, strict=True):
         converged = False
         for _ in range(iterations):
-            step = _step(transform_points(chosen, T), target, normals, distance)
-            T = orthonormalize(se3_exp(step) @ T)
+            step = _step(transform_points(chosen, T), target, normals, distance, size, centre)
+            T = orthonormalize(translation(centre) @ se3_exp(step) @ translation(-centre) @ T)
             made += 1
             if np.abs(step).max() < SMALL_STEP:
                 converged = True
@@ -90,29 +94,19 @@ def register(
     )
 
 
-class _LazyNormals:
-    """Normals of a cloud, given, or estimated for those points that are asked for."""
-
-    def __init__(self, cloud: Cloud, normals: np.ndarray | None) -> None:
-        self._cloud = cloud
-        self._normals = np.zeros_like(cloud.points) if normals is None else np.asarray(normals, np.float64)
-        self._known = np.full(len(cloud), normals is not None)
-
-    def of(self, rows: np.ndarray) -> np.ndarray:
-        unknown = np.unique(rows[~self._known[rows]])
-        self._normals[unknown] = estimate_normals(self._cloud.points, unknown, tree=self._cloud.tree)
-        self._known[unknown] = True
-        return self._normals[rows]
-
-
-def _step(moved: np.ndarray, target: Cloud, normals: _LazyNormals, distance: float) -> np.ndarray:
-    """Gauss-Newton step (translation, rotation) [6], applied from the left, of the point-to-plane distances."""
+def _step(
+    moved: np.ndarray, target: Cloud, normals: LazyNormals, distance: float, kernel: float, centre: np.ndarray
+) -> np.ndarray:
+    """Gauss-Newton step (translation, rotation) [6], applied from the left about a centre [3], of the point-to-plane
+    distances. About an origin far away, turning and moving could not be told apart."""
     apart, nearest = target.tree.query(moved, distance_upper_bound=distance, workers=-1)
     pairs = np.isfinite(apart)
     if pairs.sum() < FEWEST_MATCHES:
         raise InputError(f"expected at least {FEWEST_MATCHES} points within {distance} m of the target, found "
                          f"{int(pairs.sum())} of {len(moved)}")  # fmt: skip
     p, q, n = moved[pairs], target.points[nearest[pairs]], normals.of(nearest[pairs])
-    J = np.concatenate([n, np.cross(p, n)], 1)
+    J = np.concatenate([n, np.cross(p - centre, n)], 1)
     residual = ((p - q) * n).sum(1)
-    return np.linalg.lstsq(J.T @ J, -J.T @ residual, rcond=1e-9)[0]  # directions that nothing holds stay as they are
+    weight = 1 / (1 + (residual / kernel) ** 2) ** 2
+    # Directions that nothing holds stay as they are.
+    return np.linalg.lstsq((J * weight[:, None]).T @ J, -J.T @ (weight * residual), rcond=1e-9)[0]

@@ -18,7 +18,7 @@ _CHUNK = 1 << 17
 
 def estimate_normals(
     points: np.ndarray, rows: np.ndarray | None = None, neighbours: int = NEIGHBOURS, tree: cKDTree | None = None,
-    workers: int = -1, beside: np.ndarray | None = None, thickness: float | None = None,
+    workers: int = -1, beside: np.ndarray | None = None, thickness: float | None = None, width: float | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Unit normals float64 [n, 3] of points [N, 3], the direction of least variance among each point's nearest
     neighbours; their sign is arbitrary.
@@ -31,6 +31,8 @@ def estimate_normals(
         beside: [N, k], further coordinates in which neighbours lie near; the tree then is of all.
         thickness: normals are zero where the variance along them is above this share of the middle one, across the
             neighbours' second narrowest direction: there is no surface.
+        width: normals are zero where the middle variance is below this share of the largest: the neighbours lie along a
+            line, as one ring of a laser scanner, and do not show which way the surface is turned.
         workers: threads that search; one is faster for a few hundred points.
     """
     points = np.asarray(points, np.float64)
@@ -46,6 +48,8 @@ def estimate_normals(
         normals[part] = axes[:, :, 0]
         if thickness is not None:
             normals[start:][: len(near)][variances[:, 0] > thickness * variances[:, 1]] = 0
+        if width is not None:
+            normals[start:][: len(near)][variances[:, 1] < width * variances[:, 2]] = 0
     return normals
 
 

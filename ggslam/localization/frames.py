@@ -17,7 +17,7 @@ from ggslam.loops.verification import LocalMap, verify
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, transform_points
+from ggslam.scene.poses import inverse, transform_points, translation
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, align
 from ggslam.tracking.gicp_tracker import GicpTracker
@@ -125,10 +125,12 @@ class FrameTracker:
             tracker = self.tracker
             guess = T_world_view @ T_view_new
             last = align(points, target, guess, tracker.settings.align, noise, tracker.context)
-            information = information_in_frame(last.information, T_view_world)
+            # About the camera, which is near the view: the world's origin may be far.
+            about_camera = T_view_world @ translation(last.T_world_camera[:3, 3])
+            information = information_in_frame(last.camera_information, about_camera)
             return replace(last, T_world_camera=T_view_world @ last.T_world_camera, information=information)
 
-        voxels = target.voxels()["means"]
+        voxels = target.voxels()["means"] + target.origin
         near = voxels[np.linalg.norm(voxels - T_world_view[:3, 3], axis=1) <= self._look_up.reach]
         old = LocalMap(known.place.landmarks, transform_points(near, T_view_world))
         found = verify(old, new, self.tracker.camera, noise.sigma, align_at, self._look_up.verification)

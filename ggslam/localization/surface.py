@@ -5,6 +5,9 @@ A cell's points become flat Gaussians along its surface. Their normals are those
 `NORMAL`), else estimated from neighbours; then it is not known which side of a surface the sensor sees. A cell is
 gathered in voxels when it is read, ahead of the motion in the background; what is left to do when the sensor enters a
 cell is to compose the cells around it.
+
+Targets are in single precision, relative to an origin near the sensor (`scene.origin`): where that is in the world is
+told by the target, and poses are world poses everywhere else.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.geometry.normals import estimate_normals
 from ggslam.native.loader import NativeContext
+from ggslam.scene.origin import is_far, local_origin
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import POINTS
 from ggslam.submaps.cells_around import CellsAround, MapStatus
@@ -49,15 +53,19 @@ def packed_normals(normals: np.ndarray) -> np.ndarray:
     return np.rint(np.asarray(normals) * 127).astype(np.int8)
 
 
-def load_surface(store: GridStore, key: CellKey) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Points and unit normals of a cell, float32 [n, 3], and whether the normals point to the side that was seen.
+def load_surface(
+    store: GridStore, key: CellKey, origin: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Points, relative to an origin [3] (None: the world's), and unit normals of a cell, float32 [n, 3]; and whether
+    the normals point to the side that was seen.
 
     Raises:
         KeyError: there is no such cell, or it has no points.
         FormatError: the file is damaged.
     """
     arrays = load_points(store, key)
-    points = np.ascontiguousarray(arrays["points"], np.float32)
+    placed = arrays["points"] if origin is None or not origin.any() else arrays["points"].astype(np.float64) - origin
+    points = np.ascontiguousarray(placed, np.float32)
     if NORMAL not in arrays:
         normals = surface_normals(points)
         return points, np.where(normals @ _ANYWHERE < 0, -1, 1).astype(np.float32)[:, None] * normals, False
@@ -78,14 +86,15 @@ class SurfaceCell:
 
 
 class SurfaceLoader:
-    """Reads cells as parts of targets of some settings, in any thread."""
+    """Reads cells as parts of targets of some settings, in any thread; `origin` [3]: of the targets, in the world."""
 
-    def __init__(self, settings: TargetSettings, context: NativeContext) -> None:
+    def __init__(self, settings: TargetSettings, context: NativeContext, origin: np.ndarray | None = None) -> None:
         self.settings, self.context = settings, context
+        self.origin = np.zeros(3) if origin is None else origin
 
     def __call__(self, store: GridStore, key: CellKey) -> SurfaceCell:
         """Raises what `load_surface` raises."""
-        points, normals, has_sides = load_surface(store, key)
+        points, normals, has_sides = load_surface(store, key, self.origin)
         turn = np.ascontiguousarray(quaternions_from_normals(normals), np.float32)
         flat = np.log(self.settings.voxel * np.array([1, 1, FLATNESS])).astype(np.float32)
         log_scales, opacity_logits = np.tile(flat, (len(points), 1)), np.full(len(points), _OPACITY_LOGIT, np.float32)
@@ -98,7 +107,8 @@ class SurfaceLoader:
 def _rank(key: CellKey) -> int:
     """A number that no two cells within 2^21 cells share."""
     mask = (1 << _RANK_BITS) - 1
-    return sum((coordinate & mask) << (_RANK_BITS * axis) for axis, coordinate in enumerate(key))
+    half = 1 << (_RANK_BITS - 1)  # neighbours about zero are in order, too
+    return sum(((coordinate + half) & mask) << (_RANK_BITS * axis) for axis, coordinate in enumerate(key))
 
 
 def surface_normals(points: np.ndarray) -> np.ndarray:
@@ -147,17 +157,22 @@ class PartialSurface:
     def __init__(
         self, store: GridStore, settings: TargetSettings, context: NativeContext, submaps: SubmapSettings | None = None
     ) -> None:
-        loader = SurfaceLoader(settings, context)
-        self.map = CellsAround(store, loader, POINTS, lambda cell: cell.part.nbytes, submaps)
+        self._store, self._submaps = store, submaps
+        self._settings, self._context = settings, context
+        self.map = self._cells_around(np.zeros(3))
         self.target: GicpTarget | None = None
         self.has_sides = True
         self.points = 0
-        self._settings, self._context = settings, context
         self.damage: set[str] = set()
         """What is wrong with cells that were within R' and cannot be read."""
 
     def move_to(self, position: np.ndarray, velocity: np.ndarray | None = None) -> bool:
         """See `Surface`."""
+        before = self.target
+        if is_far(position, self._origin):  # every kilometre at most
+            self.map.close()
+            self.map = self._cells_around(local_origin(position))
+            self.target = None
         status = self.map.update(position, velocity)
         if status is MapStatus.UNCHANGED:
             return False
@@ -165,10 +180,17 @@ class PartialSurface:
         cells = self.map.cells.values()
         self.points = sum(cell.part.count for cell in cells)
         self.has_sides = all(cell.has_sides for cell in cells)
-        before = self.target
-        parts = [cell.part for cell in cells]
-        self.target = composed_target(parts, self._settings, self._context, before) if self.points else None
+        parts, like = [cell.part for cell in cells], self.target
+        self.target = None
+        if self.points:
+            self.target = composed_target(parts, self._settings, self._context, like, self._origin)
         return self.target is not None or before is not None
+
+    def _cells_around(self, origin: np.ndarray) -> CellsAround[SurfaceCell]:
+        """Cells as parts of targets with this origin."""
+        self._origin = origin
+        loader = SurfaceLoader(self._settings, self._context, origin)
+        return CellsAround(self._store, loader, POINTS, lambda cell: cell.part.nbytes, self._submaps)
 
     def close(self) -> None:
         """Ends loading ahead."""
@@ -184,7 +206,8 @@ class PartialSurface:
 
 
 class FullSurface:
-    """The surface of the whole map, read once. Memory and reading time go with the map."""
+    """The surface of the whole map, read once. Memory and reading time go with the map; its origin is near the first
+    place that is asked for."""
 
     def __init__(self, store: GridStore, settings: TargetSettings, context: NativeContext) -> None:
         self.target: GicpTarget | None = None
@@ -199,13 +222,14 @@ class FullSurface:
         if self._read:
             return False
         self._read = True
-        loader = SurfaceLoader(self._settings, self._context)
+        loader = SurfaceLoader(self._settings, self._context, local_origin(position))
         cells = [cell for key in self._store.cells() if (cell := self._cell(loader, key)) is not None]
         self.points = sum(cell.part.count for cell in cells)
         if not self.points:
             return False
         self.has_sides = all(cell.has_sides for cell in cells)
-        self.target = composed_target([cell.part for cell in cells], self._settings, self._context)
+        parts = [cell.part for cell in cells]
+        self.target = composed_target(parts, self._settings, self._context, origin=loader.origin)
         return True
 
     def close(self) -> None:

@@ -238,7 +238,8 @@ def _check_near(scene: SegmentedMap, kind: str, ids: Sequence[int], shift: Vecto
         place = np.add(record.centroid, shift)
         if not np.abs(place).max() <= FARTHEST_M:
             raise ConfigError(
-                f"--{kind} {record.label()} by {_numbers(shift)} m: it would be farther than {FARTHEST_M:g} m away"
+                f"--{kind} {record.label()} by {_numbers(shift)} m: it would be farther than {FARTHEST_M:g} m away, "
+                "and Gaussians are in single precision; large offsets belong to the program that shows the map"
             )
 
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from ggslam.errors import FormatError
 from ggslam.formats.pcd import parse_pcd, pcd_bytes
+from ggslam.scene.origin import stored_positions
 from ggslam.submaps.cell_keys import sorted_groups
 
 CellArrays = Mapping[str, np.ndarray]
@@ -18,9 +19,6 @@ CellArrays = Mapping[str, np.ndarray]
 
 POINTS = "points.pcd"
 """The part of a cell that holds its points."""
-
-_FINE = 1e-4
-"""Metres: coordinates that single precision would round more coarsely are written in double precision."""
 
 
 def encode_points(arrays: CellArrays) -> bytes:
@@ -35,8 +33,7 @@ def encode_points(arrays: CellArrays) -> bytes:
     if taken := sorted(set("xyz") & set(arrays)):
         raise ValueError(f"an attribute cannot be called {taken[0]!r}: so are the coordinates")
     points = np.asarray(arrays["points"])
-    step = np.spacing(np.float32(np.abs(points).max(initial=0)))
-    positions = points.astype(np.float32 if step <= _FINE else np.float64)
+    positions = stored_positions(points)
     columns = {axis: positions[:, number] for number, axis in enumerate("xyz")}
     return pcd_bytes({**columns, **{name: v for name, v in arrays.items() if name != "points"}}, compressed=True)
 

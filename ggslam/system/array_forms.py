@@ -69,8 +69,8 @@ class PoseForm(Form):
         leading: lengths of the axes before the last two.
     """
 
-    FARTHEST_M = 1e6
-    """From the origin: farther off float32 has steps of 0.1 m."""
+    FARTHEST_M = 1e7
+    """From the origin: UTM and Earth-centred coordinates are nearer."""
     _ROUNDING = 1e-3
 
     def __init__(self, code: str = "f8", *leading: int | str | None) -> None:

@@ -16,6 +16,7 @@ from ggslam.interface.arrays import address
 from ggslam.interface.core import tracking as structures
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.origin import moved_pose
 from ggslam.tracking.observability import PointSpread, about_point, observability
 from ggslam.tracking.photometric import PhotometricPoints, PhotometricReference
 from ggslam.tracking.points import FramePoints
@@ -30,6 +31,8 @@ class GicpTarget:
         self._handle: int | None = self._library.ggslam_gicp_target_create()
         self.voxel = 0.0
         """Edge of a fine voxel, metres."""
+        self.origin = np.zeros(3)
+        """Where in the world, float64 [3], the target's coordinates are zero; `align` takes and gives world poses."""
         self.composed_with: TargetSettings | None = None
         """Settings of the parts, if it was made by `target_parts.composed_target`."""
         self._unfinished: tuple[NativeContext, structures.TargetSettings] | None = None
@@ -143,7 +146,8 @@ class GicpTarget:
         return self._library.ggslam_gicp_target_size(self.gathered_handle, 0)
 
     def voxels(self, level: int = 0) -> dict[str, np.ndarray]:
-        """Copies of a level's (0 fine, 1 coarse) means [n, 3], normals [n, 3], covariances [n, 6], weights [n]."""
+        """Copies of a level's (0 fine, 1 coarse) means [n, 3], normals [n, 3], covariances [n, 6], weights [n]. Means
+        are relative to `origin`."""
         count = self._library.ggslam_gicp_target_size(self.handle, level)
         rows = np.empty((count, 16), np.float32)
         self._library.ggslam_gicp_target_voxels(self.handle, level, address(rows))
@@ -206,8 +210,9 @@ class AlignmentResult:
         rmse: root mean square of the inliers' point-to-plane distances, metres.
         information: float64 [6, 6], inverse covariance of the twist (v, w), translation first, that turns the true
             pose into this one from the left: T_true = exp([v, w]) T_world_camera, in world axes about the world's
-            origin. From the point-to-plane distances alone, each with its depth noise and taken as independent (an
-            optimist's view: neighbouring points share errors).
+            origin; far from it, where that loses digits, take `camera_information`. From the point-to-plane distances
+            alone, each with its depth noise and taken as independent (an optimist's view: neighbouring points share
+            errors).
         camera_information: the same about the camera centre: p' = p + v + w x (p - c).
         visibility: float64 [6] ascending, the share of points that see each direction of motion (`observability`).
         weak_directions: float64 [k, 6], the directions seen by less than the limit: unit vectors (v, w radius) in world
@@ -294,16 +299,17 @@ def align(
         T_world_camera_guess: [4, 4]; should be right to about a coarse voxel (12 cm) and 10 degrees.
         photometric: grey values to add at the fine level, with gain and offset between the images estimated along.
     """
-    guess = np.ascontiguousarray(T_world_camera_guess, np.float64)
+    guess = moved_pose(T_world_camera_guess, -target.origin)
     matches, squared = np.empty(len(source), np.int32), np.empty(len(source), np.float32)
     result = structures.AlignResult()
     arguments = native_align_settings(settings, noise, photometric.settings if photometric else None)
     load_library().ggslam_gicp_align(
         context.handle, target.handle, native_points(source), arguments,
-        photometric.points.native() if photometric else None, photometric.reference.native() if photometric else None,
+        photometric.points.native() if photometric else None,
+        photometric.reference.native(target.origin) if photometric else None,
         address(guess), address(matches), address(squared), ctypes.byref(result),
     )  # fmt: skip
-    return _result(result, source, settings, noise, matches, squared)
+    return _result(result, source, settings, noise, matches, squared, target.origin)
 
 
 def _result(
@@ -313,8 +319,9 @@ def _result(
     noise: DepthNoise,
     matches: np.ndarray,
     squared: np.ndarray,
+    origin: np.ndarray,
 ) -> AlignmentResult:
-    T = np.array(found.pose).reshape(4, 4)
+    T = moved_pose(np.array(found.pose).reshape(4, 4), origin)
     information = np.array(found.information).reshape(6, 6)
     spread = PointSpread.of(source, noise)
     status, visibility, weak = judge(information, T[:3, :3], spread, bool(found.usable), settings.degenerate_below)

@@ -16,6 +16,7 @@ import numpy as np
 from ggslam.interface.arrays import address
 from ggslam.interface.core import tracking as structures
 from ggslam.scene.camera import Camera
+from ggslam.scene.origin import moved_pose
 from ggslam.scene.poses import inverse
 from ggslam.tracking.settings import PhotometricSettings
 
@@ -79,9 +80,9 @@ class PhotometricReference:
         dv = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
         return cls(np.ascontiguousarray(np.dstack([grey, du, dv, view.depth])), view.camera, T_world_camera.copy())
 
-    def native(self) -> structures.PhotometricReferenceView:
-        """The core's form; this object must stay alive."""
-        T = inverse(self.T_world_camera)
+    def native(self, origin: np.ndarray | None = None) -> structures.PhotometricReferenceView:
+        """The core's form, in a world whose origin is at `origin` [3]; this object must stay alive."""
+        T = inverse(self.T_world_camera if origin is None else moved_pose(self.T_world_camera, -origin))
         view = structures.PhotometricReferenceView(
             address(self.pixels), self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy,
             self.camera.width, self.camera.height,

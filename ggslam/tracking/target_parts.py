@@ -57,8 +57,9 @@ class TargetPart:
 
 
 def composed_target(
-    parts: Sequence[TargetPart], settings: TargetSettings, context: NativeContext, before: GicpTarget | None = None
-) -> GicpTarget:
+    parts: Sequence[TargetPart], settings: TargetSettings, context: NativeContext, before: GicpTarget | None = None,
+    origin: np.ndarray | None = None,
+) -> GicpTarget:  # fmt: skip
     """The target of all parts together.
 
     Up to rounding it is what `GicpTarget.from_arrays` makes of all their Gaussians, ordered by rank. It depends, to the
@@ -67,9 +68,10 @@ def composed_target(
     Args:
         parts: of these settings and of different ranks, in any order.
         before: a target composed with the same settings; what it shares with this one is copied from it.
+        origin: where in the world the parts' coordinates are zero, [3]; None: at its own origin.
 
     Raises:
-        ValueError: parts of other settings, or two of one rank; or `before` is of another kind.
+        ValueError: parts of other settings, or two of one rank; or `before` is of another kind or has another origin.
     """
     if any(part.settings != settings for part in parts):
         raise ValueError("parts of other settings")
@@ -78,6 +80,10 @@ def composed_target(
     if before is not None and before.composed_with != settings:
         raise ValueError("the target before was not composed with these settings")
     target = GicpTarget()
+    if origin is not None:
+        target.origin = np.array(origin, np.float64)
+    if before is not None and (before.origin != target.origin).any():
+        raise ValueError("the target before has another origin")
     target.voxel, target.composed_with = settings.voxel, settings
     handles = (ctypes.c_void_p * len(parts))(*(part.handle for part in parts))
     load_library().ggslam_gicp_target_compose(

@@ -35,10 +35,12 @@ def agreement(reference: OccupancyMap, other: OccupancyMap) -> Agreement:
     """Compares two maps of one resolution, usually the unquantised update (`quantize=False`) with the quantised one.
 
     Raises:
-        InputError: the maps have different resolutions.
+        InputError: the maps have different resolutions or origins.
     """
     if reference.resolution != other.resolution:
         raise InputError(f"maps of one resolution expected, found {reference.resolution} and {other.resolution} m")
+    if (reference.origin != other.origin).any():
+        raise InputError(f"maps of one origin expected, found {reference.origin.tolist()} and {other.origin.tolist()}")
     counts = (ctypes.c_uint64 * 9)()
     load_library().ggslam_occupancy_compare(
         reference.handle, other.handle, reference.settings.threshold, other.settings.threshold, counts

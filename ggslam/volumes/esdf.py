@@ -119,6 +119,11 @@ class DistanceField:
         return self.tsdf.settings.voxel
 
     @property
+    def origin(self) -> np.ndarray:
+        """Where in the world blocks are counted from, float64 [3], metres."""
+        return self.tsdf.origin
+
+    @property
     def memory_bytes(self) -> int:
         """Memory held by the field between updates."""
         return int(self._library.ggslam_esdf_bytes(self._handle))
@@ -143,6 +148,7 @@ class DistanceField:
         where = np.ascontiguousarray(points, np.float64)
         if where.ndim != 2 or where.shape[1] != 3:
             raise InputError(f"expected points [N, 3], found an array of shape {where.shape}")
+        where = where - self.origin if self.origin.any() else where
         n = len(where)
         distance, gradient, known = np.empty(n, np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
         arrays = (a.ctypes.data for a in (where, distance, gradient, known))
@@ -162,7 +168,7 @@ class DistanceField:
         return values.known & (values.distance > radius)
 
     def coordinates(self) -> np.ndarray:
-        """Coordinates of all blocks, int32 [B, 3], in no particular order."""
+        """Coordinates of all blocks from the origin, int32 [B, 3], in no particular order."""
         at = np.empty((len(self), 3), np.int32)
         self._library.ggslam_esdf_list(self._handle, at.ctypes.data)
         return at
@@ -175,9 +181,9 @@ class DistanceField:
         return distance
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """The surface points that distances are measured from: positions float32 [S, 3] in metres, and unit normals
-        [S, 3] to the side in front."""
+        """The surface points that distances are measured from: positions float32 [S, 3] in metres (float64 if the
+        origin is not the world's), and unit normals [S, 3] to the side in front."""
         n = int(self._library.ggslam_esdf_sites(self._handle, None, None))
         points, normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         self._library.ggslam_esdf_sites(self._handle, points.ctypes.data, normals.ctypes.data)
-        return points, normals
+        return (points + self.origin if self.origin.any() else points), normals

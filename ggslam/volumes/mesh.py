@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from ggslam.formats.triangle_mesh import TriangleMesh, majority_labels
 from ggslam.interface.core.volumes import MeshArrays
 from ggslam.native.loader import load_library
+from ggslam.scene.origin import stored_positions
 from ggslam.scene.poses import transform_points
 from ggslam.volumes.surface_cells import surface_cells
 from ggslam.volumes.tsdf import TsdfMap
@@ -26,7 +27,7 @@ class Mesh:
     """Triangles whose vertices are shared.
 
     Attributes:
-        vertices: float32 [V, 3], metres.
+        vertices: float32 [V, 3], metres; float64 where the map's origin is not the world's (`scene.origin`).
         normals: float32 [V, 3], unit, towards free space.
         colors: uint8 [V, 3].
         labels: uint16 [V], object; 0: none.
@@ -63,7 +64,7 @@ class Mesh:
         """The mesh in another frame, T_new_old float64 [4, 4], rigid."""
         vertices = transform_points(self.vertices.astype(np.float64), T)
         normals = self.normals.astype(np.float64) @ T[:3, :3].T
-        return replace(self, vertices=vertices.astype(np.float32), normals=normals.astype(np.float32))
+        return replace(self, vertices=stored_positions(vertices), normals=normals.astype(np.float32))
 
     def geometry(self) -> TriangleMesh:
         """Vertices and triangles alone, for sampling and areas."""
@@ -94,7 +95,7 @@ def extract_mesh(tsdf: TsdfMap, min_weight: float = MIN_WEIGHT, min_triangles: i
         core.ggslam_mesher_write(tsdf.context.handle, mesher, ctypes.byref(pointers))
     finally:
         core.ggslam_mesher_destroy(mesher)
-    mesh = Mesh(*arrays)
+    mesh = Mesh(vertices + tsdf.origin if tsdf.origin.any() else vertices, normals, colors, labels, triangles)
     return without_small_pieces(mesh, min_triangles) if min_triangles > 1 else mesh
 
 
@@ -106,7 +107,7 @@ def join_meshes(parts: list[Mesh]) -> Mesh:
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     triangles = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
-    bits = np.ascontiguousarray(vertices + 0.0).view([("", np.float32)] * 3).ravel()  # + 0: -0 and 0 are the same
+    bits = np.ascontiguousarray(vertices + 0.0).view([("", vertices.dtype)] * 3).ravel()  # + 0: -0 and 0 are the same
     _, first, number = np.unique(bits, return_index=True, return_inverse=True)
     order = np.argsort(first, kind="stable")
     rows, place = first[order], np.empty(len(order), np.int32)

@@ -21,6 +21,7 @@ from ggslam.interface.core import volumes
 from ggslam.interface.core.volumes import DepthImage, InsertResult, InsertSettings
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
+from ggslam.scene.origin import local_origin, moved_pose
 from ggslam.volumes.occupancy_arrays import LEAF, contiguous_points, output_bytes
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
 from ggslam.volumes.quantization import KEY_OFFSET, check_resolution
@@ -71,7 +72,7 @@ class OccupancyLeaves:
     """Leaves of the map, pruned as OctoMap's: eight equal neighbours are one.
 
     Attributes:
-        centers: float32 [N, 3], metres.
+        centers: float32 [N, 3], metres; float64 if the map's origin is not the world's.
         sizes: float32 [N], edges in metres.
         log_odds: float32 [N].
     """
@@ -85,19 +86,24 @@ class OccupancyMap:
     """Log-odds of occupancy, unknown where no ray passed. One caller at a time.
 
     Args:
-        resolution: edge of a voxel, metres. The grid spans 65536 voxels along each axis, around the world's origin.
+        resolution: edge of a voxel, metres. The grid spans 65536 voxels along each axis, around the map's origin.
         settings: how a scan changes the map.
         context: threads to work on; None: a context of its own.
+        origin: of the grid in the world, [3] metres; None: the world's, unless the first scan is far from that
+            (`scene.origin`).
 
     Raises:
         ConfigError: impossible resolution.
     """
 
     def __init__(
-        self, resolution: float, settings: OccupancySettings | None = None, context: NativeContext | None = None
-    ) -> None:
+        self, resolution: float, settings: OccupancySettings | None = None, context: NativeContext | None = None,
+        origin: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         check_resolution(resolution)
         self._handle: int | None = None
+        self.origin = np.zeros(3) if origin is None else np.array(origin, np.float64)
+        self._has_origin = origin is not None
         self.resolution = float(resolution)
         self.settings = settings or OccupancySettings()
         self.context = context or NativeContext()
@@ -126,7 +132,8 @@ class OccupancyMap:
             InputError: points of another shape.
             ConfigError: the origin lies outside the grid.
         """
-        points = contiguous_points(points)
+        self._place(origin)
+        points = self._local(points)
         core = self._library.ggslam_occupancy_insert
         return self._insert(
             lambda settings, result: core(
@@ -160,7 +167,8 @@ class OccupancyMap:
         depth = np.ascontiguousarray(depth, np.float32)
         if depth.shape != (camera.height, camera.width):
             raise InputError(f"depth: expected shape {[camera.height, camera.width]}, found {list(depth.shape)}")
-        T = np.asarray(T_world_camera, np.float64)
+        self._place(np.asarray(T_world_camera, np.float64)[:3, 3])
+        T = moved_pose(T_world_camera, -self.origin)
         image = DepthImage(
             depth.ctypes.data, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
             max(min_depth, 1e-6), max_depth, (ctypes.c_float * 12)(*T[:3].ravel()),
@@ -168,20 +176,20 @@ class OccupancyMap:
         core = self._library.ggslam_occupancy_insert_depth
         return self._insert(
             lambda settings, result: core(self.context.handle, self.handle, ctypes.byref(image), settings, result),
-            T[:3, 3],
+            np.asarray(T_world_camera, np.float64)[:3, 3],
             max_range,
         )
 
     def states(self, points: np.ndarray) -> np.ndarray:
         """Whether points [N, 3] are `UNKNOWN`, `FREE` or `OCCUPIED`, int8 [N]. Outside the grid all is unknown."""
-        points = contiguous_points(points)
+        points = self._local(points)
         states = np.empty(len(points), np.int8)
         self._look_up(points, states.ctypes.data, None)
         return states
 
     def log_odds(self, points: np.ndarray) -> np.ndarray:
         """Log-odds at points [N, 3], float32 [N]; not a number where unknown."""
-        points = contiguous_points(points)
+        points = self._local(points)
         values = np.empty(len(points), np.float32)
         self._look_up(points, None, values.ctypes.data)
         return values
@@ -190,10 +198,11 @@ class OccupancyMap:
         """The map's leaves, or the occupied or free ones alone."""
         size = self._library.ggslam_occupancy_leaves(self.handle, self.settings.threshold, _WHICH[which])
         rows = np.frombuffer(output_bytes(self.handle, size), LEAF)
-        return OccupancyLeaves(rows["centre"].copy(), rows["size"].copy(), rows["log_odds"].copy())
+        centers = rows["centre"] + self.origin if self.origin.any() else rows["centre"].copy()
+        return OccupancyLeaves(centers, rows["size"].copy(), rows["log_odds"].copy())
 
     def occupied_centers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres float32 [N, 3] and edges float32 [N] of the occupied leaves, metres."""
+        """Centres (see `OccupancyLeaves`) [N, 3] and edges float32 [N] of the occupied leaves, metres."""
         leaves = self.leaves("occupied")
         return leaves.centers, leaves.sizes
 
@@ -216,7 +225,7 @@ class OccupancyMap:
             raise ConfigError(f"max_range: expected a positive number of metres, found {max_range}")
         s = self.settings
         limits = (s.probability_hit, s.probability_miss, s.probability_minimum, s.probability_maximum)
-        where = (ctypes.c_float * 3)(*np.asarray(origin, np.float32).reshape(3))
+        where = (ctypes.c_float * 3)(*(np.asarray(origin, np.float64).reshape(3) - self.origin).astype(np.float32))
         return InsertSettings(
             -1.0 if max_range is None else max_range, where, *map(log_odds, limits), int(s.quantize)
         )
@@ -232,7 +241,18 @@ class OccupancyMap:
     def origin_error(self, origin: np.ndarray) -> ConfigError:
         """The error of a sensor outside the grid."""
         reach = self.resolution * KEY_OFFSET
-        return ConfigError(f"origin: expected within {reach:g} m of the world's origin, found {np.asarray(origin)}")
+        place = f"({', '.join(f'{v:g}' for v in self.origin)})" if self.origin.any() else "the world's origin"
+        return ConfigError(f"origin: expected within {reach:g} m of {place}, found {np.asarray(origin)}")
+
+    def _place(self, position: np.ndarray) -> None:
+        """The first scan's sensor, at [3], decides the origin."""
+        position = np.asarray(position, np.float64).reshape(-1)
+        if not self._has_origin and np.isfinite(position).all():
+            self.origin, self._has_origin = local_origin(position), True
+
+    def _local(self, points: np.ndarray) -> np.ndarray:
+        """World points [N, 3] as the core takes them."""
+        return contiguous_points(np.asarray(points, np.float64) - self.origin if self.origin.any() else points)
 
     def _look_up(self, points: np.ndarray, states: int | None, values: int | None) -> None:
         self._library.ggslam_occupancy_look_up(
@@ -242,4 +262,5 @@ class OccupancyMap:
     def _box(self, low: ctypes.Array, high: ctypes.Array) -> np.ndarray | None:
         if low[0] > high[0]:
             return None
-        return (np.array([low[:], [h + 1 for h in high]], np.float64) - KEY_OFFSET) * self.resolution
+        box = (np.array([low[:], [h + 1 for h in high]], np.float64) - KEY_OFFSET) * self.resolution
+        return box + self.origin

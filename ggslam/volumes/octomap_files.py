@@ -4,6 +4,10 @@
 `.bt` holds free and occupied leaves (two bits a child), `.ot` the log-odds of every node (float32). Both are pruned as
 OctoMap prunes: eight equal children are one leaf, equal by state in `.bt` and by value in `.ot`. The layout is that of
 OctoMap 1.10's AbstractOcTree, AbstractOccupancyOcTree and their classes of nodes.
+
+OctoMap's grid lies around zero and is 65536 voxels wide, so a map in UTM coordinates does not fit. Its files are
+counted from its origin, which stands in a comment of the header: `# origin X Y Z`. OctoMap passes over that;
+`read_octomap` gives a map in the world again.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ from ggslam.volumes.quantization import RESOLUTION_RANGE
 _BINARY, _FULL = 0, 1
 _FIRST_LINES = {_BINARY: "# Octomap OcTree binary file", _FULL: "# Octomap OcTree file"}
 _COMMENT = "# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
+_ORIGIN = "# origin "
 _MAXIMUM_HEADER_BYTES = 1 << 16
 _BLOCK_BYTES = 2112
 _CUT_OFF = 1
@@ -45,6 +50,8 @@ class _Header:
     resolution: float
     size: int
     """Bytes before the tree."""
+    origin: np.ndarray
+    """Of the grid in the world, [3] metres."""
 
 
 def read_octomap(
@@ -79,7 +86,7 @@ def decode_octomap(
 ) -> OccupancyMap:
     """The map in the bytes of a `.bt` or `.ot` file; `name` stands for the file in messages, see `read_octomap`."""
     header = _read_header(data, name)
-    result = OccupancyMap(header.resolution, settings, context)
+    result = OccupancyMap(header.resolution, settings, context, header.origin)
     if header.nodes == 0:
         return result
     tree = np.frombuffer(data, np.uint8, offset=header.size)
@@ -130,8 +137,11 @@ def _encode(occupancy: OccupancyMap, kind: int) -> bytes:
         occupancy.handle, kind, occupancy.settings.threshold, ctypes.byref(nodes)
     )
     tree = output_bytes(occupancy.handle, size)
-    header = f"{_FIRST_LINES[kind]}\n{_COMMENT}id OcTree\nsize {nodes.value}\nres {occupancy.resolution!r}\ndata\n"
-    return header.encode() + tree
+    origin = ""
+    if occupancy.origin.any():
+        origin = f"{_ORIGIN}{' '.join(repr(float(value)) for value in occupancy.origin)}\n"
+    numbers = f"id OcTree\nsize {nodes.value}\nres {occupancy.resolution!r}\ndata\n"
+    return f"{_FIRST_LINES[kind]}\n{_COMMENT}{origin}{numbers}".encode() + tree
 
 
 def _read_header(data: bytes, name: str) -> _Header:
@@ -142,9 +152,11 @@ def _read_header(data: bytes, name: str) -> _Header:
     end = data.find(b"\ndata\n", 0, _MAXIMUM_HEADER_BYTES)
     if end < 0:
         raise FormatError(f"{name}: the header has no line 'data': cut off or damaged")
-    fields = {}
+    fields, origin = {}, np.zeros(3)
     for line in data[:end].decode("latin-1").splitlines():
-        if not line.startswith("#") and line.strip():
+        if line.startswith(_ORIGIN):
+            origin = _place(line, name)
+        elif not line.startswith("#") and line.strip():
             key, _, value = line.strip().partition(" ")
             fields[key] = value.strip()
     if fields.get("id") != "OcTree":
@@ -155,7 +167,18 @@ def _read_header(data: bytes, name: str) -> _Header:
         raise FormatError(f"{name}: res: expected {low:g} to {high:g} m, found {fields['res']}")
     if nodes < 0 or nodes != int(nodes):
         raise FormatError(f"{name}: size: expected a number of nodes, found {fields['size']}")
-    return _Header(kind, int(nodes), resolution, end + len(b"\ndata\n"))
+    return _Header(kind, int(nodes), resolution, end + len(b"\ndata\n"), origin)
+
+
+def _place(line: str, name: str) -> np.ndarray:
+    """The origin in a comment of the header; a comment of words that begins so is none."""
+    try:
+        origin = np.array([float(word) for word in line[len(_ORIGIN) :].split()])
+    except ValueError:
+        return np.zeros(3)
+    if len(origin) != 3 or not np.isfinite(origin).all():
+        raise FormatError(f"{name}: {line!r}: expected three finite numbers of metres")
+    return origin
 
 
 def _number(fields: dict[str, str], key: str, name: str) -> float:

@@ -12,6 +12,7 @@ from ggslam.errors import InputError
 from ggslam.interface.core.volumes import RaycastView, SurfaceImages
 from ggslam.native.loader import load_library
 from ggslam.scene.camera import Camera
+from ggslam.scene.origin import moved_pose
 from ggslam.volumes.mesh import MIN_WEIGHT
 from ggslam.volumes.surface_cells import surface_cells
 from ggslam.volumes.tsdf import TsdfMap
@@ -63,6 +64,7 @@ def render_depth(
         np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.uint8),
         np.zeros(shape, np.uint16),
     )  # fmt: skip
+    pose = moved_pose(pose, -tsdf.origin)
     cells = surface_cells(tsdf, min_weight)
     view = RaycastView(
         camera.fx, camera.fy, camera.cx, camera.cy, near, far, (ctypes.c_float * 9)(*pose[:3, :3].ravel()),

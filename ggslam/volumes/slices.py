@@ -70,7 +70,7 @@ def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> Slic
 
     Args:
         field: with blocks.
-        up: [3], direction of which heights are measured from the world's origin.
+        up: [3], direction of which heights are measured from the field's origin.
         height: metres along `up`.
 
     Returns:
@@ -83,7 +83,7 @@ def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> Slic
         corners = np.zeros((1, 3))
     on_plane = corners @ np.stack([x, y], 1)
     low, high = on_plane.min(axis=0), on_plane.max(axis=0)
-    return SlicePlane(height * z, x, y, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+    return SlicePlane(field.origin + height * z, x, y, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
 
 
 def slice_field(
@@ -167,8 +167,8 @@ def ros_map(cut: FieldSlice) -> np.ndarray:
 def write_ros_map(cut: FieldSlice, path: str | Path) -> tuple[Path, Path]:
     """Writes a map that ROS's map_server reads: `path` with the endings .pgm (binary) and .yaml.
 
-    The map's frame is that of the plane: x and y along its axes, in metres; the yaml's origin is the lower left corner
-    of the lower left pixel.
+    The map's frame is that of the plane: x and y along its axes, in metres from its origin; the yaml's origin is the
+    lower left corner of the lower left pixel.
 
     Returns:
         The two files.

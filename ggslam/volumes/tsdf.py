@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A truncated signed distance field of what a depth camera saw, in blocks of 8^3 voxels found by hashing.
 
-Voxel (i, j, k) of block (x, y, z) has its centre at (8 x + i + 0.5, 8 y + j + 0.5, 8 z + k + 0.5) voxels, in the frame
-of the poses. Blocks that are free space throughout are remembered as such and hold no voxels.
+Voxel (i, j, k) of block (x, y, z) has its centre at (8 x + i + 0.5, 8 y + j + 0.5, 8 z + k + 0.5) voxels from the map's
+origin, in the frame of the poses. The map's origin is the frame's own unless the first camera is far from it, where
+voxels could not be numbered nor vertices be placed in single precision (`scene.origin`). Blocks that are free space
+throughout are remembered as such and hold no voxels.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from ggslam.interface.core.volumes import FusionSettings, FusionStats, VoxelArra
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame_checks import wrong_unit
+from ggslam.scene.origin import local_origin, moved_pose
 from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.working_voxel import working_voxel
@@ -102,10 +105,16 @@ class TsdfMap:
     Args:
         settings: of the fusion.
         context: threads to work on.
+        origin: where in the world blocks are counted from, [3] metres; None: as goes with the first view.
     """
 
-    def __init__(self, settings: TsdfSettings | None = None, context: NativeContext | None = None) -> None:
+    def __init__(
+        self, settings: TsdfSettings | None = None, context: NativeContext | None = None,
+        origin: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         self.settings = settings or TsdfSettings()
+        self.origin = np.zeros(3) if origin is None else np.array(origin, np.float64)
+        self._has_origin = origin is not None
         self.context = context or NativeContext()
         self._library = load_library()
         self._handle: int | None = self._library.ggslam_tsdf_create(
@@ -174,7 +183,8 @@ class TsdfMap:
             InputError: an image of another size or kind than the camera's, a pose that is not finite and rigid, or
                 depth that cannot be in metres.
         """
-        view = FusionView(depth, camera, T_world_camera, color, labels, limit=MOST_VOXELS * self.settings.voxel)
+        limit = MOST_VOXELS * self.settings.voxel
+        view = FusionView(depth, camera, self._relative_pose(T_world_camera), color, labels, limit)
         s, stats = self.settings, FusionStats()
         numbers = FusionSettings(
             s.min_depth, s.max_depth, s.free_share, s.edge_voxels * s.voxel, s.clearing, s.max_free_weight
@@ -193,6 +203,15 @@ class TsdfMap:
         if not stats.blocks and within is None and (unit := wrong_unit(view.depth)):
             raise InputError(unit)
         return IntegrationStats(*(getattr(stats, field.name) for field in fields(IntegrationStats)))
+
+    def _relative_pose(self, T_world_camera: np.ndarray) -> np.ndarray:
+        """The pose relative to the map's origin, which the first view decides."""
+        T = np.asarray(T_world_camera, np.float64)
+        if T.shape != (4, 4) or not np.isfinite(T).all():
+            return T  # is refused
+        if not self._has_origin:
+            self.origin, self._has_origin = local_origin(T[:3, 3]), True
+        return moved_pose(T, -self.origin)
 
     def _too_small(
         self, error: InputError, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
@@ -246,7 +265,7 @@ class TsdfMap:
         return BlockList(coordinates, dense.astype(bool), free_weight, frozen.astype(bool), revision)
 
     def read(self, coordinates: np.ndarray) -> BlockVoxels:
-        """Voxels of the blocks at coordinates [n, 3]; of a block that is not there, as never seen."""
+        """Voxels of the blocks at coordinates [n, 3], from the origin; of a block that is not there, as never seen."""
         at = _coordinates(coordinates)
         shapes = {name: (len(at), VOXELS) + ((3,) if name == "color" else ()) for name in _DTYPES}
         arrays = {name: np.empty(shapes[name], dtype) for name, dtype in _DTYPES.items()}

@@ -17,6 +17,8 @@ from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import VOXELS, TsdfMap
 
 _VERSION = 1
+_ORIGIN = "origin"
+"""Where in the world blocks are counted from, float64 [3]; there if it is not zero."""
 _CONTENT = "a TSDF"
 _VOXEL_ARRAYS = {
     "value": (np.int16, ()), "weight": (np.uint16, ()), "color": (np.uint8, (3,)), "label": (np.uint16, ()),
@@ -41,6 +43,7 @@ def tsdf_to_bytes(tsdf: TsdfMap) -> bytes:
     coordinates, dense = blocks.coordinates[order], blocks.dense[order]
     voxels = tsdf.read(coordinates[dense])
     names = [field.name for field in dataclasses.fields(TsdfSettings)]
+    place = {_ORIGIN: tsdf.origin} if tsdf.origin.any() else {}
     return arrays_to_bytes(
         version=np.array(_VERSION),
         setting_names=np.array(names),
@@ -49,6 +52,7 @@ def tsdf_to_bytes(tsdf: TsdfMap) -> bytes:
         free=coordinates[~dense],
         free_weight=blocks.free_weight[order][~dense],
         **{name: getattr(voxels, name) for name in _VOXEL_ARRAYS},
+        **place,
     )
 
 
@@ -81,7 +85,10 @@ def tsdf_of_arrays(arrays: dict[str, np.ndarray], path: str | Path, context: Nat
     everything = np.concatenate([dense, free])
     if len(np.unique(everything, axis=0)) != len(everything):
         raise FormatError(f"{path}: not {_CONTENT} written by ggslam: a block is there twice")
-    tsdf = TsdfMap(settings, context)
+    origin = _check(path, arrays, _ORIGIN, np.float64, (3,)) if _ORIGIN in arrays else np.zeros(3)
+    if not np.isfinite(origin).all():
+        raise FormatError(f"{path}: {_ORIGIN}: expected finite numbers, found {origin.tolist()}")
+    tsdf = TsdfMap(settings, context, origin)
     tsdf.write(dense, **voxels)
     tsdf.write_free(free, free_weight)
     return tsdf

@@ -12,6 +12,7 @@ from torch.nn.functional import max_pool2d
 
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
+from ggslam.scene.origin import local_origin, moved_pose
 from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.torch_candidates import NEAR, BlockCandidates, DeviceView, find_candidates
@@ -71,6 +72,8 @@ class TorchTsdf:
 
     def __init__(self, settings: TsdfSettings | None = None, device: str | torch.device = "cpu") -> None:
         self.settings = settings or TsdfSettings()
+        self.origin: np.ndarray | None = None
+        """Where in the world blocks are counted from, as of a `TsdfMap`; None until the first view."""
         self.device = torch.device(device)
         none = torch.zeros(0, dtype=torch.int64, device=self.device)
         self._dense, self._voxels = none, Voxels.free(none)
@@ -96,7 +99,11 @@ class TorchTsdf:
         """Fuses a view; arguments and errors of `TsdfMap.integrate`."""
         s = self.settings
         limit = min(MOST_VOXELS, 0.5 * _OFFSET * SIDE) * s.voxel
-        checked = FusionView(depth, camera, T_world_camera, color, labels, limit)
+        pose = np.asarray(T_world_camera, np.float64)
+        if pose.shape == (4, 4) and np.isfinite(pose).all():  # else it is refused
+            self.origin = local_origin(pose[:3, 3]) if self.origin is None else self.origin
+            pose = moved_pose(pose, -self.origin)
+        checked = FusionView(depth, camera, pose, color, labels, limit)
         T = torch.from_numpy(checked.T_camera_world).to(self.device)
         depth_image = torch.tensor(checked.depth).to(self.device)
         in_range = (depth_image >= s.min_depth) & (depth_image <= s.max_depth)
@@ -156,7 +163,7 @@ class TorchTsdf:
 
     def to_native(self, context: NativeContext | None = None) -> TsdfMap:
         """The same map for mesh, distance field and files."""
-        tsdf = TsdfMap(self.settings, context)
+        tsdf = TsdfMap(self.settings, context, self.origin)
         arrays = {name: array.cpu().numpy() for name, array in vars(self._voxels).items()}
         tsdf.write(_coordinates(self._dense), **arrays)
         tsdf.write_free(_coordinates(self._free), self._free_weight.cpu().numpy())

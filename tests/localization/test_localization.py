@@ -220,3 +220,29 @@ def test_frames_outside_of_the_map_are_looked_up(room: Path, room_store: GridSto
             results = [localizer.locate(frame) for frame in frames.stream()]
         assert results[0].status is status
     assert rmse(results, frames.ground_truth) < 0.01
+
+
+def test_the_origin_follows_the_sensor(world, tmp_path: Path, context: NativeContext) -> None:
+    """Where the walk comes to be a kilometre from the target's origin, another is chosen, and nothing else changes."""
+    poses, scans, points, normals = world
+    poses, scans = poses[:20], scans[:20]
+    found, origins = [], []
+    way = poses[-1, :3, 3] - poses[0, :3, 3]
+    axis = int(np.abs(way).argmax())
+    border = np.eye(3)[axis] * (np.sign(way[axis]) * 1000.0 - poses[10, axis, 3])
+    for offset in (np.zeros(3), 2 * np.round(border / 2)):  # whole cells
+        moved = poses.copy()
+        moved[:, :3, 3] += offset
+        with GridStore.create(tmp_path / f"{abs(offset).max():.0f}.grid", GROUND) as own:
+            store_cloud(own, points + offset, {NORMAL: packed_normals(normals)})
+            surface = PartialSurface(own, TARGET, context)
+            localizer = Localizer(surface, ScanTracker(ScanTrackerSettings(), context, moved[0]), moved[0])
+            for scan in scans:
+                result = localizer.locate(scan)
+                assert result.status.is_located
+                found.append(result.T_world_sensor[:3, 3] - offset)
+                origins.append(surface.target.origin)  # type: ignore[union-attr]
+            surface.close()
+    near, far = np.reshape(found, (2, len(poses), 3))
+    assert not np.any(origins[: len(poses)]) and len(np.unique(origins[len(poses) :], axis=0)) == 2
+    assert np.abs(near - far).max() < 2e-3 and np.abs(far - poses[:, :3, 3]).max() < 0.02

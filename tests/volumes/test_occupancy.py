@@ -197,6 +197,7 @@ def test_the_quantised_map_agrees_with_the_unquantised_one() -> None:
 
 def test_refuses_what_it_cannot_use() -> None:
     occupancy = OccupancyMap(0.1)
+    occupancy.insert(np.zeros((1, 3)), np.zeros(3))  # its origin is the world's from now on
     with pytest.raises(ConfigError, match="origin"):
         occupancy.insert(np.zeros((1, 3)), np.array([1e5, 0, 0]))
     with pytest.raises(ConfigError, match="origin"):

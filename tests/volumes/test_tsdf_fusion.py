@@ -327,8 +327,8 @@ def test_blocks_far_from_the_origin_and_odd_image_sizes() -> None:
         T[:3, 3] = (-1e4, 2e4, 5e3)
         tsdf = TsdfMap(dataclasses.replace(SETTINGS, free_share=0.1))
         stats = tsdf.integrate(np.full((height, width), 2.0, np.float32), camera, T)
-        points = centres(tsdf.blocks().coordinates[tsdf.blocks().dense], SETTINGS.voxel)
-        assert stats.made == len(tsdf) > 0
+        points = centres(tsdf.blocks().coordinates[tsdf.blocks().dense], SETTINGS.voxel) + tsdf.origin
+        assert stats.made == len(tsdf) > 0 and np.array_equal(tsdf.origin, T[:3, 3])
         assert np.abs(points[..., 2] - 5002).min() < SETTINGS.voxel
 
 

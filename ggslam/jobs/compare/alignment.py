@@ -120,7 +120,7 @@ def check_registration(a: Side, b: Side, found: CloudRegistration, back: float) 
         raise ConfigError(
             f"`align` icp: {a.path} cannot be registered upon {b.path} by ICP: at the best pose found "
             f"({100 * found.moved_m:.0f} cm, {found.turned_deg:.0f} degrees away) {best:.0%} of the points "
-            f"have a partner, {_LEAST_OVERLAP:.0%} needed; ICP needs a start within some decimetres: use truth or "
+            f"have a partner, {_LEAST_OVERLAP:.0%} needed; ICP needs a start within about a metre: use truth or "
             "trajectory, or move one of them first"
         )
 

@@ -19,7 +19,9 @@ from ggslam.formats.trajectory import read_tum
 from ggslam.formats.triangle_mesh import read_mesh
 from ggslam.formats.voxel_cloud import join_clouds
 from ggslam.geometry.clouds import Cloud, Overlap, overlap
-from ggslam.geometry.icp import CloudRegistration, register
+from ggslam.geometry.coarse_to_fine import TargetSurface, register_coarse_to_fine
+from ggslam.geometry.icp import CloudRegistration
+from ggslam.geometry.surface_distances import SurfaceDistances, summary_of, surface_distances
 from ggslam.jobs.compare.alignment import (
     Alignment,
     Side,
@@ -57,6 +59,9 @@ class Comparison:
         icp: registration of the aligned A upon B; None if too little of it lies near B to begin with.
         b_on_a_after_icp: the overlap the other way after that.
         scores: of A with B as the reference, as aligned.
+        surface: distances of all of A to the surface of B, as aligned, and of B to that of A.
+        surface_after_icp: the same after ICP.
+        pair_distance_m: how far partners must be apart to reach across the gaps between the points of B.
     """
 
     a: Side
@@ -70,6 +75,9 @@ class Comparison:
     icp: CloudRegistration | None
     b_on_a_after_icp: Overlap | None
     scores: CloudScores
+    surface: tuple[SurfaceDistances, SurfaceDistances]
+    surface_after_icp: tuple[SurfaceDistances, SurfaceDistances] | None
+    pair_distance_m: float
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -84,12 +92,14 @@ class Comparison:
         icp = None
         if self.icp is not None and self.b_on_a_after_icp is not None:
             icp = {**asdict(self.icp), "a_on_b": asdict(self.icp.overlap), "b_on_a": asdict(self.b_on_a_after_icp)}
+            icp["surface"] = _both_ways(self.surface_after_icp)
             del icp["overlap"]
         return json_ready({
             **sides, "align": self.align, "T_b_a": self.T_b_a,
             "trajectory": None if self.trajectory is None else self.trajectory.to_dict(),
             "common_poses": self.common_poses,
             "overlap": {"a_on_b": asdict(self.a_on_b), "b_on_a": asdict(self.b_on_a)}, "icp": icp,
+            "surface": _both_ways(self.surface), "pair_distance_m": self.pair_distance_m,
             "geometry": asdict(self.scores),
         })  # fmt: skip
 
@@ -106,7 +116,8 @@ def compare(
             the true poses that a run kept, files lying in their world; "icp": A is registered upon B; "trajectory": the
             positions at common times are laid upon one another (Umeyama, without scale); "auto": "truth" where that
             clearly brings them nearer than "none".
-        max_distance: metres up to which points are partners, for fitness, inlier RMSE and the last stage of ICP.
+        max_distance: metres up to which points are partners, for fitness and inlier RMSE; ICP ends at closer pairs
+            where the clouds are dense (`geometry.coarse_to_fine`).
         thresholds: metres, for precision, recall and F1.
         seed: of the samples of meshes and of ICP.
 
@@ -125,14 +136,23 @@ def compare(
         T_b_a = by_truth(one, other)
     elif align == "auto":
         align, T_b_a = best_of_truth_and_none(one, other, cloud_b, max_distance, seed)
-    distances = [max(max_distance, d) for d in (0.25, 0.10)] + [max_distance]
     icp = None
     try:
-        icp = register(cloud_a, cloud_b, max_distances=distances, T_start=T_b_a, seed=seed)
+        icp = register_coarse_to_fine(cloud_a, cloud_b, max_distance, T_b_a, seed)
     except ValueError as error:
         if align == "icp":
             raise ConfigError(f"{a} cannot be registered upon {b} by ICP: {error}") from None
-    after = None
+    after, ways = None, (TargetSurface.of(cloud_b, max_distance), TargetSurface.of(cloud_a, max_distance))
+
+    def surfaces(T: np.ndarray) -> tuple[SurfaceDistances, SurfaceDistances]:
+        found = []
+        for cloud, surface, T_target_source in zip((cloud_a, cloud_b), ways, (T, inverse(T)), strict=True):
+            reach = max(surface.pair_distance, max_distance)
+            found.append(summary_of(surface_distances(
+                cloud, surface.cloud, max_distance, reach, T_target_source, seed, surface.normals
+            )))  # fmt: skip
+        return found[0], found[1]
+
     if icp is not None:
         after = overlap(cloud_b, cloud_a, max_distance, inverse(icp.T_target_source), seed)
         if align == "icp":
@@ -142,8 +162,13 @@ def compare(
         a=one, b=other, align=align, T_b_a=T_b_a, trajectory=_trajectory_scores(one, other, pairs),
         common_poses=len(pairs), a_on_b=overlap(cloud_a, cloud_b, max_distance, T_b_a, seed),
         b_on_a=overlap(cloud_b, cloud_a, max_distance, inverse(T_b_a), seed), icp=icp, b_on_a_after_icp=after,
-        scores=score_cloud(cloud_a, cloud_b, thresholds, T_b_a, seed=seed),
+        scores=score_cloud(cloud_a, cloud_b, thresholds, T_b_a, seed=seed), surface=surfaces(T_b_a),
+        surface_after_icp=None if icp is None else surfaces(icp.T_target_source), pair_distance_m=ways[0].pair_distance,
     )  # fmt: skip
+
+
+def _both_ways(surface: tuple[SurfaceDistances, SurfaceDistances] | None) -> dict[str, Any] | None:
+    return None if surface is None else {"a_to_b": asdict(surface[0]), "b_to_a": asdict(surface[1])}
 
 
 def read_side(path: Path, seed: int = 0) -> Side:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import ConfigError
+from ggslam.formats.positions import COARSE, coordinate_step
 from ggslam.formats.splat_writing import splat_writer, write_splats
 from ggslam.jobs.edit.edit import Edit
 from ggslam.objects.editing import Change, rigid_motion
@@ -78,6 +79,12 @@ def _edit_whole(
     shift = vector("move", edit.value)
     turn = vector("rotation", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
     middle = gaussians.means.double().mean(0).numpy()
+    step = coordinate_step(float(np.abs(middle + shift).max()))
+    if step > COARSE:
+        raise ConfigError(
+            f"`move` {WHOLE} {_text(shift)}: Gaussians are in single precision, which has steps of {step:.3g} m there; "
+            "large offsets belong to the program that shows the map"
+        )
     gaussians.move(torch.arange(len(gaussians)), torch.from_numpy(rigid_motion(middle, shift, turn)))
     turned = f", turned by {_text(turn)} degrees" if np.any(turn) else ""
     return f"moved all by {_text(shift)} m{turned}: {len(gaussians)} Gaussians"

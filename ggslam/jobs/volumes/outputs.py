@@ -11,6 +11,8 @@
     volumes.json               where all this is from, sizes and times
 
 Meshes and the occupancy map are in the frame that is asked for, the map's or the floor's; tsdf.npz is in the map's.
+Where the map's coordinates are large, as in UTM, meshes have double precision, and what cannot have it (tsdf.npz,
+occupancy.bt and .ot) is counted from an origin that the files tell; the floor's frame then lies below that.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,8 @@ from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import change_in_run
 from ggslam.runs.records.volumes import VolumesRecord
+from ggslam.scene.origin import moved_pose
+from ggslam.scene.poses import translation
 from ggslam.system.foreign import is_plain_name
 from ggslam.system.json_files import write_json
 from ggslam.system.staging import finish_saving, make_staging, publish
@@ -92,23 +96,38 @@ class Surface:
 
     Attributes:
         mesh: in the map's frame.
-        upright: which way is up, and where the floor is.
+        upright: which way is up, and where the floor is, seen from `origin`.
         poses: T_map_camera [N, 4, 4] of the frames that were fused.
-        T_floor_map: float64 [4, 4], see `floor_frame`.
+        T_floor_map: float64 [4, 4], see `floor_frame`; the floor's frame lies below `origin`.
+        origin: of the TSDF in the map's frame, [3] metres: zero, but for maps far from it.
     """
 
     mesh: Mesh
     upright: Upright
     poses: np.ndarray
     T_floor_map: np.ndarray
+    origin: np.ndarray
+
+    @property
+    def near_poses(self) -> np.ndarray:
+        """The poses relative to `origin`."""
+        return moved_pose(self.poses, -self.origin)
+
+    @property
+    def near_mesh(self) -> Mesh:
+        """The mesh relative to `origin`."""
+        mesh = self.mesh
+        return replace(mesh, vertices=(mesh.vertices - self.origin).astype(np.float32)) if self.origin.any() else mesh
 
     @staticmethod
     def of(maps: VolumeMaps, poses: Sequence[np.ndarray]) -> Surface:
         """The surface of finished maps."""
-        mesh, stacked = maps.mesh(SMALLEST_PIECE), np.array(poses)
+        mesh, stacked, origin = maps.mesh(SMALLEST_PIECE), np.array(poses), maps.tsdf.origin
+        near = moved_pose(stacked, -origin)
         # Marching cubes' vertices are spread evenly enough over surfaces to stand for their area.
-        upright = estimate_up(stacked, mesh.vertices, mesh.normals)
-        return Surface(mesh, upright, stacked, floor_from_map(upright, stacked))
+        upright = estimate_up(near, mesh.vertices - origin if origin.any() else mesh.vertices, mesh.normals)
+        T_floor_map = floor_from_map(upright, near) @ translation(-origin)
+        return Surface(mesh, upright, stacked, T_floor_map, origin)
 
 
 @dataclass
@@ -130,7 +149,8 @@ class _Writer:
     """Writes into a hidden folder, from which all files go to `out` together."""
 
     def __init__(self, out: Path, request: OutputRequest, surface: Surface) -> None:
-        self.out, self.request, self.surface, self.poses = out, request, surface, surface.poses
+        self.out, self.request, self.surface = out, request, surface
+        self.poses = surface.near_poses
         self.T_out_map = surface.T_floor_map if request.frame is OutputFrame.floor else np.eye(4)
         self.staged = make_staging(out)
         self.outputs = Outputs()
@@ -192,6 +212,11 @@ class _Writer:
             f"up is ({', '.join(f'{v:.3f}' for v in found.up)}) in the world's frame, {found.support:.0%} of the "
             f"surfaces agree; {floor}", up=asdict(found)
         )  # fmt: skip
+        if self.surface.origin.any():
+            self.tell(
+                f"the map is far from zero: heights, slices and the floor's frame are counted from "
+                f"{_words(self.surface.origin)}", origin=self.surface.origin
+            )  # fmt: skip
         frame, seen = self.request.frame, found.floor is not None
         command = write_floor_file(self.path(FLOOR_FILE), self.surface.T_floor_map, frame, seen)
         lying = "all ROS files are in the floor's frame"
@@ -233,13 +258,23 @@ class _Writer:
         for ending in (".bt", ".ot"):
             write_octomap(occupancy, self.path("occupancy" + ending))
         up = self.T_out_map[:3, :3] @ self.surface.upright.up
-        write_picture(self.path("occupancy.png"), occupancy_picture(occupancy, self.T_out_map @ self.poses, up))
+        poses = self.T_out_map @ self.surface.poses
+        write_picture(self.path("occupancy.png"), occupancy_picture(occupancy, poses, up))
+        if occupancy.origin.any():
+            self.outputs.lines.append(
+                f"occupancy.bt and .ot are counted from {_words(occupancy.origin)}, as their headers say: OctoMap's "
+                "grid does not reach so far"
+            )
         found = occupancy.summary()
         self.tell(
             f"occupancy: {found.occupied} occupied and {found.free} free voxels of {100 * occupancy.resolution:g} cm, "
             f"{found.memory_bytes / 1e6:.1f} MB",
             occupancy={"occupied": found.occupied, "free": found.free, "memory_mb": found.memory_bytes / 1e6},
         )  # fmt: skip
+
+
+def _words(position: np.ndarray) -> str:
+    return f"({', '.join(f'{value:g}' for value in position)})"
 
 
 def _slice(
@@ -310,7 +345,7 @@ def _write_all(writer: _Writer, maps: VolumeMaps, record: dict[str, Any], observ
     observer.advance(1, 4)
     writer.mesh()
     writer.floor()
-    mesh, upright = writer.surface.mesh, writer.surface.upright
+    mesh, upright = writer.surface.near_mesh, writer.surface.upright
     if len(mesh.triangles):
         write_picture(writer.path("mesh.png"), mesh_picture(mesh, writer.poses, upright.up))
         if writer.outputs.record["mesh"]["objects"]:

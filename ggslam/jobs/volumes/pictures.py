@@ -12,6 +12,7 @@ from ggslam.objects.colors import id_palette
 from ggslam.reporting.cloud_pictures import CloudView, draw_cloud, view_along
 from ggslam.reporting.mesh_pictures import draw_mesh
 from ggslam.reporting.pictures import side_by_side
+from ggslam.scene.origin import moved_pose
 from ggslam.volumes.mesh import Mesh
 from ggslam.volumes.occupancy import OccupancyMap
 
@@ -53,10 +54,10 @@ def mesh_picture(mesh: Mesh, poses: np.ndarray, up: np.ndarray, by_object: bool 
 
 def occupancy_picture(occupancy: OccupancyMap, poses: np.ndarray, up: np.ndarray) -> np.ndarray:
     """The occupied voxels below the cameras' heads from above, coloured by height, uint8 [H, W, 3]."""
-    centers = occupancy.occupied_centers()[0].astype(np.float64)
+    centers = occupancy.occupied_centers()[0].astype(np.float64) - occupancy.origin
     if not len(centers):
         return np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
-    heights = centers @ up
+    poses, heights = moved_pose(poses, -occupancy.origin), centers @ up
     head = float(np.percentile(poses[:, :3, 3] @ up, 90)) + 0.3
     shown = heights < head  # no ceiling
     centers, heights = (centers[shown], heights[shown]) if shown.any() else (centers, heights)
