@@ -142,8 +142,8 @@ class VolumeMaps:
         """
         number = len(self.times.rows)
         row = {"slam": waited} if waited else {}
-        start = time.perf_counter()
-        self._fuse(frame.depth, frame.camera, T_world_camera, frame.color, labels)
+        start, depth = time.perf_counter(), frame.depth_or_infinity()
+        self._fuse(depth, frame.camera, T_world_camera, frame.color, labels)
         every = self.settings.decay_every
         if every and number % every == every - 1:
             self.tsdf.decay()
@@ -155,7 +155,7 @@ class VolumeMaps:
             row["esdf"] = time.perf_counter() - start
         if self.occupancy is not None:
             start = time.perf_counter()
-            self._insert(frame.depth, frame.camera, T_world_camera)
+            self._insert(depth, frame.camera, T_world_camera)
             row["occupancy"] = time.perf_counter() - start
         self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
@@ -168,7 +168,7 @@ class VolumeMaps:
 
     def _insert(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
         assert self.occupancy is not None
-        self.occupancy.insert_depth(depth, camera, T_world_camera)
+        self.occupancy.insert_depth(depth, camera, T_world_camera, free_depth=self.settings.tsdf.max_depth)
 
     def rebuild(self, views: Iterable[PosedView]) -> None:
         """Begins anew from keyframes where they are now, for after a loop was closed."""

@@ -26,7 +26,8 @@ class TsdfSettings:
     min_depth: float = setting(0.1, 0, 100, "m")
     """Nearer depth is not fused."""
     max_depth: float = setting(7.0, 0.1, _FARTHEST, "m", basic=True)
-    """Farther depth is not fused; unless set, farther in scenes larger than rooms."""
+    """Farther depth makes no surface: all before it is free, up to this far. Unless set, farther in scenes larger than
+    rooms."""
     free_share: float = setting(0.9, 0.1, 1)
     """A block without voxels becomes free throughout if all depth seen through it lies behind it, and at least this
     share of its pixels have depth. Else it gets voxels, if it is not known yet, until all of them were seen."""

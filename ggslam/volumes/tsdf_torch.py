@@ -20,6 +20,7 @@ from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, SIDE, VOXE
 _SURPRISE = 0.5
 _FREE_FROM = 0.98 * FREE_VALUE
 _EROSION = 2
+_RANGE_SLACK = 1.00001
 _LABEL_VOXELS = 2.0
 _COLOR_SHARE = 0.125
 _OFFSET = 1 << 20
@@ -99,16 +100,17 @@ class TorchTsdf:
         checked = FusionView(depth, camera, T_world_camera, color, labels, limit)
         T = torch.from_numpy(checked.T_camera_world).to(self.device)
         depth_image = torch.tensor(checked.depth).to(self.device)
-        in_range = (depth_image >= s.min_depth) & (depth_image <= s.max_depth)
-        view = DeviceView(torch.where(in_range, depth_image, 0), camera, T[:3, :3], T[:3, 3])
+        told = torch.where(depth_image >= s.min_depth, depth_image.clamp(max=s.max_depth + 2 * s.truncation), 0)
+        view = DeviceView(told, camera, T[:3, :3], T[:3, 3], s.max_depth)
         found = find_candidates(view, SIDE * s.voxel, s.truncation, s.free_share)
         keys = _keys(found.coordinates)
         dense_row, free_row = _rows(self._dense, keys), _rows(self._free, keys)
         self._note_free(found, keys, dense_row, free_row)
 
         old = dense_row >= 0
-        # A block that is not known yet gets voxels also if parts of it alone are seen as free.
-        new = ~old & (found.surface | (~found.free & (free_row < 0)))
+        # A block that is not known yet gets voxels also if parts of it alone are seen as free, except where the range
+        # ends.
+        new = ~old & (found.surface | (~found.free & ~found.passed & (free_row < 0)))
         weight = torch.zeros_like(keys)
         known = free_row >= 0
         weight[known] = self._free_weight[free_row[known]]
@@ -193,8 +195,12 @@ def _fuse(
     scale = FULL_WEIGHT / s.max_weight
     drop = ((distance + s.truncation) / (s.truncation - s.voxel)).clamp(max=1)
     measured = _round(scale / z**2 * drop).clamp(max=FULL_WEIGHT)
-    valid = (distance >= -s.truncation) & (measured >= 1)
     value, weight = voxels.value.float(), voxels.weight.float()
+    # Depth beyond the range makes known what is free up to the range. What a surface in range left nearer to it, or
+    # behind the range, goes with that surface.
+    in_range = distance + z <= _RANGE_SLACK * s.max_depth
+    told = (weight > 0) | in_range | ((distance >= s.truncation) & (z <= s.max_depth))
+    valid = told & (distance >= -s.truncation) & (measured >= 1)
     behind = valid & (distance >= s.truncation)
     scaled = FREE_VALUE / s.truncation * distance
     if s.clearing > 0:
@@ -239,11 +245,14 @@ def _distances(at: Tensor, view: DeviceView, s: TsdfSettings) -> tuple[Tensor, T
     pixel = torch.where(inside, (v + 0.5).long() * c.width + (u + 0.5).long(), 0)
     nearest = view.depth.flatten()[pixel]
     depth = _interpolate(view, inside, u, v, nearest, s)
-    return torch.where(inside & (nearest > 0), depth - z, -torch.inf), safe, pixel
+    # Depth beyond the range is no surface's: it tells of what lies before it alone.
+    told = (nearest > 0) & ((nearest <= s.max_depth) | (nearest >= z))
+    return torch.where(inside & told, depth - z, -torch.inf), safe, pixel
 
 
 def _interpolate(view: DeviceView, inside: Tensor, u: Tensor, v: Tensor, nearest: Tensor, s: TsdfSettings) -> Tensor:
-    """Depth between the four pixels around (u, v), where they are all there and differ little; else the nearest."""
+    """Depth between the four pixels around (u, v), where they are all there, in range, and differ little; else the
+    nearest."""
     height, width = view.depth.shape
     inside = inside & (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)
     u0, v0 = torch.where(inside, u, 0).long(), torch.where(inside, v, 0).long()
@@ -251,7 +260,8 @@ def _interpolate(view: DeviceView, inside: Tensor, u: Tensor, v: Tensor, nearest
     flat, at = view.depth.flatten(), v0 * width + u0
     a, b, c, d = flat[at], flat[at + right], flat[at + below], flat[at + below + right]
     low, high = a.minimum(b).minimum(c.minimum(d)), a.maximum(b).maximum(c.maximum(d))
-    smooth = inside & (low > 0) & (high - low <= (0.02 * low).clamp(min=s.edge_voxels * s.voxel))
+    smooth = inside & (low > 0) & (high <= s.max_depth)
+    smooth &= high - low <= (0.02 * low).clamp(min=s.edge_voxels * s.voxel)
     x, y = u - u0, v - v0
     top, bottom = a + x * (b - a), c + x * (d - c)
     return torch.where(smooth, top + y * (bottom - top), nearest)

@@ -289,7 +289,8 @@ def _level_occupancy(
     observer.begin("occupancy on the floor", count)
     bare = replace(source, label=None)
     for done, posed in enumerate(islice(bare, count)):
-        level.insert_depth(posed.frame.depth, posed.frame.camera, T_floor_map @ posed.T_world_camera)
+        T_floor_camera, depth = T_floor_map @ posed.T_world_camera, posed.frame.depth_or_infinity()
+        level.insert_depth(depth, posed.frame.camera, T_floor_camera, free_depth=maps.settings.tsdf.max_depth)
         observer.advance(done + 1, count)
     maps.occupancy = level
 

@@ -10,7 +10,7 @@
 #include "volumes/tsdf_scratch.hpp"
 
 GGSLAM_DECLARE_KERNEL(void tsdf_prepare_depth(const float* depth, int width, int height, int row, float min_depth,
-                                              float max_depth, float* out, volumes::DepthTile* tiles, int32_t* valid))
+                                              float farthest, float* out, volumes::DepthTile* tiles, int32_t* valid))
 GGSLAM_DECLARE_KERNEL(void tsdf_erode_row(const float* depth, int width, int v, float* out))
 GGSLAM_DECLARE_KERNEL(void tsdf_erode_column(const float* rows, int width, int height, int v, float* out))
 GGSLAM_DECLARE_KERNEL(void tsdf_pack_color(const uint8_t* color, std::size_t begin, std::size_t end, int32_t* out))
@@ -57,7 +57,8 @@ void erode(const FusionInput& in, Context& context, FusionImages& images) {
   });
 }
 
-void prepare(const FusionInput& in, const FusionSettings& settings, Context& context, FusionImages& images) {
+void prepare(const FusionInput& in, const FusionSettings& settings, float truncation, Context& context,
+             FusionImages& images) {
   const std::size_t pixels = static_cast<std::size_t>(in.width) * in.height;
   const int columns = (in.width + kTile - 1) / kTile, rows = (in.height + kTile - 1) / kTile;
   DepthPyramid& pyramid = images.pyramid;
@@ -75,8 +76,9 @@ void prepare(const FusionInput& in, const FusionSettings& settings, Context& con
   context.pool.parallel_for(rows, 8, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t row = begin; row < end; ++row) {
       const int first = static_cast<int>(row) * kTile, last = std::min(first + kTile, in.height);
-      depth_kernel(in.depth, in.width, in.height, static_cast<int>(row), settings.min_depth, settings.max_depth,
-                   images.depth.data(), base.tiles.data() + row * columns, &pyramid.valid[(row + 1) * stride + 1]);
+      depth_kernel(in.depth, in.width, in.height, static_cast<int>(row), settings.min_depth,
+                   settings.max_depth + 2 * truncation, images.depth.data(), base.tiles.data() + row * columns,
+                   &pyramid.valid[(row + 1) * stride + 1]);
       for (int v = first; v < last; ++v) erosion_kernel(images.depth.data(), in.width, v, images.eroded_rows.data());
     }
     if (in.color == nullptr) return;
@@ -163,7 +165,7 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
   view.width = in.width, view.height = in.height;
   view.fx = in.fx, view.fy = in.fy, view.cx = in.cx, view.cy = in.cy;
   view.truncation = map.truncation, view.voxel = map.voxel, view.edge = settings.edge;
-  view.clearing = settings.clearing;
+  view.clearing = settings.clearing, view.max_depth = settings.max_depth;
   view.weight_scale = kFullWeight / map.max_weight;
   view.max_free_weight = settings.max_free_weight * view.weight_scale;
   const Mat3d rotation = Mat3d::from(in.rotation);
@@ -225,7 +227,7 @@ FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const
                       const FusionSettings& settings) {
   FusionStats stats{};
   const auto start = Clock::now();
-  prepare(in, settings, context, scratch.images);
+  prepare(in, settings, map.truncation, context, scratch.images);
   const auto prepared = Clock::now();
   select(map, in, settings, context, scratch);
   ++map.revision, ++map.views;

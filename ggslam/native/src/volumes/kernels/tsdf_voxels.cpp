@@ -17,6 +17,7 @@ using volumes::VoxelUpdate;
 
 constexpr float kSurprise = 0.5f;           // of the truncation: how far depth must contradict a voxel to clear it
 constexpr float kFreeFrom = 0.98f * kFreeValue;  // a voxel seen as free counts as free from this value on
+constexpr float kRangeSlack = 1.00001f;     // of the range: rounding when depth is added up again
 constexpr float kLabelVoxels = 2.0f;        // labels are told to voxels this near to the surface
 constexpr float kColorShare = 0.125f;       // of a new colour at least: less would be rounded away
 
@@ -62,6 +63,7 @@ void project(const VoxelUpdate& t, Work& w) {
       offset[a][lane] = (lane & 7) * t.step[0][a] + (lane >> 3) * t.step[1][a];
   const Float near = broadcast(volumes::kNear), left = broadcast(-0.5f), nothing = broadcast(kNothing);
   const Float right = broadcast(t.width - 0.5f), bottom = broadcast(t.height - 0.5f);
+  const Float max_depth = broadcast(t.max_depth);
   for (int n = 0; n < kGroups; ++n) {
     const int first = n * kLanes;
     const float i = first & 7, j = first >> 3 & 7, k = first >> 6;
@@ -74,7 +76,10 @@ void project(const VoxelUpdate& t, Work& w) {
                              both(greater_equal(v, left), greater(bottom, v)));
     const Int pixel = truncate(zero_unless(inside, v + 0.5f)) * t.width + truncate(zero_unless(inside, u + 0.5f));
     const Float depth = gather(t.depth, pixel);
-    const Float distance = select(both(inside, greater(depth, Float{})), depth - p[2], nothing);
+    // Depth beyond the range is no surface's: it tells of what lies before it alone.
+    const Float gap = depth - p[2], least = select(greater(depth, max_depth), Float{}, nothing);
+    const Mask told = both(both(inside, greater(depth, Float{})), greater_equal(gap, least));
+    const Float distance = select(told, gap, nothing);
     const Float band = reach(t, depth);
     const Mask seen = greater_equal(distance, -band);
     w.groups[n] = {p[2], inverse, u, v, distance, Float{}, pixel};
@@ -83,7 +88,7 @@ void project(const VoxelUpdate& t, Work& w) {
   }
 }
 
-// Takes the depth between the four pixels around a voxel, where they are all there and differ little.
+// Takes the depth between the four pixels around a voxel, where they are all there, in range, and differ little.
 void interpolate(const VoxelUpdate& t, Group& g) {
   const Float u = g.u, v = g.v;
   const Mask inside =
@@ -96,7 +101,8 @@ void interpolate(const VoxelUpdate& t, Group& g) {
   gather_pairs(t.depth, at, a, b), gather_pairs(t.depth + t.width, at, c, d);
   const Float low = minimum(minimum(a, b), minimum(c, d)), high = maximum(maximum(a, b), maximum(c, d));
   const Float allowed = maximum(broadcast(t.edge), low * 0.02f);
-  const Mask smooth = both(wanted, both(greater(low, Float{}), greater_equal(allowed, high - low)));
+  const Mask within = both(greater(low, Float{}), greater_equal(broadcast(t.max_depth), high));
+  const Mask smooth = both(wanted, both(within, greater_equal(allowed, high - low)));
   const Float x = u - to_float(u0), y = v - to_float(v0);
   const Float top = a + x * (b - a), bottom = c + x * (d - c);
   g.distance = select(smooth, top + y * (bottom - top) - g.z, g.distance);
@@ -116,11 +122,16 @@ void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& chan
   const Float distance = g.distance;
   const Float drop = minimum((distance + t.truncation) * (1.0f / (t.truncation - t.voxel)), one);
   const Float measured = minimum(rounded(t.weight_scale * g.inverse * g.inverse * drop), broadcast(kFullWeight));
-  const Mask valid = both(greater_equal(distance, -truncation), greater_equal(measured, one));
-
   const Int old_value = load_widened(block.value + first), old_weight = load_widened(block.weight + first);
   const Float value = to_float(old_value);
   Float weight = to_float(old_weight);
+  // Depth beyond the range makes known what is free up to the range. What a surface in range left nearer to it, or behind
+  // the range, goes with that surface.
+  const Mask in_range = greater_equal(broadcast(t.max_depth * kRangeSlack), distance + g.z);
+  const Mask before = both(greater_equal(distance, truncation), greater_equal(broadcast(t.max_depth), g.z));
+  const Mask told = either(greater(weight, Float{}), either(in_range, before));
+  const Mask valid = both(told, both(greater_equal(distance, -truncation), greater_equal(measured, one)));
+
   const Mask behind = both(valid, greater_equal(distance, truncation));  // the surface is: the voxel is free
   const Float scaled = (kFreeValue / t.truncation) * distance;
   const Mask surface = both(greater(weight, Float{}), greater(broadcast(kFreeFrom), value));
