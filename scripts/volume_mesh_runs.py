@@ -19,7 +19,7 @@ from ggslam.formats.triangle_mesh import TriangleMesh
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
-from ggslam.volumes.mesh import MIN_WEIGHT, extract_mesh
+from ggslam.volumes.mesh import extract_mesh
 from ggslam.volumes.raycast import render_depth
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.surface_cells import SurfaceCells
@@ -85,7 +85,7 @@ def mesh_part(
         reference: true points [N, 3]; None: meshes are not scored.
     """
     mesh = extract_mesh(tsdf)
-    ours = min(seconds(lambda: (SurfaceCells(tsdf, MIN_WEIGHT), extract_mesh(tsdf)), REPEATS))
+    ours = min(seconds(lambda: (SurfaceCells(tsdf, tsdf.settings.least_weight), extract_mesh(tsdf)), REPEATS))
     print(f"  mesh: {len(mesh.triangles)} triangles in {1e3 * ours:.1f} ms", end="")
     theirs_mesh = None
     if grid is not None:
@@ -102,7 +102,7 @@ def mesh_part(
 
 def _print_rendering(tsdf: TsdfMap, grid: Any, camera: Camera, poses: Sequence[np.ndarray]) -> None:
     near, far = tsdf.settings.min_depth, tsdf.settings.max_depth
-    first = min(seconds(lambda: SurfaceCells(tsdf, MIN_WEIGHT), REPEATS))
+    first = min(seconds(lambda: SurfaceCells(tsdf, tsdf.settings.least_weight), REPEATS))
     ours = np.mean([min(seconds(partial(render_depth, tsdf, camera, T, near, far), REPEATS)) for T in poses])
     print(f"  depth {camera.width}x{camera.height}: {1e3 * ours:.1f} ms, after a change of the map "
           f"{1e3 * first:.1f} ms more", end="")  # fmt: skip

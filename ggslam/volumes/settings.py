@@ -69,6 +69,12 @@ class TsdfSettings:
         return replace(self, **left)
 
     @property
+    def least_weight(self) -> float:
+        """Weight from which a voxel has a surface, in measurements from 1 m: half of a measurement from the farthest
+        depth in range, so that all that was seen once has one but for rims behind a surface, which drop off."""
+        return 0.5 / self.max_depth**2
+
+    @property
     def truncation(self) -> float:
         """In metres."""
         return self.truncation_voxels * self.voxel

@@ -107,12 +107,14 @@ class BlocksTask:
         key, blocks: of the cell.
         tsdf: content of a TSDF's file.
         field: of the distance field; None: a mesh is wanted.
+        min_weight: of the mesh, see `VolumeSettings.min_weight`.
     """
 
     key: CellKey
     blocks: CellBlocks
     tsdf: bytes
     field: FieldSettings | None = None
+    min_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ def fuse_cell(task: FuseTask) -> CellPart:
 
 def mesh_cell(task: BlocksTask) -> CellPart:
     """The triangles of a cell, small pieces among them."""
-    mesh = extract_mesh(_tsdf(task))
+    mesh = extract_mesh(_tsdf(task), task.min_weight or None)
     corners = mesh.vertices[mesh.triangles].astype(np.float64).mean(1)
     blocks = np.floor(np.floor(corners * (SIDE / task.blocks.edge) - 0.5) / SIDE).astype(int)
     own = mesh.part(task.blocks.own(blocks))
