@@ -29,7 +29,10 @@ LEAST_WEIGHT = 65
 """Decay forgets voxels of less than this."""
 MOST_VOXELS = 1e9
 """Voxels farther than this from the origin could not be numbered."""
-_DTYPES = {"value": np.int16, "weight": np.uint16, "label": np.uint16, "color": np.uint8, "votes": np.uint8}
+_DTYPES = {"value": np.int16, "weight": np.uint16, "label": np.uint16, "color": np.uint8, "votes": np.uint8,
+           "hits": np.uint8, "octants": np.uint8}  # fmt: skip
+OCCUPIED_HITS = 128
+"""Voxels of so much evidence have measured points in them."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,9 @@ class BlockVoxels:
         color: uint8 [B, 512, 3].
         label: uint16 [B, 512], the object; 0: none.
         votes: uint8 [B, 512], for the label, less those against it.
+        hits: uint8 [B, 512], evidence of measured points in the voxel: log-odds in steps of 1 / 23.6 above 128, of hits
+            and misses that count as those of `OccupancySettings.with_raised_odds`; 0: none.
+        octants: uint8 [B, 512], where in the voxel they lie: octant (x, y, z) is bit x + 2 y + 4 z.
     """
 
     value: np.ndarray
@@ -68,6 +74,8 @@ class BlockVoxels:
     color: np.ndarray
     label: np.ndarray
     votes: np.ndarray
+    hits: np.ndarray
+    octants: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -264,7 +272,7 @@ class TsdfMap:
 
         Args:
             coordinates: of the blocks.
-            voxels: `value`, `weight`, `color`, `label`, `votes` as in `BlockVoxels`; what is not given stays.
+            voxels: `value`, `weight`, `color`, `label`, `votes`, `hits`, `octants` as in `BlockVoxels`; what is not given stays.
 
         Raises:
             InputError: an array of another name or shape.

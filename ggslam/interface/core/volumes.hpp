@@ -15,6 +15,8 @@ struct VoxelArrays {
   uint16_t* label;
   uint8_t* color;
   uint8_t* votes;
+  uint8_t* hits;
+  uint8_t* octants;
 };
 
 // Numbers of the fusion. Distances in metres.

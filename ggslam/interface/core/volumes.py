@@ -20,7 +20,7 @@ from ctypes import (
 from typing import Any
 
 HEADER = "core/volumes.hpp"
-HEADER_SHA256 = "2402e27fcbc954c70b78c533f12447d288c689d09005c4d25d6cd1b408cd5972"
+HEADER_SHA256 = "b2167029b78bb879d942033b0f220fd1df458e5ce63198db33e6340bdc5bc03e"
 
 
 class VoxelArrays(Structure):
@@ -28,6 +28,7 @@ class VoxelArrays(Structure):
 
     _fields_ = [
         ("value", c_void_p), ("weight", c_void_p), ("label", c_void_p), ("color", c_void_p), ("votes", c_void_p),
+        ("hits", c_void_p), ("octants", c_void_p),
     ]
 
 

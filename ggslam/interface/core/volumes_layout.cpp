@@ -23,7 +23,8 @@ using ggslam::volumes::VoxelArrays;
 namespace {
 constexpr std::size_t kLayout[] = {
     sizeof(VoxelArrays), offsetof(VoxelArrays, value), offsetof(VoxelArrays, weight), offsetof(VoxelArrays, label),
-    offsetof(VoxelArrays, color), offsetof(VoxelArrays, votes),
+    offsetof(VoxelArrays, color), offsetof(VoxelArrays, votes), offsetof(VoxelArrays, hits),
+    offsetof(VoxelArrays, octants),
     sizeof(FusionSettings), offsetof(FusionSettings, min_depth), offsetof(FusionSettings, max_depth),
     offsetof(FusionSettings, free_share), offsetof(FusionSettings, edge), offsetof(FusionSettings, clearing),
     offsetof(FusionSettings, max_free_weight), offsetof(FusionSettings, bounded), offsetof(FusionSettings, low),

@@ -144,6 +144,17 @@ struct VoxelUpdate {
   float max_depth;         // depth beyond it tells of free space alone
   float weight_scale;      // 65535 / largest weight
   float max_free_weight;   // in 65535ths of the largest
+  const uint8_t* octants;  // [kVoxels], those of the block that the view has points in
+};
+
+// A row of the depth image as octants of voxels from a corner of blocks: at depth z of column u they are floor(origin + z
+// (first + u step)) along the map's axes.
+struct OctantRow {
+  const float* depth;
+  int width;
+  float max_depth;  // farther depth is none
+  float origin[3], first[3], step[3];
+  int32_t* out[3];  // [width]; where there is no depth they may be anything
 };
 
 FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const FusionInput& input,

@@ -67,6 +67,19 @@ void tsdf_erode_column(const float* rows, int width, int height, int v, float* o
   }
 }
 
+void tsdf_octants_of_row(const volumes::OctantRow& row) {
+  for (int a = 0; a < 3; ++a) {
+    const float origin = row.origin[a], first = row.first[a], step = row.step[a];
+    int32_t* out = row.out[a];
+    for (int u = 0; u < row.width; ++u) {
+      const float z = row.depth[u] <= row.max_depth ? row.depth[u] : 0.0f;
+      const float x = origin + z * (first + static_cast<float>(u) * step);
+      const int32_t whole = static_cast<int32_t>(x);
+      out[u] = whole - (x < static_cast<float>(whole));  // std::floor is not vectorised
+    }
+  }
+}
+
 // Red + 256 green + 65536 blue of pixels [begin, end).
 void tsdf_pack_color(const uint8_t* color, std::size_t begin, std::size_t end, int32_t* out) {
   for (std::size_t p = begin; p < end; ++p)

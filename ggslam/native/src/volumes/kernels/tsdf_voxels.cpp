@@ -114,6 +114,35 @@ Float cleared(const VoxelUpdate& t, const Group& g, Mask through, Float weight) 
   return select(through, rounded(weight * (1 - t.clearing)), weight);
 }
 
+bool all_are(const std::uint8_t* bytes, std::uint8_t value) {
+  std::uint8_t other = 0;
+  for (int lane = 0; lane < kLanes; ++lane) other |= bytes[lane] ^ value;
+  return other == 0;
+}
+
+// Counts hits and misses of the voxels from `first` on. Returns whether there are hits.
+bool count_points(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block, Mask& changed) {
+  const bool none = all_are(t.octants + first, 0);
+  if (none && (all_are(block.hits + first, volumes::kLeastHits) || !any(greater_equal(g.distance, broadcast(t.voxel)))))
+    return false;
+  const Int old = load_widened(block.hits + first), octants = load_widened(block.octants + first);
+  const Int now = load_widened(t.octants + first);
+  const Float before = to_float(old), start = select(greater(before, Float{}), before, broadcast(volumes::kOccupied));
+  const Mask hit = greater(to_float(now), Float{});
+  const Mask miss = neither_of(greater_equal(g.distance, broadcast(t.voxel)), hit);
+  const Float up = minimum(start + broadcast(volumes::kHit), broadcast(volumes::kMostHits));
+  const Float down = maximum(start - broadcast(volumes::kMiss), broadcast(volumes::kLeastHits));
+  const Float after = select(hit, up, select(miss, down, before));
+  const Mask was = greater_equal(before, broadcast(volumes::kOccupied));
+  const Mask is = greater_equal(after, broadcast(volumes::kOccupied));
+  const Float kept = select(either(hit, is), to_float(octants | now), Float{});
+  const Mask grown = both(is, greater(kept, to_float(octants)));
+  changed = either(changed, either(grown, either(neither_of(is, was), neither_of(was, is))));
+  store_narrowed(block.hits + first, truncate(after));
+  store_narrowed(block.octants + first, truncate(kept));
+  return !none;
+}
+
 // Averages values and weights.
 void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& changed) {
   const int first = n * kLanes;
@@ -199,9 +228,10 @@ bool vote(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block) {
 unsigned summary(const VoxelBlock& block) {
   int weights = 0, unseen = 0, occupied = 0;
   for (int k = 0; k < kVoxels; ++k) {
-    weights |= block.weight[k];
+    const int hit = block.hits[k] >= volumes::kOccupied;
+    weights |= block.weight[k] | hit;
     unseen |= block.weight[k] == 0;
-    occupied |= block.value[k] != kFreeValue;
+    occupied |= (block.value[k] != kFreeValue) | hit;
   }
   return (weights == 0 ? volumes::kNoneSeen : 0u) | (unseen == 0 && occupied == 0 ? volumes::kAllFree : 0u);
 }
@@ -215,13 +245,15 @@ unsigned tsdf_fuse_block(const VoxelUpdate& t, VoxelBlock& block) {
   for (int n = 0; n < w.near.count; ++n) interpolate(t, w.groups[w.near.group[n]]);
   Mask changed{};
   for (int n = 0; n < w.seen.count; ++n) average(t, w, w.seen.group[n], block, changed);
+  bool points = false;
+  for (int n = 0; n < kGroups; ++n) points |= count_points(t, w.groups[n], n * kLanes, block, changed);
   bool relabelled = false;
   for (int n = 0; n < w.band.count; ++n) {
     const int first = w.band.group[n] * kLanes;
     if (t.color != nullptr) paint(t, w.groups[w.band.group[n]], first, block);
     if (t.labels != nullptr) relabelled |= vote(t, w.groups[w.band.group[n]], first, block);
   }
-  return (relabelled || any(changed) ? volumes::kChanged : 0u) | (w.band.count > 0 ? volumes::kInBand : 0u) |
+  return (relabelled || any(changed) ? volumes::kChanged : 0u) | (w.band.count > 0 || points ? volumes::kInBand : 0u) |
          summary(block);
 }
 
@@ -232,6 +264,10 @@ unsigned tsdf_decay_block(VoxelBlock& block, float factor, int least) {
     const int weight = static_cast<int>(block.weight[k] * factor + 0.5f);
     const bool forgotten = weight < least && block.weight[k] > 0;
     block.weight[k] = weight < least ? 0 : static_cast<std::uint16_t>(weight);
+    if (block.weight[k] == 0) {
+      flags |= block.hits[k] >= volumes::kOccupied ? volumes::kChanged : 0u;
+      block.hits[k] = block.octants[k] = 0;
+    }
     if (!forgotten) continue;
     block.value[k] = kFreeValue, block.label[k] = 0, block.votes[k] = 0;
     block.red[k] = block.green[k] = block.blue[k] = 0;
