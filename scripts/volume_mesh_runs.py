@@ -149,5 +149,7 @@ def _print_score(name: str, mesh: TriangleMesh, reference: np.ndarray, voxel: fl
     scores = score_cloud(mesh.sample(SAMPLES)[0], reference, (voxel, 2 * voxel))
     near = scores.thresholds[0]
     print(f"  {name}: accuracy {1e3 * scores.accuracy_m:.2f} mm, completeness {1e3 * scores.completeness_m:.2f} mm; "
-          f"within a voxel {100 * near.precision:.2f} % of the mesh, {100 * near.recall:.2f} % of the reference",
+          f"within a voxel {100 * near.precision:.2f} % of the mesh; "
+          f"missing {100 - 100 * near.recall:.2f} % of the reference, "
+          f"{100 - 100 * scores.thresholds[1].recall:.2f} % within two",
           flush=True)  # fmt: skip

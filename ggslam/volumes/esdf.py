@@ -2,9 +2,9 @@
 """The signed Euclidean distance to the nearest obstacle and its gradient, for planners.
 
 The TSDF of `ggslam.volumes.tsdf` measures along the camera's axis and only near surfaces; what it has exactly is where
-surfaces are. The field takes its zero crossings as surface points with normals, and what is too thin for its voxels from
-the points that were measured in them, finds the nearest for every voxel that was seen, and measures the distance from
-there. An update looks only at what changed in the TSDF, and its
+surfaces are. The field takes its zero crossings as surface points with normals, and what is too thin for its voxels
+from the points that were measured in them, finds the nearest for every voxel that was seen, and measures the distance
+from there. An update looks only at what changed in the TSDF, and its
 result is the same as that of computing everything anew, also after an obstacle has gone.
 
 Unknown voxels, those that no frame has seen, have no distance. The field does not tell how far they are either: a

@@ -272,7 +272,8 @@ class TsdfMap:
 
         Args:
             coordinates: of the blocks.
-            voxels: `value`, `weight`, `color`, `label`, `votes`, `hits`, `octants` as in `BlockVoxels`; what is not given stays.
+            voxels: `value`, `weight`, `color`, `label`, `votes`, `hits`, `octants` as in `BlockVoxels`; what is not
+                given stays.
 
         Raises:
             InputError: an array of another name or shape.

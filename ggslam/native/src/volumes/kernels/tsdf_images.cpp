@@ -68,14 +68,17 @@ void tsdf_erode_column(const float* rows, int width, int height, int v, float* o
 }
 
 void tsdf_octants_of_row(const volumes::OctantRow& row) {
+  const int width = row.width;
+  const float max_depth = row.max_depth;
+  const float* __restrict depth = row.depth;
   for (int a = 0; a < 3; ++a) {
     const float origin = row.origin[a], first = row.first[a], step = row.step[a];
-    int32_t* out = row.out[a];
-    for (int u = 0; u < row.width; ++u) {
-      const float z = row.depth[u] <= row.max_depth ? row.depth[u] : 0.0f;
+    int32_t* __restrict out = row.out[a];
+    for (int u = 0; u < width; ++u) {
+      const float z = std::min(depth[u], max_depth);
       const float x = origin + z * (first + static_cast<float>(u) * step);
       const int32_t whole = static_cast<int32_t>(x);
-      out[u] = whole - (x < static_cast<float>(whole));  // std::floor is not vectorised
+      out[u] = whole - (x < static_cast<float>(whole) ? 1 : 0);  // std::floor is not vectorised
     }
   }
 }

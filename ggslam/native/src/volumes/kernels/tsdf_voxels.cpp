@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Fuses a view into the voxels of a block, kLanes voxels at a time.
 #include <algorithm>
+#include <cstring>
 
 #include "volumes/kernels/voxel_vectors.hpp"
 #include "volumes/tsdf_fusion.hpp"
@@ -114,16 +115,24 @@ Float cleared(const VoxelUpdate& t, const Group& g, Mask through, Float weight) 
   return select(through, rounded(weight * (1 - t.clearing)), weight);
 }
 
-bool all_are(const std::uint8_t* bytes, std::uint8_t value) {
-  std::uint8_t other = 0;
-  for (int lane = 0; lane < kLanes; ++lane) other |= bytes[lane] ^ value;
+// Whether kLanes bytes are all the same as one that is repeated in a word.
+bool all_are(const std::uint8_t* bytes, std::uint64_t repeated) {
+  static_assert(kLanes == 4 || kLanes % 8 == 0);
+  std::uint64_t other = 0, word = 0;
+  constexpr int kStep = kLanes < 8 ? kLanes : 8;
+  for (int lane = 0; lane < kLanes; lane += kStep) {
+    std::memcpy(&word, bytes + lane, kStep);
+    other |= word ^ (kStep < 8 ? repeated & 0xffffffffu : repeated);
+  }
   return other == 0;
 }
+
+constexpr std::uint64_t kAllEmpty = 0x0101010101010101u * volumes::kLeastHits;
 
 // Counts hits and misses of the voxels from `first` on. Returns whether there are hits.
 bool count_points(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block, Mask& changed) {
   const bool none = all_are(t.octants + first, 0);
-  if (none && (all_are(block.hits + first, volumes::kLeastHits) || !any(greater_equal(g.distance, broadcast(t.voxel)))))
+  if (none && (all_are(block.hits + first, kAllEmpty) || !any(greater_equal(g.distance, broadcast(t.voxel)))))
     return false;
   const Int old = load_widened(block.hits + first), octants = load_widened(block.octants + first);
   const Int now = load_widened(t.octants + first);
