@@ -151,16 +151,19 @@ def volumes(
         camera=camera, intrinsics=intrinsics, depth_camera=depth_camera, depth_kind=depth_kind,
             depth_delay=depth_delay, upright=upright,
     )  # fmt: skip
-    overrides = [*(settings or []), *([] if min_weight is None else [f"volumes.min_weight={min_weight}"])]
     request = VolumesRequest(
         source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,
         occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live, realtime=realtime,
         onto=onto, slice_height=slice_height, band=_band(band), frame=frame.value, latency=driving, device=device,
-        config=config, overrides=overrides, overwrite=overwrite,
+        config=config, overrides=_overrides(settings, min_weight), overwrite=overwrite,
     )  # fmt: skip
     if is_store(source):
         return _make_of_store(request, engine, workers, address)
     return _make_and_show(request, _numbers("--speeds", speeds), braking, (engine, workers, address))
+
+
+def _overrides(settings: list[str] | None, min_weight: float | None) -> list[str]:
+    return [*(settings or []), *([] if min_weight is None else [f"volumes.min_weight={min_weight}"])]
 
 
 def _make_braking(sensor_ms: float, plan_ms: float, network_ms: float, friction: float) -> Braking:

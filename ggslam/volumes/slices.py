@@ -18,11 +18,13 @@ from ggslam.system.atomic import write_bytes, write_text
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
 from ggslam.volumes.measured_points import measured_octants
-from ggslam.volumes.tsdf import SIDE, TsdfMap
+from ggslam.volumes.tsdf import SIDE
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 """Grey values of a ROS map."""
 _MOST_CELLS = 50_000_000
+_ROUGH = 0.4
+"""Voxels that the field's distance may be off at edges and between the heights that are looked at."""
 _BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
@@ -102,10 +104,11 @@ def slice_field(
     """Slices the field.
 
     A cell is occupied if its centre is from half a cell before a surface (or half a voxel, if that is more) to a cell
-    behind it, or if a point was measured in it (in an eighth of a voxel that overlaps it). With a band, heights from
-    `low` to `high` are looked at, a voxel apart: a cell is occupied if it is at any of them, and free if it is known at
-    one at least, and occupied or behind a surface at none. A robot as high as the band may therefore drive over a cell
-    that was seen at some of its heights only.
+    behind it, or if a point was measured in it: in an eighth of a voxel that overlaps it, where the field agrees that a
+    surface may go through the cell, or has the point as a thin thing. With a band, heights from `low` to `high` are
+    looked at, a voxel apart: a cell is occupied if it is at any of them, and free if it is known at one at least, and
+    occupied or behind a surface at none. A robot as high as the band may therefore drive over a cell that was seen at
+    some of its heights only.
 
     Args:
         field: to slice.
@@ -127,13 +130,20 @@ def slice_field(
     low, high = band or (0.0, 0.0)
     offsets = np.linspace(low, high, int(np.ceil((high - low) / field.voxel - 1e-6)) + 1)
     least = np.full(len(centres), np.nan, np.float32)
-    hit, cell = np.zeros(len(centres), bool), max(resolution, field.voxel)
+    (hit, through), cell = np.zeros((2, len(centres)), bool), max(resolution, field.voxel)
     for offset in offsets:
-        found = field.query(centres + offset * plane.normal).distance
+        values = field.query(centres + offset * plane.normal)
+        found, along = values.distance, np.abs(values.gradient @ np.stack([plane.x_axis, plane.y_axis], 1)).sum(1)
         least = np.fmin(least, found)
         hit |= (found <= cell / 2) & (found >= -cell)
+        through |= np.abs(found) <= along * resolution / 2 + _ROUGH * field.voxel
     distance, occupied = least.reshape(height, width), hit.reshape(height, width)
-    points = _cells_with_points(field.tsdf, plane, resolution, (low, high), occupied.shape)
+    octants = measured_octants(field.tsdf)
+    points = _cells_with_points(octants, field.voxel, plane, resolution, (low, high), occupied.shape)
+    lone = octants[_thin_octants(octants, field)]
+    points &= through.reshape(height, width) | _cells_with_points(
+        lone, field.voxel, plane, resolution, (low, high), occupied.shape
+    )
     # Where what is behind one side of a thing meets space seen free from another, the field has a surface that nobody
     # saw.
     doubtful = occupied & (cv2.dilate(points.astype(np.uint8), _BESIDE) == 0) & points.any()
@@ -143,13 +153,22 @@ def slice_field(
     return FieldSlice(whole, resolution, distance, ~np.isnan(distance), occupied, behind)
 
 
+def _thin_octants(octants: np.ndarray, field: DistanceField) -> np.ndarray:
+    """Which octants [N, 3] lie in voxels that are surface for their points alone, bool [N]."""
+    points, normals = field.surface()
+    voxels = [np.floor(p / field.voxel).astype(np.int64) for p in (points[~normals.any(1)].astype(float), octants)]
+    thin, own = ((v[:, 0] << 42) + (v[:, 1] << 21) + v[:, 2] for v in voxels)
+    return np.isin(own, thin)
+
+
 def _cells_with_points(
-    tsdf: TsdfMap, plane: SlicePlane, resolution: float, band: tuple[float, float], shape: tuple[int, int]
-) -> np.ndarray:
-    """Cells that octants with measured points overlap at the heights of a band, bool [H, W]."""
+    octants: np.ndarray, voxel: float, plane: SlicePlane, resolution: float, band: tuple[float, float],
+    shape: tuple[int, int],
+) -> np.ndarray:  # fmt: skip
+    """Cells that octants [N, 3] overlap at the heights of a band, bool [H, W]."""
     axes = np.stack([plane.x_axis, plane.y_axis, plane.normal])
-    reach = 0.25 * tsdf.settings.voxel * np.abs(axes).sum(1)
-    points = (measured_octants(tsdf) - plane.origin) @ axes.T
+    reach = 0.25 * voxel * np.abs(axes).sum(1)
+    points = (octants - plane.origin) @ axes.T
     points = points[(points[:, 2] >= band[0] - reach[2]) & (points[:, 2] <= band[1] + reach[2])]
     first, last = (
         np.floor((points[:, :2] + side * reach[:2] - plane.low) / resolution).astype(int) for side in (-1, 1)
