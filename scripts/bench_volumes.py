@@ -27,6 +27,9 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+if "--peers" in sys.argv[:-1]:  # behind our own packages, before anything looks for Open3D
+    sys.path.append(sys.argv[sys.argv.index("--peers") + 1])
+
 from volume_esdf_runs import accuracy_part, esdf_part
 from volume_mesh_runs import compare_meshes
 from volume_runs import compare_fusion
@@ -42,9 +45,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="*", type=Path)
     parser.add_argument("--parts", nargs="+", choices=[*PARTS, "accuracy"], default=[*PARTS, "accuracy"])
-    parser.add_argument("--voxels", nargs="+", type=float, default=[0.04, 0.02, 0.01], help="of the TSDF, metres")
+    parser.add_argument("--voxels", nargs="+", type=float, default=[0.1, 0.05, 0.02, 0.01], help="of the TSDF, metres")
     parser.add_argument("--esdf-voxels", nargs="+", type=float, default=[0.08, 0.04, 0.02], help="metres")
     parser.add_argument("--frames", type=int, help="only the first of a recording")
+    parser.add_argument("--views", type=int, help="only so many, spread over the recording")
+    parser.add_argument("--peers", type=Path, help="site-packages of another environment that has Open3D")
     parser.add_argument("--repeats", type=int, default=2, help="whole runs; the fastest time of each frame counts")
     arguments = parser.parse_args()
     for path in arguments.recordings:

@@ -19,7 +19,7 @@ from ggslam.formats.triangle_mesh import TriangleMesh
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
-from ggslam.volumes.mesh import MIN_WEIGHT, extract_mesh
+from ggslam.volumes.mesh import extract_mesh
 from ggslam.volumes.raycast import render_depth
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.surface_cells import SurfaceCells
@@ -85,7 +85,7 @@ def mesh_part(
         reference: true points [N, 3]; None: meshes are not scored.
     """
     mesh = extract_mesh(tsdf)
-    ours = min(seconds(lambda: (SurfaceCells(tsdf, MIN_WEIGHT), extract_mesh(tsdf)), REPEATS))
+    ours = min(seconds(lambda: (SurfaceCells(tsdf, tsdf.settings.least_weight), extract_mesh(tsdf)), REPEATS))
     print(f"  mesh: {len(mesh.triangles)} triangles in {1e3 * ours:.1f} ms", end="")
     theirs_mesh = None
     if grid is not None:
@@ -102,7 +102,7 @@ def mesh_part(
 
 def _print_rendering(tsdf: TsdfMap, grid: Any, camera: Camera, poses: Sequence[np.ndarray]) -> None:
     near, far = tsdf.settings.min_depth, tsdf.settings.max_depth
-    first = min(seconds(lambda: SurfaceCells(tsdf, MIN_WEIGHT), REPEATS))
+    first = min(seconds(lambda: SurfaceCells(tsdf, tsdf.settings.least_weight), REPEATS))
     ours = np.mean([min(seconds(partial(render_depth, tsdf, camera, T, near, far), REPEATS)) for T in poses])
     print(f"  depth {camera.width}x{camera.height}: {1e3 * ours:.1f} ms, after a change of the map "
           f"{1e3 * first:.1f} ms more", end="")  # fmt: skip
@@ -149,5 +149,7 @@ def _print_score(name: str, mesh: TriangleMesh, reference: np.ndarray, voxel: fl
     scores = score_cloud(mesh.sample(SAMPLES)[0], reference, (voxel, 2 * voxel))
     near = scores.thresholds[0]
     print(f"  {name}: accuracy {1e3 * scores.accuracy_m:.2f} mm, completeness {1e3 * scores.completeness_m:.2f} mm; "
-          f"within a voxel {100 * near.precision:.2f} % of the mesh, {100 * near.recall:.2f} % of the reference",
+          f"within a voxel {100 * near.precision:.2f} % of the mesh; "
+          f"missing {100 - 100 * near.recall:.2f} % of the reference, "
+          f"{100 - 100 * scores.thresholds[1].recall:.2f} % within two",
           flush=True)  # fmt: skip

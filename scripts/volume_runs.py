@@ -90,7 +90,8 @@ class VoxelBlockGrid:
 def frames_of(path: Path, arguments: argparse.Namespace) -> list[Frame]:
     """Frames with true poses, without masks."""
     stream = open_sequence(path, stop=arguments.frames).stream(masks=False)
-    return [frame for frame in stream if frame.T_world_camera is not None]
+    frames = [frame for frame in stream if frame.T_world_camera is not None]
+    return frames if arguments.views is None else frames[:: max(1, len(frames) // arguments.views)][: arguments.views]
 
 
 def compare_fusion(path: Path, arguments: argparse.Namespace) -> None:

@@ -56,7 +56,7 @@ def read_only_images() -> Iterator[list[Frame]]:
 
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*not writable.*")
-        for name in ("read_color", "read_depth", "read_confidence"):
+        for name in ("read_color", "metric_depth", "no_returns", "read_confidence"):
             patch.setattr(sequence, name, _locking(getattr(sequence, name)))
         patch.setattr(MaskReader, "read", _locking(MaskReader.read))
         patch.setattr(sequence.Sequence, "_frame", frame)

@@ -51,6 +51,11 @@ Esdf = Annotated[bool, typer.Option("--esdf", help="Also make a distance field, 
 Occupancy = Annotated[
     float | None, typer.Option(metavar="VOXEL", help="Also make an occupancy map (.bt, .ot), voxels of so many metres.")
 ]
+MinWeight = Annotated[
+    float | None,
+    typer.Option(help="Least weight of voxels that the mesh is made of, in looks from 1 m; default: half a look from "
+                 "the farthest depth that is fused (0.01 at 7 m). More leaves out what was hardly seen."),
+]  # fmt: skip
 Mesh = Annotated[
     Path | None, typer.Option(help="Mesh file, .ply, .obj or .glb; default mesh.ply in the folder of the results.")
 ]
@@ -101,6 +106,7 @@ def volumes(
     esdf: Esdf = False,
     occupancy: Occupancy = None,
     mesh: Mesh = None,
+    min_weight: MinWeight = None,
     object_meshes: ObjectMeshes = False,
     objects: Objects = True,
     live: Live = False,
@@ -149,11 +155,15 @@ def volumes(
         source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,
         occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live, realtime=realtime,
         onto=onto, slice_height=slice_height, band=_band(band), frame=frame.value, latency=driving, device=device,
-        config=config, overrides=settings or [], overwrite=overwrite,
+        config=config, overrides=_overrides(settings, min_weight), overwrite=overwrite,
     )  # fmt: skip
     if is_store(source):
         return _make_of_store(request, engine, workers, address)
     return _make_and_show(request, _numbers("--speeds", speeds), braking, (engine, workers, address))
+
+
+def _overrides(settings: list[str] | None, min_weight: float | None) -> list[str]:
+    return [*(settings or []), *([] if min_weight is None else [f"volumes.min_weight={min_weight}"])]
 
 
 def _make_braking(sensor_ms: float, plan_ms: float, network_ms: float, friction: float) -> Braking:
@@ -178,7 +188,8 @@ def _make_of_store(
         objects=request.objects, config=request.config, overrides=request.overrides,
     )  # fmt: skip
     if request != plain or request.sequence != type(request.sequence)(request.source):
-        raise ConfigError("of a grid store --out, --voxel, --esdf, --config, --set and the workers can be chosen")
+        chosen = "--out, --voxel, --esdf, --min-weight, --config, --set"
+        raise ConfigError(f"of a grid store {chosen} and the workers can be chosen")
     if address is not None and engine is not options.EngineName.ray:
         raise ConfigError("--address is for --engine ray")
     settings = load_config(request.config, request.overrides).volumes

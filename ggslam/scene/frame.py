@@ -33,6 +33,8 @@ class Frame:
         valid: bool [H, W], False where colour shows nothing (beyond the border of an undistorted image); the same array
             for all frames of a recording; None: all of it shows something.
         moving: bool [H, W], True where something is seen that moves; None: nothing, as far as is known.
+        no_return: bool [H, W], True where the sensor says that there is nothing within its range (+inf, REP 117); depth
+            is 0 there. None: nowhere, as far as is known.
         depth_delay: seconds after `timestamp`, which is that of colour, at which depth was taken.
         camera_number: of the camera in its rig; 0 without one.
         instant: number of the instant at which the cameras of a rig took their images together; None without a rig.
@@ -49,9 +51,14 @@ class Frame:
     mask_loader: Callable[[], np.ndarray | None] | None = field(default=None, repr=False, compare=False)
     valid: Mask | None = field(default=None, repr=False, compare=False)
     moving: Mask | None = field(default=None, repr=False, compare=False)
+    no_return: Mask | None = field(default=None, repr=False, compare=False)
     depth_delay: float = 0.0
     camera_number: int = 0
     instant: int | None = None
+
+    def depth_or_infinity(self) -> np.ndarray:
+        """Depth float32 [H, W], metres: 0 where unknown, +inf where the sensor found nothing."""
+        return self.depth if self.no_return is None else np.where(self.no_return, np.float32(np.inf), self.depth)
 
     def load_mask(self) -> np.ndarray | None:
         """The mask; reads it from disk on every call if it did not come with the frame.

@@ -62,16 +62,18 @@ class DepthKind:
         Returns:
             float32 [H, W]; 0: none.
         """
-        if self.mirrored:
-            depth = depth[:, ::-1]
-        if self.flipped:
-            depth = depth[::-1]
+        depth = self.right_way_round(depth)
         if self.measure == "ray":
             depth = depth / np.linalg.norm(rays, axis=2)
         elif self.measure == "inverse":
             units = (self.inverse_units or depth_scale) / depth_scale
             depth = np.divide(np.float32(units), depth, out=np.zeros(depth.shape, np.float32), where=depth > 0)
         return np.ascontiguousarray(depth, np.float32)
+
+    def right_way_round(self, image: np.ndarray) -> np.ndarray:
+        """An image [H, W] as stored -> the right way round."""
+        image = image[:, ::-1] if self.mirrored else image
+        return image[::-1] if self.flipped else image
 
 
 PLAIN = DepthKind()

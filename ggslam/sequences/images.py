@@ -69,7 +69,11 @@ def read_depth(file: ImageFile, depth_scale: float, none: Iterable[float] = ()) 
     Raises:
         SequenceError: missing, truncated, not an image, or not 16-bit or floating-point with one channel.
     """
-    raw = read_stored_depth(file)
+    return metric_depth(read_stored_depth(file), depth_scale, none)
+
+
+def metric_depth(raw: np.ndarray, depth_scale: float, none: Iterable[float] = ()) -> np.ndarray:
+    """The same of a depth image as stored."""
     depth = raw.astype(np.float32) / np.float32(depth_scale)
     if raw.dtype.kind == "f":
         depth[~((depth > 0) & np.isfinite(depth))] = 0
@@ -78,6 +82,20 @@ def read_depth(file: ImageFile, depth_scale: float, none: Iterable[float] = ()) 
     for code in none:
         depth[np.isclose(raw, code, rtol=1e-6, atol=0)] = 0
     return depth
+
+
+def no_returns(raw: np.ndarray, none: Iterable[float] = ()) -> np.ndarray | None:
+    """Where a depth image as stored says that the sensor found nothing within its range: +inf (REP 117; NaN and -inf
+    say that nothing is known). Bool [H, W]; None: nowhere.
+
+    Args:
+        raw: uint16 or floating-point [H, W].
+        none: stored numbers that mean "nothing measured" instead.
+    """
+    if raw.dtype.kind != "f" or np.inf in none:
+        return None
+    found = np.isposinf(raw)
+    return found if found.any() else None
 
 
 def read_confidence(file: ImageFile) -> np.ndarray:

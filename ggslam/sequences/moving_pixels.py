@@ -69,6 +69,7 @@ class MovingPixels:
         load, ids = frame.mask_loader, frame.mask
         return replace(
             frame, depth=np.where(moving, np.float32(0), frame.depth), moving=moving,
+            no_return=None if frame.no_return is None else frame.no_return & ~moving,
             mask=None if ids is None else _unlabel(ids, moving),
             mask_loader=None if load is None else partial(_load_unlabelled, load, moving),
         )  # fmt: skip

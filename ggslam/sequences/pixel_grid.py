@@ -24,6 +24,9 @@ USUAL_PIXELS = 640 * 480
 ASPECT_TOLERANCE = 0.01
 """Relative difference of width/height up to which two sizes count as the same view (1296x968 and 640x480: 0.4 %)."""
 
+_VERY_FAR_M = np.float32(1e4)
+"""Stands for depth where the sensor found nothing, where the way of its pixels into another image is looked for."""
+
 Size = tuple[int, int]
 """(width, height) in pixels."""
 
@@ -186,6 +189,22 @@ class ImageGeometry:
         """Depth float32 [H, W] metres as stored, with the colour image as stored -> image of `camera`."""
         found = self._depth_on_color(depth, color) if self.finer else self._depth_of_camera(depth)
         return np.where(self.valid, found, np.float32(0)) if self._filled and self.valid is not None else found
+
+    def no_return(
+        self, found: np.ndarray, stored: np.ndarray, depth: np.ndarray, color: np.ndarray, files: FrameFiles
+    ) -> np.ndarray:
+        """Where the sensor found nothing, bool [H, W] as stored -> bool [H, W] of `camera`: where depth is very far if
+        it is taken to be so there.
+
+        Args:
+            found: as stored.
+            stored: depth as stored, metres.
+            depth: of `camera`, made of it.
+            color: steadied colour.
+            files: the frame.
+        """
+        far = self.steady(np.where(found, _VERY_FAR_M, stored), files, cv2.INTER_NEAREST)
+        return (depth == 0) & (self.depth(far, color) > _VERY_FAR_M / 2)
 
     def _depth_of_camera(self, depth: np.ndarray) -> np.ndarray:
         if self._registration is not None:

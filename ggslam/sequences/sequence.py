@@ -21,7 +21,7 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.depth_kind import PLAIN, DepthKind
-from ggslam.sequences.images import read_color, read_confidence, read_depth
+from ggslam.sequences.images import metric_depth, no_returns, read_color, read_confidence, read_stored_depth
 from ggslam.sequences.mask_images import most_pixels
 from ggslam.sequences.masks import MaskReader
 from ggslam.sequences.moving_pixels import MovingPixels
@@ -283,20 +283,23 @@ class Sequence:
             return self._frame(index, source, files, masks)
 
     def _frame(self, index: int, source: int, files: FrameFiles, masks: ReadMasks) -> Frame:
-        color, depth = self._read(source)
+        color, depth, no_return = self._read(source)
         self._geometry.check(color, depth, files)
         color = self._geometry.steady(color, files, cv2.INTER_LINEAR)
+        stored = depth
+        depth = self._geometry.depth(self._geometry.steady(depth, files, cv2.INTER_NEAREST), color)
         pose = None if self.ground_truth is None else self.ground_truth[index]
         found = Frame(
             index=index,
             source_index=source,
             timestamp=float(self.timestamps[index]),
             color=self._geometry.color(color),
-            depth=self._geometry.depth(self._geometry.steady(depth, files, cv2.INTER_NEAREST), color),
+            depth=depth,
             camera=self.camera,
             mask=self._mask(index, masks is True) if masks in (True, "unshared") else None,
             T_world_camera=pose.copy() if pose is not None and np.isfinite(pose).all() else None,
             valid=self.valid,
+            no_return=None if no_return is None else self._geometry.no_return(no_return, stored, depth, color, files),
             depth_delay=0.0 if self._recording.depth_delays is None else float(self._recording.depth_delays[source]),
             mask_loader=partial(self._mask, index) if masks == "lazy" and files.mask is not None else None,
         )
@@ -353,10 +356,13 @@ class Sequence:
             return None
         return self._geometry.mask(self._geometry.steady(ids, self.files(index), cv2.INTER_NEAREST), shared)
 
-    def _read(self, source: int) -> tuple[np.ndarray, np.ndarray]:
+    def _read(self, source: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Colour and depth as stored, in metres, and where depth says that the sensor found nothing."""
         files = self._recording.files[source]
         recording = self._recording
-        depth = read_depth(files.depth, recording.depth_scale, recording.depth_kind.none)
+        raw, kind = read_stored_depth(files.depth), recording.depth_kind
+        depth = metric_depth(raw, recording.depth_scale, kind.none)
+        no_return = None if kind.measure == "inverse" else no_returns(raw, kind.none)
         if files.confidence is not None:
             confidence = read_confidence(files.confidence)
             if confidence.shape != depth.shape:
@@ -364,10 +370,11 @@ class Sequence:
                 raise SequenceError(f"{files.confidence}: expected confidence of {expected} like depth, found {found}")
             depth = np.where(confidence < recording.min_confidence, np.float32(0), depth)
         color = read_color(files.color, recording.upright)
-        if recording.depth_kind != PLAIN:
+        if kind != PLAIN:
             rays = rays_of_depth(recording, files, image_size(color), image_size(depth))
-            depth = recording.depth_kind.to_z(depth, rays, recording.depth_scale)
-        return color, depth
+            depth = kind.to_z(depth, rays, recording.depth_scale)
+            no_return = None if no_return is None else kind.right_way_round(no_return)
+        return color, depth, no_return
 
     def _look_for_fill(self, geometry: ImageGeometry, color: np.ndarray) -> None:
         """Leaves out what is of one colour from a corner on in all images, if it is so in the first one."""
@@ -391,7 +398,7 @@ class Sequence:
             if source in self._recording.problems:
                 continue
             try:
-                color, depth = self._read(source)
+                color, depth, _ = self._read(source)
             except SequenceError as error:
                 if self._on_bad_frame == "error":
                     raise

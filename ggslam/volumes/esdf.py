@@ -2,8 +2,9 @@
 """The signed Euclidean distance to the nearest obstacle and its gradient, for planners.
 
 The TSDF of `ggslam.volumes.tsdf` measures along the camera's axis and only near surfaces; what it has exactly is where
-surfaces are. The field takes its zero crossings as surface points with normals, finds the nearest of them for every
-voxel that was seen, and measures the distance from there. An update looks only at what changed in the TSDF, and its
+surfaces are. The field takes its zero crossings as surface points with normals, and what is too thin for its voxels
+from the points that were measured in them, finds the nearest for every voxel that was seen, and measures the distance
+from there. An update looks only at what changed in the TSDF, and its
 result is the same as that of computing everything anew, also after an obstacle has gone.
 
 Unknown voxels, those that no frame has seen, have no distance. The field does not tell how far they are either: a
@@ -182,7 +183,8 @@ class DistanceField:
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """The surface points that distances are measured from: positions float32 [S, 3] in metres (float64 if the
-        origin is not the world's), and unit normals [S, 3] to the side in front."""
+        origin is not the world's), and unit normals [S, 3] to the side in front; zero where something is thinner than
+        a voxel."""
         n = int(self._library.ggslam_esdf_sites(self._handle, None, None))
         points, normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
         self._library.ggslam_esdf_sites(self._handle, points.ctypes.data, normals.ctypes.data)

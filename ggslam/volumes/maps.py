@@ -17,11 +17,10 @@ import numpy as np
 import torch
 
 from ggslam.errors import ConfigError
-from ggslam.geometry.scene_size import voxel_times
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.volumes.esdf import DistanceField
-from ggslam.volumes.mesh import MIN_WEIGHT, Mesh, extract_mesh
+from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.posed_view import PosedView
 from ggslam.volumes.tsdf import TsdfMap
@@ -93,7 +92,7 @@ class VolumeMaps:
         onto: TsdfMap | None = None, device: str | None = None,
     ) -> None:  # fmt: skip
         self.settings = settings
-        self._goes_on, self.times_a_room = onto is not None, 1
+        self._goes_on = onto is not None
         self._on_device = None if device is None else _fusion_on(device, settings, onto)
         self.tsdf = TsdfMap(settings.tsdf) if onto is None else onto
         self.context = self.tsdf.context
@@ -112,7 +111,7 @@ class VolumeMaps:
         tsdf = self.settings.tsdf.in_scene(scale, voxel)
         if self._goes_on or tsdf == self.settings.tsdf:
             return
-        self.settings, self.times_a_room = replace(self.settings, tsdf=tsdf), voxel_times(scale)
+        self.settings = replace(self.settings, tsdf=tsdf)
         if self._on_device is not None:
             self._on_device = TorchTsdf(tsdf, self._on_device.device)
         self.tsdf = TsdfMap(tsdf, self.context)
@@ -120,7 +119,7 @@ class VolumeMaps:
 
     def mesh(self, min_triangles: int = 0) -> Mesh:
         """The surface of the TSDF; see `volumes.mesh.extract_mesh`."""
-        return extract_mesh(self.tsdf, MIN_WEIGHT / self.times_a_room**2, min_triangles)
+        return extract_mesh(self.tsdf, self.settings.min_weight or None, min_triangles)
 
     @property
     def _receiver(self) -> TsdfMap | TorchTsdf:
@@ -142,8 +141,8 @@ class VolumeMaps:
         """
         number = len(self.times.rows)
         row = {"slam": waited} if waited else {}
-        start = time.perf_counter()
-        self._fuse(frame.depth, frame.camera, T_world_camera, frame.color, labels)
+        start, depth = time.perf_counter(), frame.depth_or_infinity()
+        self._fuse(depth, frame.camera, T_world_camera, frame.color, labels)
         every = self.settings.decay_every
         if every and number % every == every - 1:
             self.tsdf.decay()
@@ -155,7 +154,7 @@ class VolumeMaps:
             row["esdf"] = time.perf_counter() - start
         if self.occupancy is not None:
             start = time.perf_counter()
-            self._insert(frame.depth, frame.camera, T_world_camera)
+            self._insert(depth, frame.camera, T_world_camera)
             row["occupancy"] = time.perf_counter() - start
         self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
@@ -168,7 +167,7 @@ class VolumeMaps:
 
     def _insert(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
         assert self.occupancy is not None
-        self.occupancy.insert_depth(depth, camera, T_world_camera)
+        self.occupancy.insert_depth(depth, camera, T_world_camera, free_depth=self.settings.tsdf.max_depth)
 
     def rebuild(self, views: Iterable[PosedView]) -> None:
         """Begins anew from keyframes where they are now, for after a loop was closed."""

@@ -18,9 +18,6 @@ from ggslam.scene.poses import transform_points
 from ggslam.volumes.surface_cells import surface_cells
 from ggslam.volumes.tsdf import TsdfMap
 
-MIN_WEIGHT = 0.1
-"""In measurements from 1 m: voxels seen less count as unknown. One look from 3 m is enough."""
-
 
 @dataclass(frozen=True)
 class Mesh:
@@ -71,7 +68,7 @@ class Mesh:
         return TriangleMesh(self.vertices.astype(np.float64), self.triangles.astype(np.int64))
 
 
-def extract_mesh(tsdf: TsdfMap, min_weight: float = MIN_WEIGHT, min_triangles: int = 0) -> Mesh:
+def extract_mesh(tsdf: TsdfMap, min_weight: float | None = None, min_triangles: int = 0) -> Mesh:
     """The surface where the distance changes its sign, between voxels that are all known.
 
     Neighbouring cells agree on their common face, so the mesh is closed but for borders with the unknown: no edge has
@@ -80,7 +77,8 @@ def extract_mesh(tsdf: TsdfMap, min_weight: float = MIN_WEIGHT, min_triangles: i
 
     Args:
         tsdf: the map.
-        min_weight: voxels of less weight (in measurements from 1 m), or never seen, count as unknown.
+        min_weight: voxels of less weight (in measurements from 1 m), or never seen, count as unknown; None: see
+            `TsdfSettings.least_weight`.
         min_triangles: connected pieces of fewer triangles are left out.
     """
     core, cells = load_library(), surface_cells(tsdf, min_weight)

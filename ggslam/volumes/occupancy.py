@@ -10,6 +10,7 @@ and one pass over the blocks applies them. What has one value throughout is a si
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -151,14 +152,17 @@ class OccupancyMap:
         max_range: float | None = None,
         min_depth: float = 0.1,
         max_depth: float = 1000.0,
+        free_depth: float | None = None,
     ) -> ScanCounts:
         """Inserts one depth image.
 
         Args:
-            depth: [H, W], metres along the optical axis; 0: none.
+            depth: [H, W], metres along the optical axis; 0: none; +inf: the sensor found nothing (REP 117).
             T_world_camera: float64 [4, 4].
             max_range: metres from the camera; rays to farther points end there, without a hit.
             min_depth, max_depth: pixels outside are left out, metres.
+            free_depth: pixels of +inf free space up to this depth along the optical axis; None: up to `max_range`, and
+                nothing if that is None, too.
 
         Raises:
             InputError: the image is not of the camera's size.
@@ -171,7 +175,8 @@ class OccupancyMap:
         T = moved_pose(T_world_camera, -self.origin)
         image = DepthImage(
             depth.ctypes.data, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
-            max(min_depth, 1e-6), max_depth, (ctypes.c_float * 12)(*T[:3].ravel()),
+            max(min_depth, 1e-6), max_depth, _free_depth(max_range, free_depth),
+            (ctypes.c_float * 12)(*T[:3].ravel()),
         )  # fmt: skip
         core = self._library.ggslam_occupancy_insert_depth
         return self._insert(
@@ -227,7 +232,7 @@ class OccupancyMap:
         limits = (s.probability_hit, s.probability_miss, s.probability_minimum, s.probability_maximum)
         where = (ctypes.c_float * 3)(*(np.asarray(origin, np.float64).reshape(3) - self.origin).astype(np.float32))
         return InsertSettings(
-            -1.0 if max_range is None else max_range, where, *map(log_odds, limits), int(s.quantize)
+            -1.0 if max_range is None else max_range, where, *map(log_odds, limits), int(s.quantize), int(s.last_voxel)
         )
 
     def _insert(
@@ -264,3 +269,16 @@ class OccupancyMap:
             return None
         box = (np.array([low[:], [h + 1 for h in high]], np.float64) - KEY_OFFSET) * self.resolution
         return box + self.origin
+
+
+def _free_depth(max_range: float | None, free_depth: float | None) -> float:
+    """Depth that pixels of +inf free space up to; 0: they are left out.
+
+    Raises:
+        ConfigError: one that is not positive.
+    """
+    if free_depth is None:
+        return 0.0 if max_range is None else max_range
+    if not 0 < free_depth < math.inf:
+        raise ConfigError(f"free_depth: expected a positive number of metres, found {free_depth}")
+    return free_depth

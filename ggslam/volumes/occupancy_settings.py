@@ -17,7 +17,8 @@ def log_odds(probability: float) -> float:
 
 @settings_class(frozen=True)
 class OccupancySettings:
-    """How a scan changes the map. The defaults are OctoMap's (Hornung et al., "OctoMap", Autonomous Robots 2013)."""
+    """How a scan changes the map. The probabilities are OctoMap's by default (Hornung et al., "OctoMap", Autonomous
+    Robots 2013)."""
 
     probability_hit: float = setting(0.7, 0.501, 0.999)
     """Occupancy that one scan with a point in the voxel speaks for."""
@@ -31,6 +32,9 @@ class OccupancySettings:
     """A voxel is occupied from this probability on."""
     quantize: bool = True
     """One ray per occupied voxel, to its centre. False: one per point, OctoMap's plain update."""
+    last_voxel: bool = True
+    """Rays that are cut at the range free the voxel they end in, too, if they go on behind it. OctoMap leaves that
+    voxel as it is (False), so that what was once seen there stays for ever."""
 
     def __post_init__(self) -> None:
         if not self.probability_minimum <= self.probability_occupied <= self.probability_maximum:

@@ -64,7 +64,7 @@ def from_octomap(tree: Any, context: NativeContext | None = None, quantize: bool
     """
     settings = OccupancySettings(
         tree.getProbHit(), tree.getProbMiss(), tree.getClampingThresMin(), tree.getClampingThresMax(),
-        tree.getOccupancyThres(), quantize,
+        tree.getOccupancyThres(), quantize, last_voxel=False,
     )  # fmt: skip
     if tree.size() == 0:
         return OccupancyMap(tree.getResolution(), settings, context)
@@ -93,7 +93,7 @@ def insert_batched(
         ValueError, ConfigError: as `OccupancyMap.insert`.
     """
     resolution = tree.getResolution()
-    finder = OccupancyMap(resolution, OccupancySettings(quantize=quantize), context)
+    finder = OccupancyMap(resolution, OccupancySettings(quantize=quantize, last_voxel=False), context)
     keys, counts = scan_keys(finder, points, origin, max_range)
     for occupied, part in ((False, keys[: counts.free]), (True, keys[counts.free :])):
         for first in range(0, len(part), _CHUNK):

@@ -13,7 +13,6 @@ from ggslam.interface.core.volumes import RaycastView, SurfaceImages
 from ggslam.native.loader import load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.origin import moved_pose
-from ggslam.volumes.mesh import MIN_WEIGHT
 from ggslam.volumes.surface_cells import surface_cells
 from ggslam.volumes.tsdf import TsdfMap
 
@@ -37,7 +36,7 @@ class RenderedSurface:
 
 def render_depth(
     tsdf: TsdfMap, camera: Camera, T_world_camera: np.ndarray, near: float = 0.1, far: float = 10.0,
-    min_weight: float = MIN_WEIGHT,
+    min_weight: float | None = None,
 ) -> RenderedSurface:  # fmt: skip
     """Casts a ray through every pixel centre to the first change from free space to the inside.
 
@@ -49,7 +48,8 @@ def render_depth(
         camera: its size is that of the images.
         T_world_camera: float64 [4, 4].
         near, far: range of depth, metres.
-        min_weight: voxels of less weight (in measurements from 1 m), or never seen, count as unknown.
+        min_weight: voxels of less weight (in measurements from 1 m), or never seen, count as unknown; None: see
+            `TsdfSettings.least_weight`.
 
     Raises:
         InputError: a range that is none, or a pose that is not finite.

@@ -26,7 +26,8 @@ class TsdfSettings:
     min_depth: float = setting(0.1, 0, 100, "m")
     """Nearer depth is not fused."""
     max_depth: float = setting(7.0, 0.1, _FARTHEST, "m", basic=True)
-    """Farther depth is not fused; unless set, farther in scenes larger than rooms."""
+    """Farther depth makes no surface: all before it is free, up to this far. Unless set, farther in scenes larger than
+    rooms."""
     free_share: float = setting(0.9, 0.1, 1)
     """A block without voxels becomes free throughout if all depth seen through it lies behind it, and at least this
     share of its pixels have depth. Else it gets voxels, if it is not known yet, until all of them were seen."""
@@ -66,6 +67,12 @@ class TsdfSettings:
         )
         left = {n: v for n, v in zip(names, new, strict=True) if getattr(self, n) == getattr(usual, n)}
         return replace(self, **left)
+
+    @property
+    def least_weight(self) -> float:
+        """Weight from which a voxel has a surface, in measurements from 1 m: half of a measurement from the farthest
+        depth in range, so that all that was seen once has one but for rims behind a surface, which drop off."""
+        return 0.5 / self.max_depth**2
 
     @property
     def truncation(self) -> float:

@@ -17,11 +17,15 @@ from ggslam.errors import InputError
 from ggslam.system.atomic import write_bytes, write_text
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
+from ggslam.volumes.measured_points import measured_octants
 from ggslam.volumes.tsdf import SIDE
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 """Grey values of a ROS map."""
 _MOST_CELLS = 50_000_000
+_ROUGH = 0.4
+"""Voxels that the field's distance may be off at edges and between the heights that are looked at."""
+_BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,9 @@ class FieldSlice:
         resolution: edge of a cell, metres.
         distance: float32 [H, W], metres, at the cells' centres; of a band, the least over the heights. NaN: not known.
         known: bool [H, W].
-        occupied: bool [H, W], whether a cell has a surface in it or is behind one.
+        occupied: bool [H, W], whether a cell has a surface in it.
+        behind: bool [H, W], whether a cell is behind a surface (at one of the heights), or at one that no point was
+            measured near: not free, whatever is known.
     """
 
     plane: SlicePlane
@@ -63,6 +69,12 @@ class FieldSlice:
     distance: np.ndarray
     known: np.ndarray
     occupied: np.ndarray
+    behind: np.ndarray
+
+    @property
+    def free(self) -> np.ndarray:
+        """Cells that were seen, with no surface in them and not behind one, bool [H, W]."""
+        return self.known & ~self.occupied & ~self.behind
 
 
 def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> SlicePlane:
@@ -91,10 +103,12 @@ def slice_field(
 ) -> FieldSlice:
     """Slices the field.
 
-    A cell is occupied if a surface is within half a cell (or half a voxel, if that is more) of its centre, or its
-    centre is behind one. With a band, heights from `low` to `high` are looked at, a voxel apart: a cell is occupied if
-    it is at any of them, and free if it is known at one at least and occupied at none. A robot as high as the band may
-    therefore drive over a cell that was seen at some of its heights only.
+    A cell is occupied if its centre is from half a cell before a surface (or half a voxel, if that is more) to a cell
+    behind it, or if a point was measured in it: in an eighth of a voxel that overlaps it, where the field agrees that a
+    surface may go through the cell, or has the point as a thin thing. With a band, heights from `low` to `high` are
+    looked at, a voxel apart: a cell is occupied if it is at any of them, and free if it is known at one at least, and
+    occupied or behind a surface at none. A robot as high as the band may therefore drive over a cell that was seen at
+    some of its heights only.
 
     Args:
         field: to slice.
@@ -116,14 +130,56 @@ def slice_field(
     low, high = band or (0.0, 0.0)
     offsets = np.linspace(low, high, int(np.ceil((high - low) / field.voxel - 1e-6)) + 1)
     least = np.full(len(centres), np.nan, np.float32)
+    (hit, through), cell = np.zeros((2, len(centres)), bool), max(resolution, field.voxel)
     for offset in offsets:
-        least = np.fmin(least, field.query(centres + offset * plane.normal).distance)
-    distance = least.reshape(height, width)
-    known = ~np.isnan(distance)
-    occupied = known & (distance <= max(resolution, field.voxel) / 2)
+        values = field.query(centres + offset * plane.normal)
+        found, along = values.distance, np.abs(values.gradient @ np.stack([plane.x_axis, plane.y_axis], 1)).sum(1)
+        least = np.fmin(least, found)
+        hit |= (found <= cell / 2) & (found >= -cell)
+        through |= np.abs(found) <= along * resolution / 2 + _ROUGH * field.voxel
+    distance, occupied = least.reshape(height, width), hit.reshape(height, width)
+    octants = measured_octants(field.tsdf)
+    points = _cells_with_points(octants, field.voxel, plane, resolution, (low, high), occupied.shape)
+    lone = octants[_thin_octants(octants, field)]
+    points &= through.reshape(height, width) | _cells_with_points(
+        lone, field.voxel, plane, resolution, (low, high), occupied.shape
+    )
+    # Where what is behind one side of a thing meets space seen free from another, the field has a surface that nobody
+    # saw.
+    doubtful = occupied & (cv2.dilate(points.astype(np.uint8), _BESIDE) == 0) & points.any()
+    occupied, behind = (occupied & ~doubtful) | points, (distance < 0) | doubtful
     top_right = (plane.low[0] + width * resolution, plane.low[1] + height * resolution)
     whole = SlicePlane(plane.origin, plane.x_axis, plane.y_axis, plane.low, top_right)
-    return FieldSlice(whole, resolution, distance, known, occupied)
+    return FieldSlice(whole, resolution, distance, ~np.isnan(distance), occupied, behind)
+
+
+def _thin_octants(octants: np.ndarray, field: DistanceField) -> np.ndarray:
+    """Which octants [N, 3] lie in voxels that are surface for their points alone, bool [N]."""
+    points, normals = field.surface()
+    voxels = [np.floor(p / field.voxel).astype(np.int64) for p in (points[~normals.any(1)].astype(float), octants)]
+    thin, own = ((v[:, 0] << 42) + (v[:, 1] << 21) + v[:, 2] for v in voxels)
+    return np.isin(own, thin)
+
+
+def _cells_with_points(
+    octants: np.ndarray, voxel: float, plane: SlicePlane, resolution: float, band: tuple[float, float],
+    shape: tuple[int, int],
+) -> np.ndarray:  # fmt: skip
+    """Cells that octants [N, 3] overlap at the heights of a band, bool [H, W]."""
+    axes = np.stack([plane.x_axis, plane.y_axis, plane.normal])
+    reach = 0.25 * voxel * np.abs(axes).sum(1)
+    points = (octants - plane.origin) @ axes.T
+    points = points[(points[:, 2] >= band[0] - reach[2]) & (points[:, 2] <= band[1] + reach[2])]
+    first, last = (
+        np.floor((points[:, :2] + side * reach[:2] - plane.low) / resolution).astype(int) for side in (-1, 1)
+    )
+    marked = np.zeros(shape, bool)
+    steps = (last - first).max(axis=0, initial=0)
+    for step in np.ndindex(*(steps + 1)):
+        column, from_bottom = np.minimum(first + step, last).T
+        inside = (column >= 0) & (column < shape[1]) & (from_bottom >= 0) & (from_bottom < shape[0])
+        marked[shape[0] - 1 - from_bottom[inside], column[inside]] = True
+    return marked
 
 
 def slice_picture(cut: FieldSlice, full_scale: float, smallest_side: int = 480) -> np.ndarray:
@@ -161,7 +217,7 @@ def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
 
 def ros_map(cut: FieldSlice) -> np.ndarray:
     """A slice as a ROS map: uint8 [H, W], 0 occupied, 254 free, 205 unknown."""
-    return np.where(cut.occupied, OCCUPIED, np.where(cut.known, FREE, UNKNOWN)).astype(np.uint8)
+    return np.where(cut.occupied, OCCUPIED, np.where(cut.free, FREE, UNKNOWN)).astype(np.uint8)
 
 
 def write_ros_map(cut: FieldSlice, path: str | Path) -> tuple[Path, Path]:

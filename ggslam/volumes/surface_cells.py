@@ -35,8 +35,10 @@ class SurfaceCells:
 _latest: WeakKeyDictionary[TsdfMap, SurfaceCells] = WeakKeyDictionary()
 
 
-def surface_cells(tsdf: TsdfMap, min_weight: float) -> SurfaceCells:
-    """Found again only where the map or the weight is another than at the last call."""
+def surface_cells(tsdf: TsdfMap, min_weight: float | None = None) -> SurfaceCells:
+    """Found again only where the map or the weight is another than at the last call. Without a weight it is that of the
+    map's settings."""
+    min_weight = tsdf.settings.least_weight if min_weight is None else min_weight
     cells = _latest.get(tsdf)
     if cells is None or cells.revision != tsdf.revision or cells.min_weight != min_weight:
         cells = _latest[tsdf] = SurfaceCells(tsdf, min_weight)

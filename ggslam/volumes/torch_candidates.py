@@ -21,23 +21,25 @@ _CHUNK = 1 << 22
 @dataclass(frozen=True)
 class DeviceView:
     """A view on the device: depth float32 [H, W] with 0 for none, camera, rotation [3, 3] and translation [3] of
-    T_camera_world (float64)."""
+    T_camera_world (float64), and the range: depth beyond it is no surface's, but what lies before it is free."""
 
     depth: Tensor
     camera: Camera
     rotation: Tensor
     translation: Tensor
+    max_depth: float
 
 
 @dataclass(frozen=True)
 class BlockCandidates:
     """Blocks in view: coordinates int64 [n, 3], z [n] of their centres, and what is seen of each: a surface within the
-    truncation, or free space throughout."""
+    truncation, or free space throughout; or whether the range ends in it."""
 
     coordinates: Tensor
     z: Tensor
     surface: Tensor
     free: Tensor
+    passed: Tensor
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,9 @@ def find_candidates(view: DeviceView, block: float, truncation: float, free_shar
     device = view.depth.device
     if not bool((view.depth > 0).any()):
         none = torch.zeros(0, device=device)
-        return BlockCandidates(none.long().reshape(0, 3), none, none.bool(), none.bool())
+        return BlockCandidates(none.long().reshape(0, 3), none, *[none.bool()] * 3)
     tiles = _tiles(view.depth)
-    at = _frustum_blocks(view, block, float(view.depth.max()) + truncation)
+    at = _frustum_blocks(view, block, min(float(view.depth.max()), view.max_depth) + truncation)
     centre = ((at.double() + 0.5) * block) @ view.rotation.T + view.translation
     extent = 0.5 * block * view.rotation.abs().sum(1)
     area, whole, visible = _footprints(view.camera, centre.float(), extent.float())
@@ -69,15 +71,17 @@ def find_candidates(view: DeviceView, block: float, truncation: float, free_shar
     some = (high > 0) & (high >= near - truncation)
     at, centre, area, whole, low, near, far = (a[some] for a in (at, centre, area, whole, low, near, far))
     behind = low > far + truncation
-    surface, hidden = torch.zeros_like(behind), torch.zeros_like(behind)
+    surface, hidden, passed = (torch.zeros_like(behind) for _ in range(3))
     unsure = torch.nonzero(~behind)[:, 0]
     position = -view.rotation.T @ view.translation
     offset = ((at[unsure].double() + 0.5) * block - position).float()
     seen = _look(view, tiles, area[unsure], offset, near[unsure], far[unsure], 0.5 * block, truncation)
-    behind[unsure], hidden[unsure], surface[unsure] = seen
-    keep = behind | surface
-    free = behind & ~hidden & ~surface & whole & (_valid_share(tiles, area, view.camera) >= free_share)
-    return BlockCandidates(at[keep], centre[keep, 2], surface[keep], free[keep])
+    behind[unsure], hidden[unsure], surface[unsure], passed[unsure] = seen
+    keep = behind | surface | passed
+    passed = ~surface & (passed | (far > view.max_depth))
+    whole &= _valid_share(tiles, area, view.camera) >= free_share
+    free = behind & ~hidden & ~surface & ~passed & whole
+    return BlockCandidates(at[keep], centre[keep, 2], surface[keep], free[keep], passed[keep])
 
 
 def _tiles(depth: Tensor) -> _Tiles:
@@ -148,10 +152,11 @@ def _range_over(tiles: _Tiles, area: Tensor) -> tuple[Tensor, Tensor]:
 def _look(
     view: DeviceView, tiles: _Tiles, area: Tensor, offset: Tensor, near: Tensor, far: Tensor, half: float,
     truncation: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Whether depth lies behind, in front of, and at blocks, tile by tile of their footprints; bool [n] each."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Whether depth lies behind, in front of, and at blocks, and whether depth beyond the range lies at them, tile by
+    tile of their footprints; bool [n] each."""
     n, device = len(area), area.device
-    found = torch.zeros(3, n, dtype=torch.bool, device=device)
+    found = torch.zeros(4, n, dtype=torch.bool, device=device)
     columns = area[:, 2] - area[:, 0] + 1
     counts = columns * (area[:, 3] - area[:, 1] + 1)
     ends = counts.cumsum(0)
@@ -168,13 +173,18 @@ def _look(
         met &= most > 0
         behind, front = met & (least > high), met & (most < low)
         at = met & ~behind & ~front
+        beyond, passed = at & (most > view.max_depth), torch.zeros_like(at)
         # Depth in front and behind: nothing may lie between.
-        split = torch.nonzero(at & (least < low) & (most > high))[:, 0]
-        between = _pixels_between(view.depth, u[split], v[split], low[split], high[split])
+        split = torch.nonzero(at & ~beyond & (least < low) & (most > high))[:, 0]
+        z = _pixels(view.depth, u[split], v[split])
+        between = ((z >= low[split, None]) & (z <= high[split, None])).any(1)
         at[split], behind[split], front[split] = between, ~between, ~between
-        for kind, flags in zip(found, (behind, front, at), strict=True):
-            kind[b[flags]] = True
-    return found[0], found[1], found[2]
+        split = torch.nonzero(beyond)[:, 0]
+        flags = _look_beyond(_pixels(view.depth, u[split], v[split]), low[split], high[split], view.max_depth)
+        behind[split], front[split], at[split], passed[split] = flags
+        for kind, met in zip(found, (behind, front, at, passed), strict=True):
+            kind[b[met]] = True
+    return found[0], found[1], found[2], found[3]
 
 
 def _intersect_rays(
@@ -199,13 +209,20 @@ def _intersect_rays(
     return met & (z0 <= z1), z0, z1
 
 
-def _pixels_between(depth: Tensor, u: Tensor, v: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Whether tiles have a pixel of depth in [low, high]."""
+def _look_beyond(z: Tensor, low: Tensor, high: Tensor, max_depth: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What `_look` tells of tiles with depth beyond the range, pixel by pixel z [n, 16]."""
+    behind, front = z > high[:, None], (z > 0) & (z < low[:, None])
+    at = (z > 0) & ~behind & ~front
+    passed = at & (z > max_depth)
+    return behind.any(1), front.any(1), (at & ~passed).any(1), passed.any(1)
+
+
+def _pixels(depth: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Depth of tiles [n, 16]; beyond the border that of the last pixel."""
     step = torch.arange(TILE, device=depth.device)
     rows = (v[:, None] * TILE + step).clamp(max=depth.shape[0] - 1)
     columns = (u[:, None] * TILE + step).clamp(max=depth.shape[1] - 1)
-    z = depth[rows[:, :, None], columns[:, None, :]].flatten(1)
-    return ((z >= low[:, None]) & (z <= high[:, None])).any(1)
+    return depth[rows[:, :, None], columns[:, None, :]].flatten(1)
 
 
 def _valid_share(tiles: _Tiles, area: Tensor, camera: Camera) -> Tensor:

@@ -32,7 +32,10 @@ LEAST_WEIGHT = 65
 """Decay forgets voxels of less than this."""
 MOST_VOXELS = 1e9
 """Voxels farther than this from the origin could not be numbered."""
-_DTYPES = {"value": np.int16, "weight": np.uint16, "label": np.uint16, "color": np.uint8, "votes": np.uint8}
+_DTYPES = {"value": np.int16, "weight": np.uint16, "label": np.uint16, "color": np.uint8, "votes": np.uint8,
+           "hits": np.uint8, "octants": np.uint8}  # fmt: skip
+OCCUPIED_HITS = 128
+"""Voxels of so much evidence have measured points in them."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,9 @@ class BlockVoxels:
         color: uint8 [B, 512, 3].
         label: uint16 [B, 512], the object; 0: none.
         votes: uint8 [B, 512], for the label, less those against it.
+        hits: uint8 [B, 512], evidence of measured points in the voxel: log-odds in steps of 1 / 23.6 above 128, of hits
+            and misses that count as those of `OccupancySettings.with_raised_odds`; 0: none.
+        octants: uint8 [B, 512], where in the voxel they lie: octant (x, y, z) is bit x + 2 y + 4 z.
     """
 
     value: np.ndarray
@@ -71,6 +77,8 @@ class BlockVoxels:
     color: np.ndarray
     label: np.ndarray
     votes: np.ndarray
+    hits: np.ndarray
+    octants: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -167,11 +175,13 @@ class TsdfMap:
         and averaged with sdf = clamp(depth - z, -truncation, truncation), of weight 1 / z^2 that drops linearly from
         one voxel to the truncation behind the surface (B. Curless and M. Levoy, "A volumetric method for building
         complex models from range images", 1996; weights as in H. Oleynikova et al., "Voxblox", 2017). What lies farther
-        behind the surface, and what has no depth, stays as it is. Voxels within the truncation take the pixel's colour;
-        those within two voxels of the surface vote for its label (R. Boyer and J. Moore's majority vote).
+        behind the surface, and what has no depth, stays as it is. Depth beyond the range is no surface's, but frees
+        what lies before it, up to the range. Voxels within the truncation take the pixel's colour; those within two
+        voxels of the surface vote for its label (R. Boyer and J. Moore's majority vote).
 
         Args:
-            depth: float32 [H, W], metres along the optical axis; 0, NaN, infinite or out of range: none.
+            depth: float32 [H, W], metres along the optical axis; 0, negative, NaN or nearer than the range: none. +inf:
+                the sensor found nothing (REP 117), so all is free up to the range.
             camera: of the images.
             T_world_camera: [4, 4] pose.
             color: uint8 [H, W, 3].
@@ -179,13 +189,16 @@ class TsdfMap:
             within: least and greatest coordinates [3] of blocks; others stay as they are. None: all.
 
         Raises:
-            VoxelError: the view shows too many blocks for voxels of this size.
+            VoxelError: the view shows too many blocks for voxels of this size. Where these are free space before depth
+                beyond the range, that depth is left out instead.
             InputError: an image of another size or kind than the camera's, a pose that is not finite and rigid, or
                 depth that cannot be in metres.
         """
         limit = MOST_VOXELS * self.settings.voxel
         view = FusionView(depth, camera, self._relative_pose(T_world_camera), color, labels, limit)
         s, stats = self.settings, FusionStats()
+        if within is None and _has_beyond(view.depth, s.max_depth) and (unit := wrong_unit(view.depth)):
+            raise InputError(unit)
         numbers = FusionSettings(
             s.min_depth, s.max_depth, s.free_share, s.edge_voxels * s.voxel, s.clearing, s.max_free_weight
         )
@@ -198,10 +211,10 @@ class TsdfMap:
                 ctypes.byref(stats),
             )  # fmt: skip
         except CoreInputError as error:
+            if "blocks" in str(error) and (view.depth > s.max_depth).any():
+                near = np.where(view.depth <= s.max_depth, view.depth, np.float32(0))
+                return self.integrate(near, camera, T_world_camera, color, labels, within)
             raise self._too_small(error, view.depth, camera, T_world_camera) from None
-        # Looked at only where nothing came of the view.
-        if not stats.blocks and within is None and (unit := wrong_unit(view.depth)):
-            raise InputError(unit)
         return IntegrationStats(*(getattr(stats, field.name) for field in fields(IntegrationStats)))
 
     def _relative_pose(self, T_world_camera: np.ndarray) -> np.ndarray:
@@ -278,7 +291,8 @@ class TsdfMap:
 
         Args:
             coordinates: of the blocks.
-            voxels: `value`, `weight`, `color`, `label`, `votes` as in `BlockVoxels`; what is not given stays.
+            voxels: `value`, `weight`, `color`, `label`, `votes`, `hits`, `octants` as in `BlockVoxels`; what is not
+                given stays.
 
         Raises:
             InputError: an array of another name or shape.
@@ -314,6 +328,11 @@ class TsdfMap:
     def freeze(self, frozen: bool = True) -> None:
         """From now on decay leaves all blocks that are there alone (or no longer)."""
         self._library.ggslam_tsdf_freeze(self.handle, int(frozen))
+
+
+def _has_beyond(depth: np.ndarray, max_depth: float) -> bool:
+    """Whether some of every eighth pixel and row lie beyond the range."""
+    return bool((depth[::8, ::8] > max_depth).any())
 
 
 def _coordinates(values: np.ndarray) -> np.ndarray:

@@ -16,14 +16,16 @@ from ggslam.system.atomic import write_bytes
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import VOXELS, TsdfMap
 
-_VERSION = 1
+_VERSION = 2
 _ORIGIN = "origin"
 """Where in the world blocks are counted from, float64 [3]; there if it is not zero."""
 _CONTENT = "a TSDF"
 _VOXEL_ARRAYS = {
     "value": (np.int16, ()), "weight": (np.uint16, ()), "color": (np.uint8, (3,)), "label": (np.uint16, ()),
-    "votes": (np.uint8, ()),
+    "votes": (np.uint8, ()), "hits": (np.uint8, ()), "octants": (np.uint8, ()),
 }  # fmt: skip
+_SINCE_2 = ("hits", "octants")
+"""Arrays that files of version 1 lack: no points are known."""
 
 
 def save_tsdf(path: str | Path, tsdf: TsdfMap) -> None:
@@ -77,6 +79,8 @@ def tsdf_of_arrays(arrays: dict[str, np.ndarray], path: str | Path, context: Nat
     settings = _settings(path, arrays)
     dense = _check(path, arrays, "dense", np.int32, (-1, 3))
     free = _check(path, arrays, "free", np.int32, (-1, 3))
+    if int(arrays["version"]) == 1:
+        arrays = {**arrays, **{name: np.zeros((len(dense), VOXELS), np.uint8) for name in _SINCE_2}}
     voxels = {
         name: _check(path, arrays, name, dtype, (len(dense), VOXELS, *tail))
         for name, (dtype, tail) in _VOXEL_ARRAYS.items()
@@ -110,7 +114,7 @@ def join_blocks(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 def _settings(path: str | Path, arrays: dict[str, np.ndarray]) -> TsdfSettings:
     try:
-        if int(arrays["version"]) != _VERSION:
+        if int(arrays["version"]) not in (1, _VERSION):
             raise FormatError(f"{path}: TSDF of version {int(arrays['version'])}, expected {_VERSION}")
         values = dict(zip(arrays["setting_names"].tolist(), arrays["setting_values"].tolist(), strict=True))
         known = {field.name for field in dataclasses.fields(TsdfSettings)}

@@ -16,12 +16,14 @@ from ggslam.scene.origin import local_origin, moved_pose
 from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.torch_candidates import NEAR, BlockCandidates, DeviceView, find_candidates
-from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, SIDE, VOXELS, TsdfMap
+from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, OCCUPIED_HITS, SIDE, VOXELS, TsdfMap
 
 _SURPRISE = 0.5
 _FREE_FROM = 0.98 * FREE_VALUE
 _EROSION = 2
+_RANGE_SLACK = 1.00001
 _LABEL_VOXELS = 2.0
+_HIT, _MISS, _LEAST_HITS, _MOST_HITS = 41, 20, OCCUPIED_HITS - 47, OCCUPIED_HITS + 83
 _COLOR_SHARE = 0.125
 _OFFSET = 1 << 20
 """Block coordinates are below this in size, so that three of them make one number."""
@@ -29,14 +31,16 @@ _OFFSET = 1 << 20
 
 @dataclass
 class Voxels:
-    """Voxels of blocks as in `tsdf.BlockVoxels`, [n, 512] (color [n, 512, 3]), as int32 (value, weight, label), uint8
-    (color) and int32 (votes)."""
+    """Voxels of blocks as in `tsdf.BlockVoxels`, [n, 512] (color [n, 512, 3]), as int32 (value, weight, label, votes,
+    hits, octants) and uint8 (color)."""
 
     value: Tensor
     weight: Tensor
     color: Tensor
     label: Tensor
     votes: Tensor
+    hits: Tensor
+    octants: Tensor
 
     @staticmethod
     def free(weight: Tensor) -> Voxels:
@@ -44,7 +48,9 @@ class Voxels:
         value = torch.full((len(weight), VOXELS), FREE_VALUE, dtype=torch.int32, device=weight.device)
         nothing = torch.zeros_like(value)
         color = torch.zeros((*value.shape, 3), dtype=torch.uint8, device=weight.device)
-        return Voxels(value, weight[:, None].expand_as(value).int().clone(), color, nothing, nothing.clone())
+        weights = weight[:, None].expand_as(value).int().clone()
+        hits = torch.where(weights > 0, _LEAST_HITS, 0).int()
+        return Voxels(value, weights, color, nothing, nothing.clone(), hits, nothing.clone())
 
     def __getitem__(self, rows: Tensor) -> Voxels:
         return Voxels(*(a[rows] for a in vars(self).values()))
@@ -106,16 +112,17 @@ class TorchTsdf:
         checked = FusionView(depth, camera, pose, color, labels, limit)
         T = torch.from_numpy(checked.T_camera_world).to(self.device)
         depth_image = torch.tensor(checked.depth).to(self.device)
-        in_range = (depth_image >= s.min_depth) & (depth_image <= s.max_depth)
-        view = DeviceView(torch.where(in_range, depth_image, 0), camera, T[:3, :3], T[:3, 3])
+        told = torch.where(depth_image >= s.min_depth, depth_image.clamp(max=s.max_depth + 2 * s.truncation), 0)
+        view = DeviceView(told, camera, T[:3, :3], T[:3, 3], s.max_depth)
         found = find_candidates(view, SIDE * s.voxel, s.truncation, s.free_share)
         keys = _keys(found.coordinates)
         dense_row, free_row = _rows(self._dense, keys), _rows(self._free, keys)
         self._note_free(found, keys, dense_row, free_row)
 
         old = dense_row >= 0
-        # A block that is not known yet gets voxels also if parts of it alone are seen as free.
-        new = ~old & (found.surface | (~found.free & (free_row < 0)))
+        # A block that is not known yet gets voxels also if parts of it alone are seen as free, except where the range
+        # ends.
+        new = ~old & (found.surface | (~found.free & ~found.passed & (free_row < 0)))
         weight = torch.zeros_like(keys)
         known = free_row >= 0
         weight[known] = self._free_weight[free_row[known]]
@@ -124,7 +131,8 @@ class TorchTsdf:
         label_image = None if checked.labels is None else torch.from_numpy(checked.labels.astype(np.int32))
         at = torch.cat([found.coordinates[old], found.coordinates[new]])
         in_band = _fuse(voxels, at, view, s, color_image, None if label_image is None else label_image.to(self.device))
-        told = torch.where(free_row[new] < 0, (voxels.weight > 0).any(1)[int(old.sum()) :], in_band[int(old.sum()) :])
+        seen = ((voxels.weight > 0) | (voxels.hits >= OCCUPIED_HITS)).any(1)
+        told = torch.where(free_row[new] < 0, seen[int(old.sum()) :], in_band[int(old.sum()) :])
         self._keep(voxels, dense_row[old], keys[new], told)
 
     def _note_free(self, found: BlockCandidates, keys: Tensor, dense_row: Tensor, free_row: Tensor) -> None:
@@ -145,7 +153,8 @@ class TorchTsdf:
         """Takes over updated blocks: those at `rows`, then of the new ones those that the view told something about.
         Blocks free throughout give their voxels back."""
         n = len(rows)
-        all_free = ((voxels.value == FREE_VALUE) & (voxels.weight > 0)).all(1)
+        empty = voxels.hits < OCCUPIED_HITS
+        all_free = ((voxels.value == FREE_VALUE) & (voxels.weight > 0) & empty).all(1)
         self._voxels.put(rows, voxels[torch.arange(n, device=self.device)])
         freed, freed_new = rows[all_free[:n]], new_keys[all_free[n:]]
         least = voxels.weight.amin(1).long()[all_free]
@@ -200,8 +209,12 @@ def _fuse(
     scale = FULL_WEIGHT / s.max_weight
     drop = ((distance + s.truncation) / (s.truncation - s.voxel)).clamp(max=1)
     measured = _round(scale / z**2 * drop).clamp(max=FULL_WEIGHT)
-    valid = (distance >= -s.truncation) & (measured >= 1)
     value, weight = voxels.value.float(), voxels.weight.float()
+    # Depth beyond the range makes known what is free up to the range. What a surface in range left nearer to it, or
+    # behind the range, goes with that surface.
+    in_range = distance + z <= _RANGE_SLACK * s.max_depth
+    told = (weight > 0) | in_range | ((distance >= s.truncation) & (z <= s.max_depth))
+    valid = told & (distance >= -s.truncation) & (measured >= 1)
     behind = valid & (distance >= s.truncation)
     scaled = FREE_VALUE / s.truncation * distance
     if s.clearing > 0:
@@ -225,7 +238,33 @@ def _fuse(
         voxels.color = torch.where(band[..., None], (after + 0.5).to(torch.uint8), voxels.color)
     if labels is not None:
         _vote(voxels, band & (distance.abs() <= _LABEL_VOXELS * s.voxel), labels.flatten()[pixel])
-    return band.any(1)
+    octants = _octants(at, view, s)
+    _count_points(voxels, octants, distance >= s.voxel)
+    return (band | (octants > 0)).any(1)
+
+
+def _octants(at: Tensor, view: DeviceView, s: TsdfSettings) -> Tensor:
+    """Octants of the voxels of blocks at coordinates [n, 3] that the view has points in, bits, int32 [n, 512]."""
+    c, device = view.camera, at.device
+    v, u = torch.nonzero((view.depth > 0) & (view.depth <= view.max_depth), as_tuple=True)
+    z = view.depth[v, u].double()
+    points = torch.stack([(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z], 1) - view.translation
+    octant = ((points @ view.rotation) * (2 / s.voxel)).floor().long()
+    row = _rows(_keys(at), _keys(octant >> 4))
+    within, bit = octant >> 1 & 7, octant & 1
+    place = (row * VOXELS + within[:, 0] + SIDE * within[:, 1] + SIDE**2 * within[:, 2]) * 8
+    marks = torch.zeros(len(at) * VOXELS * 8, dtype=torch.int32, device=device)
+    marks[(place + bit[:, 0] + 2 * bit[:, 1] + 4 * bit[:, 2])[row >= 0]] = 1
+    return (marks.view(len(at), VOXELS, 8) << torch.arange(8, device=device, dtype=torch.int32)).sum(2).int()
+
+
+def _count_points(voxels: Voxels, octants: Tensor, missed: Tensor) -> None:
+    before = voxels.hits
+    start = torch.where(before > 0, before, OCCUPIED_HITS)
+    down = torch.where(missed, (start - _MISS).clamp(min=_LEAST_HITS), before)
+    voxels.hits = torch.where(octants > 0, (start + _HIT).clamp(max=_MOST_HITS), down).int()
+    kept = (octants > 0) | (voxels.hits >= OCCUPIED_HITS)
+    voxels.octants = torch.where(kept, voxels.octants | octants, 0)
 
 
 def _round(values: Tensor) -> Tensor:
@@ -246,11 +285,14 @@ def _distances(at: Tensor, view: DeviceView, s: TsdfSettings) -> tuple[Tensor, T
     pixel = torch.where(inside, (v + 0.5).long() * c.width + (u + 0.5).long(), 0)
     nearest = view.depth.flatten()[pixel]
     depth = _interpolate(view, inside, u, v, nearest, s)
-    return torch.where(inside & (nearest > 0), depth - z, -torch.inf), safe, pixel
+    # Depth beyond the range is no surface's: it tells of what lies before it alone.
+    told = (nearest > 0) & ((nearest <= s.max_depth) | (nearest >= z))
+    return torch.where(inside & told, depth - z, -torch.inf), safe, pixel
 
 
 def _interpolate(view: DeviceView, inside: Tensor, u: Tensor, v: Tensor, nearest: Tensor, s: TsdfSettings) -> Tensor:
-    """Depth between the four pixels around (u, v), where they are all there and differ little; else the nearest."""
+    """Depth between the four pixels around (u, v), where they are all there, in range, and differ little; else the
+    nearest."""
     height, width = view.depth.shape
     inside = inside & (u >= 0) & (u < width - 1) & (v >= 0) & (v < height - 1)
     u0, v0 = torch.where(inside, u, 0).long(), torch.where(inside, v, 0).long()
@@ -258,7 +300,8 @@ def _interpolate(view: DeviceView, inside: Tensor, u: Tensor, v: Tensor, nearest
     flat, at = view.depth.flatten(), v0 * width + u0
     a, b, c, d = flat[at], flat[at + right], flat[at + below], flat[at + below + right]
     low, high = a.minimum(b).minimum(c.minimum(d)), a.maximum(b).maximum(c.maximum(d))
-    smooth = inside & (low > 0) & (high - low <= (0.02 * low).clamp(min=s.edge_voxels * s.voxel))
+    smooth = inside & (low > 0) & (high <= s.max_depth)
+    smooth &= high - low <= (0.02 * low).clamp(min=s.edge_voxels * s.voxel)
     x, y = u - u0, v - v0
     top, bottom = a + x * (b - a), c + x * (d - c)
     return torch.where(smooth, top + y * (bottom - top), nearest)

@@ -18,6 +18,9 @@ class VolumeSettings:
     tsdf: TsdfSettings = field(default_factory=TsdfSettings)
     esdf: FieldSettings = field(default_factory=FieldSettings)
     occupancy: OccupancySettings = field(default_factory=OccupancySettings.with_raised_odds)
+    min_weight: float = setting(0.0, 0, 1000)
+    """Least weight of voxels that the mesh is made of, in measurements from 1 m; 0: automatic, half a measurement from
+    the farthest depth that is fused."""
     esdf_every: int = setting(0, 0, 10**6, "frames")
     """The distance field is updated with every n-th frame; 0: with every one when volumes are made live or their
     latency is to be reported, else once at the end."""

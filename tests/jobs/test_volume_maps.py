@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -152,3 +153,29 @@ def test_fusing_on_a_device_gives_the_same_volumes(frames: list[Frame]) -> None:
     assert torch_on_cpu.field is not None and len(torch_on_cpu.field) == len(found)
     with pytest.raises(ConfigError, match="device"):
         VolumeMaps(SETTINGS, device="nonsense")
+
+
+def test_what_the_sensor_no_longer_finds_goes(frames: list[Frame]) -> None:
+    """A frame that says "nothing within range" everywhere, after one that saw a room: nothing is left in range."""
+    maps = VolumeMaps(SETTINGS, esdf=True, occupancy=0.06)
+    seen, T = frames[0], np.eye(4)
+    for _ in range(5):
+        maps.add(seen, T)
+    assert len(maps.field.surface()[0]) > 100 and maps.occupancy.summary().occupied > 100
+    nothing = replace(seen, depth=np.zeros_like(seen.depth), no_return=np.ones(seen.depth.shape, bool))
+    missing = replace(nothing, no_return=None)
+    before = maps.occupancy.summary().occupied
+    for _ in range(20):
+        maps.add(missing, T)
+    assert maps.occupancy.summary().occupied == before
+    for _ in range(20):
+        maps.add(nothing, T)
+    points = maps.field.surface()[0]
+    column = points[:, 0] / points[:, 2] * seen.camera.fx + seen.camera.cx
+    row = points[:, 1] / points[:, 2] * seen.camera.fy + seen.camera.cy
+    margin = 0.1 * seen.camera.fx / np.maximum(points[:, 2], 0.1)  # of the view: voxels half in it
+    inner = (np.minimum(column, seen.camera.width - 1 - column) > margin) & (points[:, 2] > 0.3)
+    inner &= (np.minimum(row, seen.camera.height - 1 - row) > margin) & (points[:, 2] < 3.9)
+    assert not inner.any()
+    centres = maps.occupancy.occupied_centers()[0]
+    assert not (centres[:, 2] < 3.9).any()

@@ -34,7 +34,7 @@ def panel(distance: float, half_width: float, spacing: float = 0.02) -> np.ndarr
 @pytest.mark.parametrize("quantize", [True, False])
 @pytest.mark.parametrize("max_range", [None, 1.1])
 def test_log_odds_of_the_reference(name: str, quantize: bool, max_range: float | None) -> None:
-    occupancy = OccupancyMap(0.13, OccupancySettings(quantize=quantize), NativeContext(2, name))
+    occupancy = OccupancyMap(0.13, OccupancySettings(quantize=quantize, last_voxel=False), NativeContext(2, name))
     reference = ReferenceMap(0.13, quantize)
     for points, origin in random_scans():
         occupancy.insert(points, origin, max_range)
@@ -70,7 +70,7 @@ def test_threads_do_not_change_the_map(threads: int) -> None:
 def test_exactly_the_map_of_octomap(quantize: bool, max_range: float | None) -> None:
     pyoctomap = pytest.importorskip("pyoctomap")
     tree = pyoctomap.OcTree(0.05)
-    occupancy = OccupancyMap(0.05, OccupancySettings(quantize=quantize))
+    occupancy = OccupancyMap(0.05, OccupancySettings(quantize=quantize, last_voxel=False))
     for points, origin in random_scans(number=6, points=4000):
         occupancy.insert(points, origin, max_range)
         tree.insertPointCloud(

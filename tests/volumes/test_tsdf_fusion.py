@@ -191,7 +191,7 @@ def test_what_appears_in_free_space_is_taken_over() -> None:
 def test_holes_do_not_carve() -> None:
     tsdf = fused(wall(2.0), [FRONT])
     blocks, before = tsdf.blocks(), all_voxels(tsdf)
-    for bad in (0.0, -1.0, np.nan, np.inf, -np.inf, 0.01, 50.0):
+    for bad in (0.0, -1.0, np.nan, -np.inf, 0.01):
         stats = tsdf.integrate(np.full((120, 160), bad, np.float32), CAMERA, FRONT)
         assert stats.blocks == 0
     half = render_depth(wall(2.0), CAMERA, FRONT)
@@ -209,7 +209,7 @@ def test_bad_depth_does_not_touch_its_neighbours() -> None:
     holes = np.zeros(depth.shape, bool)
     holes[40:44, 60:66] = True
     bad = depth.copy()
-    bad[holes] = np.resize([np.nan, np.inf, -1.0, 0.0], holes.sum())
+    bad[holes] = np.resize([np.nan, -np.inf, -1.0, 0.0], holes.sum())
     clean = np.where(holes, 0, depth)
     a, b = TsdfMap(SETTINGS), TsdfMap(SETTINGS)
     a.integrate(bad, CAMERA, FRONT), b.integrate(clean, CAMERA, FRONT)

@@ -15,6 +15,8 @@ struct VoxelArrays {
   uint16_t* label;
   uint8_t* color;
   uint8_t* votes;
+  uint8_t* hits;
+  uint8_t* octants;
 };
 
 // Numbers of the fusion. Distances in metres.
@@ -85,7 +87,7 @@ struct InsertSettings {
   double max_range;
   float origin[3];
   float hit, miss, minimum, maximum;
-  std::int32_t quantize;
+  std::int32_t quantize, last_voxel;  // last_voxel: rays cut at the range free the voxel they end in, too
 };
 
 // What a scan saw.
@@ -93,11 +95,12 @@ struct InsertResult {
   std::uint64_t rays, free, occupied;  // rays walked; voxels of the scan, those both passed and hit counted as occupied
 };
 
-// A depth image [height, width]; depths outside [low, high] count as none.
+// A depth image [height, width]; depths outside [low, high] count as none, but +inf frees space up to `free` (0: it counts
+// as none, too).
 struct DepthImage {
   const float* depth;
   std::int32_t width, height;
-  float fx, fy, cx, cy, low, high;
+  float fx, fy, cx, cy, low, high, free;
   float T_world_camera[12];
 };
 

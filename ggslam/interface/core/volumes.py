@@ -20,7 +20,7 @@ from ctypes import (
 from typing import Any
 
 HEADER = "core/volumes.hpp"
-HEADER_SHA256 = "735ad5d952c896406b6cd0854d1702f2e9cc667d8573a8a89a149a17047acc0d"
+HEADER_SHA256 = "b2167029b78bb879d942033b0f220fd1df458e5ce63198db33e6340bdc5bc03e"
 
 
 class VoxelArrays(Structure):
@@ -28,6 +28,7 @@ class VoxelArrays(Structure):
 
     _fields_ = [
         ("value", c_void_p), ("weight", c_void_p), ("label", c_void_p), ("color", c_void_p), ("votes", c_void_p),
+        ("hits", c_void_p), ("octants", c_void_p),
     ]
 
 
@@ -99,7 +100,7 @@ class InsertSettings(Structure):
 
     _fields_ = [
         ("max_range", c_double), ("origin", c_float * 3), ("hit", c_float), ("miss", c_float), ("minimum", c_float),
-        ("maximum", c_float), ("quantize", c_int32),
+        ("maximum", c_float), ("quantize", c_int32), ("last_voxel", c_int32),
     ]
 
 
@@ -110,11 +111,12 @@ class InsertResult(Structure):
 
 
 class DepthImage(Structure):
-    """A depth image [height, width]; depths outside [low, high] count as none."""
+    """A depth image [height, width]; depths outside [low, high] count as none, but +inf frees space up to `free` (0:
+    it counts as none, too)."""
 
     _fields_ = [
         ("depth", c_void_p), ("width", c_int32), ("height", c_int32), ("fx", c_float), ("fy", c_float), ("cx", c_float),
-        ("cy", c_float), ("low", c_float), ("high", c_float), ("T_world_camera", c_float * 12),
+        ("cy", c_float), ("low", c_float), ("high", c_float), ("free", c_float), ("T_world_camera", c_float * 12),
     ]
 
 

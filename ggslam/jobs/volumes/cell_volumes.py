@@ -107,12 +107,14 @@ class BlocksTask:
         key, blocks: of the cell.
         tsdf: content of a TSDF's file.
         field: of the distance field; None: a mesh is wanted.
+        min_weight: of the mesh, see `VolumeSettings.min_weight`.
     """
 
     key: CellKey
     blocks: CellBlocks
     tsdf: bytes
     field: FieldSettings | None = None
+    min_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,8 @@ def look_at_frames(task: LookTask) -> np.ndarray:
     seen, s = np.zeros((len(task.views), len(task.low)), bool), task.settings
     for row, (visit, number, T_world_camera) in enumerate(task.views):
         frame = _recording(task.records[visit]).frame(number, masks=False)
-        depth = np.where((frame.depth >= s.min_depth) & (frame.depth <= s.max_depth), frame.depth, 0)
+        depth = frame.depth_or_infinity()
+        depth = np.where(depth >= s.min_depth, np.minimum(depth, s.max_depth), 0)
         if depth.any():
             reach = depth_reach(depth, *_TILES) + s.truncation
             frustums = Frustums.of(frame.camera, inverse(T_world_camera)[None], reach[None])
@@ -143,13 +146,14 @@ def fuse_cell(task: FuseTask) -> CellPart:
     tsdf = TsdfMap(task.settings, NativeContext(own_threads()))
     for visit, number, T_world_camera in task.views:
         frame = _recording(task.records[visit]).frame(number, masks=False)
-        tsdf.integrate(frame.depth, frame.camera, T_world_camera, frame.color, within=task.blocks.around(0))
+        depth, within = frame.depth_or_infinity(), task.blocks.around(0)
+        tsdf.integrate(depth, frame.camera, T_world_camera, frame.color, within=within)
     return CellPart(task.key, tsdf_to_bytes(tsdf), len(tsdf))
 
 
 def mesh_cell(task: BlocksTask) -> CellPart:
     """The triangles of a cell, small pieces among them."""
-    mesh = extract_mesh(_tsdf(task))
+    mesh = extract_mesh(_tsdf(task), task.min_weight or None)
     corners = mesh.vertices[mesh.triangles].astype(np.float64).mean(1)
     blocks = np.floor(np.floor(corners * (SIDE / task.blocks.edge) - 0.5) / SIDE).astype(int)
     own = mesh.part(task.blocks.own(blocks))

@@ -125,10 +125,12 @@ class _Fused:
         """Remembers where a frame was seen from, and how far it saw of what was fused."""
         self.poses.append(T_world_camera)
         self.timestamps.append(frame.timestamp)
-        limits, seen = self.maps.settings.tsdf, frame.depth[::8, ::8]
-        seen = seen[(seen >= limits.min_depth) & (seen <= limits.max_depth)]
-        if len(seen):
-            self.depth_ranges.append(float(np.percentile(seen, 95)))
+        limits = self.maps.settings.tsdf
+        for seen in (frame.depth[::8, ::8], frame.depth):  # all of it only where none is in range
+            seen = seen[(seen >= limits.min_depth) & (seen <= limits.max_depth)]
+            if len(seen):
+                self.depth_ranges.append(float(np.percentile(seen, 95)))
+                break
 
     def latency(self) -> float:
         """Seconds after which 95 % of the frames are in all maps, the wait for a distance field that is not updated
@@ -168,7 +170,7 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
         raise fused.error if fused.error is not None else SequenceError(f"{request.source}: no frame could be fused")
     with delay_interrupts():
         maps.finish()
-        if not len(maps.tsdf):
+        if not len(maps.tsdf) or (onto is None and not fused.depth_ranges):  # free space alone has no floor
             limits = maps.settings.tsdf
             raise SequenceError(
                 f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
@@ -289,7 +291,8 @@ def _level_occupancy(
     observer.begin("occupancy on the floor", count)
     bare = replace(source, label=None)
     for done, posed in enumerate(islice(bare, count)):
-        level.insert_depth(posed.frame.depth, posed.frame.camera, T_floor_map @ posed.T_world_camera)
+        T_floor_camera, depth = T_floor_map @ posed.T_world_camera, posed.frame.depth_or_infinity()
+        level.insert_depth(depth, posed.frame.camera, T_floor_camera, free_depth=maps.settings.tsdf.max_depth)
         observer.advance(done + 1, count)
     maps.occupancy = level
 

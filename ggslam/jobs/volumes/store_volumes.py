@@ -157,7 +157,7 @@ class _Work:
     def name(self, esdf: bool) -> str:
         """Made of all that the result depends on."""
         poses = [[visit, frame, T.tolist()] for visit, frame, T in self.poses]
-        wanted = [asdict(self.settings.tsdf), asdict(self.settings.esdf) if esdf else None]
+        wanted = [asdict(self.settings.tsdf), asdict(self.settings.esdf) if esdf else None, self.settings.min_weight]
         return hashlib.sha256(json.dumps([__version__, wanted, self.texts, poses]).encode()).hexdigest()
 
     def blocks(self, key: CellKey) -> CellBlocks:
@@ -310,7 +310,8 @@ class _Volumes:
             for other in sorted(there):
                 if other in filled and max(abs(a - b) for a, b in zip(key, other, strict=True)) <= steps:
                     parts.append(blocks_within(read(other), *blocks.around(around)))
-            yield BlocksTask(key, blocks, arrays_to_bytes(**join_blocks(parts)), settings)
+            held, least = arrays_to_bytes(**join_blocks(parts)), self.work.settings.min_weight
+            yield BlocksTask(key, blocks, held, settings, least)
 
 
 def _error(failure: Failure, text: str) -> GgslamError:

@@ -16,7 +16,14 @@ struct FieldBlock {
   std::vector<Site> sites;
   std::unique_ptr<FieldVoxels> voxels;
   uint64_t known[kSide] = {}, negative[kSide] = {};  // voxel (i, j, k): bit i + 8 j of word k
+  uint64_t crossed[kSide] = {};                      // voxels whose site is a zero crossing
   float required = 0;  // how far from its voxels sites were read last time at most, voxels; 0: never computed
+};
+
+// What the TSDF has in a block now: sites in the order of their voxels, and the bits of a FieldBlock.
+struct BlockSites {
+  std::vector<Site> sites;
+  uint64_t known[kSide], negative[kSide];
 };
 
 // A block to compute and how far around it sites are looked for.
@@ -42,6 +49,10 @@ class Esdf {
   std::vector<int32_t> find_sites(Context& context, FieldStats& stats);  // rows of blocks whose known voxels changed
   void erase_gone(FieldStats& stats, std::vector<BlockCoordinates>& touched);
   void gather(BlockCoordinates at, int16_t* values) const;
+  std::vector<int32_t> find_crossings(Context& context, const std::vector<int32_t>& rows,
+                                      std::vector<BlockSites>& found);
+  // esdf_thin.cpp
+  void add_thin(int32_t row, BlockSites& found) const;
   // esdf_update.cpp
   std::vector<Task> affected(Context& context, const std::vector<int32_t>& changed) const;
   float first_pad(int32_t row) const;

@@ -38,16 +38,26 @@ bool same_site(const Site& a, const Site& b) {
 }
 
 // How many came, went or moved. Both are in order of their voxels.
-int64_t count_changes(const std::vector<Site>& before, const Site* now, int count) {
+int64_t count_changes(const std::vector<Site>& before, const std::vector<Site>& now) {
   int64_t changed = 0;
   std::size_t b = 0;
-  for (int i = 0; i < count; ++i) {
-    for (; b < before.size() && before[b].voxel < now[i].voxel; ++b) ++changed;
-    const bool both = b < before.size() && before[b].voxel == now[i].voxel;
-    if (!both || !same_site(before[b], now[i])) ++changed;
+  for (const Site& site : now) {
+    for (; b < before.size() && before[b].voxel < site.voxel; ++b) ++changed;
+    const bool both = b < before.size() && before[b].voxel == site.voxel;
+    if (!both || !same_site(before[b], site)) ++changed;
     b += both;
   }
   return changed + static_cast<int64_t>(before.size() - b);
+}
+
+// Of a block that has not changed.
+BlockSites crossings_of(const FieldBlock& block) {
+  BlockSites out;
+  std::memcpy(out.known, block.known, sizeof out.known);
+  std::memcpy(out.negative, block.negative, sizeof out.negative);
+  for (const Site& site : block.sites)
+    if (block.crossed[site.voxel >> 6] >> (site.voxel & 63) & 1) out.sites.push_back(site);
+  return out;
 }
 
 }  // namespace
@@ -77,6 +87,32 @@ void Esdf::erase_gone(FieldStats& stats, std::vector<BlockCoordinates>& touched)
   }
 }
 
+// Zero crossings of blocks, and which of the blocks have others than before.
+std::vector<int32_t> Esdf::find_crossings(Context& context, const std::vector<int32_t>& rows,
+                                          std::vector<BlockSites>& found) {
+  found.resize(rows.size());
+  std::vector<uint8_t> differ(rows.size());
+  const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_crossings);
+  context.pool.parallel_for(rows.size(), 16, [&](std::size_t begin, std::size_t end, int) {
+    int16_t values[kHalo * kHalo * kHalo];
+    std::vector<Site> sites(kVoxels + 1);
+    for (std::size_t i = begin; i < end; ++i) {
+      gather(table_.at(rows[i]), values);
+      const int n = kernel(values, sites.data(), found[i].known, found[i].negative);
+      found[i].sites.assign(sites.begin(), sites.begin() + n);
+      uint64_t crossed[kSide] = {};
+      for (const Site& site : found[i].sites) crossed[site.voxel >> 6] |= uint64_t{1} << (site.voxel & 63);
+      FieldBlock& block = blocks_[rows[i]];
+      differ[i] = std::memcmp(crossed, block.crossed, sizeof crossed) != 0;
+      std::memcpy(block.crossed, crossed, sizeof crossed);
+    }
+  });
+  std::vector<int32_t> changed;
+  for (std::size_t i = 0; i < rows.size(); ++i)
+    if (differ[i]) changed.push_back(rows[i]);
+  return changed;
+}
+
 std::vector<int32_t> Esdf::find_sites(Context& context, FieldStats& stats) {
   site_changes_.clear();
   std::vector<BlockCoordinates> touched;
@@ -100,23 +136,25 @@ std::vector<int32_t> Esdf::find_sites(Context& context, FieldStats& stats) {
     list(at);
     for (const BlockCoordinates& face : kFaces) list(at + face);
   }
+  // What is thin in a block depends on the crossings in the blocks at its faces.
+  std::vector<BlockSites> found;
+  const std::size_t own = rows.size();
+  for (const int32_t row : find_crossings(context, rows, found))
+    for (const BlockCoordinates& face : kFaces) list(table_.at(row) + face);
+  for (std::size_t i = own; i < rows.size(); ++i) found.push_back(crossings_of(blocks_[rows[i]]));
   std::vector<int64_t> moved(rows.size());
   std::vector<uint8_t> seen_changed(rows.size());
-  const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_crossings);
   context.pool.parallel_for(rows.size(), 16, [&](std::size_t begin, std::size_t end, int) {
-    int16_t values[kHalo * kHalo * kHalo];
-    std::vector<Site> found(kVoxels + 1);
     for (std::size_t i = begin; i < end; ++i) {
       FieldBlock& block = blocks_[rows[i]];
-      uint64_t known[kSide], negative[kSide];
-      gather(table_.at(rows[i]), values);
-      const int n = kernel(values, found.data(), known, negative);
-      moved[i] = count_changes(block.sites, found.data(), n);
-      seen_changed[i] = block.voxels == nullptr || std::memcmp(known, block.known, sizeof known) != 0 ||
-                        std::memcmp(negative, block.negative, sizeof negative) != 0;
-      std::memcpy(block.known, known, sizeof known);
-      std::memcpy(block.negative, negative, sizeof negative);
-      if (moved[i] > 0) block.sites.assign(found.begin(), found.begin() + n);
+      BlockSites& now = found[i];
+      add_thin(rows[i], now);
+      moved[i] = count_changes(block.sites, now.sites);
+      seen_changed[i] = block.voxels == nullptr || std::memcmp(now.known, block.known, sizeof now.known) != 0 ||
+                        std::memcmp(now.negative, block.negative, sizeof now.negative) != 0;
+      std::memcpy(block.known, now.known, sizeof now.known);
+      std::memcpy(block.negative, now.negative, sizeof now.negative);
+      if (moved[i] > 0) block.sites = now.sites;
     }
   });
   std::vector<int32_t> changed;

@@ -37,12 +37,26 @@ std::size_t free_voxels(const Scan& scan) {
 }
 
 bool insert(Context& context, OccupancyMap& map, const float* points, std::size_t n, const InsertSettings& s,
-            InsertResult& result) {
-  ScanSettings settings{{s.origin[0], s.origin[1], s.origin[2]}, s.max_range, s.quantize != 0};
-  if (!map.scan.cast(context, map.tree.grid, settings, points, n)) return false;
+            InsertResult& result, const std::vector<float>& empty = {}) {
+  const ScanSettings settings{{s.origin[0], s.origin[1], s.origin[2]}, s.max_range, s.quantize != 0, s.last_voxel != 0};
+  if (!map.scan.cast(context, map.tree.grid, settings, points, n, empty)) return false;
   apply_scan(context, map.scan, {s.hit, s.miss, s.minimum, s.maximum}, map.tree);
   result = {map.scan.rays(), free_voxels(map.scan), map.scan.occupied().voxels()};
   return true;
+}
+
+// World points at depth `free` of the pixels that found nothing, [n, 3].
+std::vector<float> empty_points(const DepthImage& in) {
+  std::vector<float> points;
+  if (!(in.free > 0)) return points;
+  const float* T = in.T_world_camera;
+  for (int v = 0; v < in.height; ++v)
+    for (int u = 0; u < in.width; ++u) {
+      if (in.depth[static_cast<std::size_t>(v) * in.width + u] != std::numeric_limits<float>::infinity()) continue;
+      const float z = in.free, x = (u - in.cx) / in.fx * z, y = (v - in.cy) / in.fy * z;
+      for (int a = 0; a < 3; ++a) points.push_back(T[4 * a] * x + T[4 * a + 1] * y + T[4 * a + 2] * z + T[4 * a + 3]);
+    }
+  return points;
 }
 
 void check_scan(const float* points, std::uint64_t n, const InsertSettings* pointer, const InsertResult* result) {
@@ -97,7 +111,7 @@ GGSLAM_EXPORT int ggslam_occupancy_insert_depth(void* context_, void* map_, cons
       kernel(image->depth + v * width, image->width, image->fx, image->cx, (v - image->cy) / image->fy,
              image->T_world_camera, image->low, image->high, map.points.data() + 3 * v * width);
   });
-  return insert(context, map, map.points.data(), pixels, *settings, *result) ? 1 : 0;
+  return insert(context, map, map.points.data(), pixels, *settings, *result, empty_points(in)) ? 1 : 0;
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_occupancy_look_up(void* context, void* map, const float* points, std::uint64_t n,
@@ -154,7 +168,8 @@ GGSLAM_EXPORT std::int64_t ggslam_occupancy_scan_keys(void* context, void* map_,
                                                       const InsertSettings* s, InsertResult* result) try {
   OccupancyMap& map = map_of(map_);
   check_scan(points, n, s, result);
-  ScanSettings settings{{s->origin[0], s->origin[1], s->origin[2]}, s->max_range, s->quantize != 0};
+  ScanSettings settings{{s->origin[0], s->origin[1], s->origin[2]}, s->max_range, s->quantize != 0,
+                        s->last_voxel != 0};
   if (!map.scan.cast(object_of<Context>(context), map.tree.grid, settings, points, n)) return -1;
   *result = {map.scan.rays(), free_voxels(map.scan), map.scan.occupied().voxels()};
   map.output.resize((result->free + result->occupied) * 3 * sizeof(std::uint16_t));

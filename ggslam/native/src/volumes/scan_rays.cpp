@@ -100,15 +100,31 @@ void count_points(const std::vector<std::int64_t>& codes, const VoxelMasks& voxe
 }
 
 bool Scan::cast(Context& context, const KeyGrid& grid, const ScanSettings& settings, const float* points,
-                std::size_t n) {
-  Origin origin{Vec3f::from(settings.origin), {}, 0};
-  if (!key_of_point(grid, origin.point, origin.key)) return false;
-  origin.code = morton_code(origin.key);
+                std::size_t n, const std::vector<float>& empty) {
+  Vec3i key;
+  if (!key_of_point(grid, Vec3f::from(settings.origin), key)) return false;
   while (workers_.size() < static_cast<std::size_t>(context.pool.size())) {
     workers_.emplace_back(new Worker);
     workers_.back()->free.limit(kMostFreeBlocks);
   }
   for (auto& worker : workers_) worker->free.clear(), worker->occupied.clear(), worker->rays = worker->batch.count = 0;
+  cast_to(context, grid, settings, points, n, false);
+  if (!empty.empty()) cast_to(context, grid, settings, empty.data(), empty.size() / 3, true);
+  rays_ = workers_[0]->rays;
+  for (std::size_t w = 1; w < workers_.size(); ++w) {
+    workers_[0]->free.unite(workers_[w]->free);
+    workers_[0]->occupied.unite(workers_[w]->occupied);
+    rays_ += workers_[w]->rays;
+  }
+  return true;
+}
+
+// Rays to n points, at which there is something unless they are `empty`.
+void Scan::cast_to(Context& context, const KeyGrid& grid, const ScanSettings& settings, const float* points,
+                   std::size_t n, bool empty) {
+  Origin origin{Vec3f::from(settings.origin), {}, 0};
+  key_of_point(grid, origin.point, origin.key);
+  origin.code = morton_code(origin.key);
   if (settings.quantize) {
     quantize(context, grid, points, n, codes_, voxels_);
     list_centres(grid, voxels_, centres_);
@@ -128,10 +144,13 @@ bool Scan::cast(Context& context, const KeyGrid& grid, const ScanSettings& setti
       Vec3f cut;
       Vec3i key;
       if (!key_of_point(grid, point, key)) continue;
+      const Vec3i whole = key;
       const bool beyond = cut_at_range(origin, point, settings.max_range, cut);
       if (beyond && !key_of_point(grid, cut, key)) continue;
       const std::uint64_t code = morton_code(key);
-      if (!beyond) worker.occupied.insert(code);
+      if (!beyond && !empty) worker.occupied.insert(code);
+      // OctoMap leaves out the last voxel of a ray that is cut, so that what was there once stays for ever.
+      if (empty || (settings.last_voxel && beyond && !(key == whole))) worker.free.insert(code);
       if (code == origin.code) continue;
       ++worker.rays;
       prepare_ray(grid, origin, beyond ? cut : point, code, worker.batch);
@@ -139,13 +158,6 @@ bool Scan::cast(Context& context, const KeyGrid& grid, const ScanSettings& setti
     }
     flush(worker);
   });
-  rays_ = workers_[0]->rays;
-  for (std::size_t w = 1; w < workers_.size(); ++w) {
-    workers_[0]->free.unite(workers_[w]->free);
-    workers_[0]->occupied.unite(workers_[w]->occupied);
-    rays_ += workers_[w]->rays;
-  }
-  return true;
 }
 
 }  // namespace ggslam

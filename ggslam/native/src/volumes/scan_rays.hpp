@@ -27,13 +27,16 @@ struct ScanSettings {
   float origin[3];
   double max_range;  // metres; negative: none
   bool quantize;     // one ray per voxel, to its centre; otherwise one per point
+  bool last_voxel;   // rays cut at the range free the voxel that they end in, if they go on behind it
 };
 
 class Scan {
  public:
   // Looks at n points (float [n, 3], world); false if the origin is outside the grid. Points that are not finite or
-  // outside the grid are left out. Free voxels are not taken out of `free` where they are occupied as well.
-  bool cast(Context& context, const KeyGrid& grid, const ScanSettings& settings, const float* points, std::size_t n);
+  // outside the grid are left out. Free voxels are not taken out of `free` where they are occupied as well. Rays to
+  // `empty` points free all on their way, their end included.
+  bool cast(Context& context, const KeyGrid& grid, const ScanSettings& settings, const float* points, std::size_t n,
+            const std::vector<float>& empty = {});
   const VoxelMasks& free() const { return workers_[0]->free; }
   const VoxelMasks& occupied() const { return workers_[0]->occupied; }
   std::size_t rays() const { return rays_; }
@@ -44,6 +47,9 @@ class Scan {
     RayBatch batch;
     std::size_t rays = 0;
   };
+  void cast_to(Context& context, const KeyGrid& grid, const ScanSettings& settings, const float* points, std::size_t n,
+               bool empty);
+
   std::vector<std::unique_ptr<Worker>> workers_;
   std::size_t rays_ = 0;
   VoxelMasks voxels_;

@@ -39,6 +39,7 @@ VoxelBlock* Tsdf::densify(Block& block) {
   *v = VoxelBlock{};
   std::fill_n(v->value, kVoxels, kFreeValue);
   std::fill_n(v->weight, kVoxels, block.free_weight);
+  std::fill_n(v->hits, kVoxels, static_cast<uint8_t>(block.free_weight > 0 ? kLeastHits : kNeverSeen));
   return v;
 }
 

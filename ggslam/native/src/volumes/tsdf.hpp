@@ -23,7 +23,15 @@ struct alignas(64) VoxelBlock {
   uint16_t label[kVoxels];   // 0: none
   uint8_t red[kVoxels], green[kVoxels], blue[kVoxels];
   uint8_t votes[kVoxels];    // for `label`, less those against it
+  uint8_t hits[kVoxels];     // evidence of measured points in the voxel, see below
+  uint8_t octants[kVoxels];  // where in the voxel they lie: octant (x, y, z) is bit x + 2 y + 4 z
 };
+
+// A voxel's distance tells of surfaces that are larger than it; what is thin is averaged away. Points are counted beside
+// it, as OctoMap counts them: log-odds in steps, clamped, of hits (the view has a point in the voxel) and misses (it looks
+// past the voxel's centre by more than a voxel). These are those of OccupancySettings.with_raised_odds, 23.6 steps a unit.
+constexpr int kNeverSeen = 0, kOccupied = 128;  // occupied from this value on
+constexpr int kHit = 41, kMiss = 20, kLeastHits = kOccupied - 47, kMostHits = kOccupied + 83;
 
 // (i, j, k) of a row.
 static inline Vec3i voxel_of(int row) { return {{row % kSide, row / kSide % kSide, row / (kSide * kSide)}}; }

@@ -98,12 +98,16 @@ GGSLAM_EXPORT int ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at, c
     const VoxelBlock* v = row < 0 ? nullptr : map.voxels(map.block(row));
     if (v == nullptr) {
       std::fill_n(plain.weight, kVoxels, row < 0 ? uint16_t{0} : map.block(row).free_weight);
+      const bool known = row >= 0 && map.block(row).free_weight > 0;
+      std::fill_n(plain.hits, kVoxels, static_cast<uint8_t>(known ? ggslam::volumes::kLeastHits : 0));
       v = &plain;
     }
     copy_out(out->value, i, v->value);
     copy_out(out->weight, i, v->weight);
     copy_out(out->label, i, v->label);
     copy_out(out->votes, i, v->votes);
+    copy_out(out->hits, i, v->hits);
+    copy_out(out->octants, i, v->octants);
     if (out->color == nullptr) continue;
     uint8_t* color = out->color + 3 * i * kVoxels;
     for (int k = 0; k < kVoxels; ++k)
@@ -125,6 +129,8 @@ GGSLAM_EXPORT int ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at, 
     copy_in(v->weight, i, in->weight);
     copy_in(v->label, i, in->label);
     copy_in(v->votes, i, in->votes);
+    copy_in(v->hits, i, in->hits);
+    copy_in(v->octants, i, in->octants);
     if (in->color == nullptr) continue;
     const uint8_t* color = in->color + 3 * i * kVoxels;
     for (int k = 0; k < kVoxels; ++k)

@@ -12,8 +12,8 @@ namespace ggslam::volumes {
 namespace {
 
 // What a cube's footprint shows, bits: depth behind it, in front of it, at it (each by more or less than the
-// truncation). Once there is depth at it, the others are no longer looked for.
-enum : unsigned { kBehind = 1, kInFront = 2, kAt = 4 };
+// truncation), or depth at it that is beyond the range. Once there is depth at it, the others are no longer looked for.
+enum : unsigned { kBehind = 1, kInFront = 2, kAt = 4, kPassed = 8 };
 
 // The corners of what is in view must have coordinates.
 void check_extent(const Vec3d& low, const Vec3d& high, double block) {
@@ -41,7 +41,7 @@ CandidateSearch::CandidateSearch(const Tsdf& map, const FusionInput& input, cons
   }
   Vec3d low, high;
   const Mat3d axes = cast<double>(axes_);
-  const double far = images.farthest + map.truncation;
+  const double far = std::min(images.farthest, settings.max_depth) + map.truncation;
   const double right[2] = {(-0.5 - in_.cx) / in_.fx, (in_.width - 0.5 - in_.cx) / in_.fx};
   const double down[2] = {(-0.5 - in_.cy) / in_.fy, (in_.height - 0.5 - in_.cy) / in_.fy};
   for (int corner = -1; corner < 4; ++corner) {
@@ -80,11 +80,16 @@ void CandidateSearch::descend(BlockCoordinates at, int side, CandidateCount& cou
   for (int v = area.v0 >> level; v <= area.v1 >> level && !(seen & kAt); ++v)
     for (int u = area.u0 >> level; u <= area.u1 >> level && !(seen & kAt); ++u)
       seen |= look(level, u, v, area, cube);
-  if ((seen & (kAt | kBehind)) == 0) return;  // no depth, or hidden
-  const bool is_free = seen == kBehind && area.whole;
+  if ((seen & (kAt | kBehind | kPassed)) == 0) return;  // no depth, or hidden
+  const bool beyond = (seen & kPassed) != 0 || cube.far > settings_.max_depth;
+  const bool is_free = seen == kBehind && area.whole && !beyond;
   if (side == 1) {
     const bool enough = is_free && valid_share(area) >= settings_.free_share;
-    return emit(at, seen & kAt ? Sight::surface : enough ? Sight::free : Sight::partial, count, out);
+    const Sight sight = seen & kAt ? Sight::surface
+                        : enough   ? Sight::free
+                        : beyond   ? Sight::passed
+                                   : Sight::partial;
+    return emit(at, sight, count, out);
   }
   if (is_free && valid_share(area) == 1.0f) return emit_free(at, side, count, out);
   const int half = side / 2;
@@ -103,6 +108,7 @@ bool CandidateSearch::wanted(BlockCoordinates at, int side) const {
 void CandidateSearch::emit(BlockCoordinates at, Sight sight, CandidateCount& count, std::vector<Candidate>& out) const {
   if (!wanted(at, 1)) return;
   const auto row = static_cast<int32_t>(map_.find(at));
+  if (sight == Sight::passed && (row < 0 || map_.block(row).slot < 0)) return;  // nothing there to be freed
   count.add(1, sight == Sight::surface || (sight == Sight::partial && row < 0));
   out.push_back({at, sight, cube(at, 1).centre[2], row});
 }
@@ -181,6 +187,7 @@ unsigned CandidateSearch::look(int level, int u, int v, const Footprint& area, c
   if (tile.low > high) return kBehind;
   if (tile.high < low) return kInFront;
   if (level == 0) {
+    if (tile.high > settings_.max_depth) return look_beyond(u, v, low, high);
     if (tile.low >= low || tile.high <= high) return kAt;
     return look_at_pixels(u, v, low, high);
   }
@@ -201,6 +208,19 @@ unsigned CandidateSearch::look_at_pixels(int u, int v, float low, float high) co
       if (z >= low && z <= high) return kAt;
     }
   return kBehind | kInFront;
+}
+
+// The same for a tile with depth beyond the range.
+unsigned CandidateSearch::look_beyond(int u, int v, float low, float high) const {
+  const int u1 = std::min((u + 1) * kTile, in_.width), v1 = std::min((v + 1) * kTile, in_.height);
+  unsigned seen = 0;
+  for (int y = v * kTile; y < v1; ++y)
+    for (int x = u * kTile; x < u1; ++x) {
+      const float z = images_.depth[static_cast<std::size_t>(y) * in_.width + x];
+      if (z <= 0) continue;
+      seen |= z > high ? kBehind : z < low ? kInFront : z > settings_.max_depth ? kPassed : kAt;
+    }
+  return seen;
 }
 
 float CandidateSearch::valid_share(const Footprint& a) const {

@@ -10,11 +10,12 @@
 #include "volumes/tsdf_scratch.hpp"
 
 GGSLAM_DECLARE_KERNEL(void tsdf_prepare_depth(const float* depth, int width, int height, int row, float min_depth,
-                                              float max_depth, float* out, volumes::DepthTile* tiles, int32_t* valid))
+                                              float farthest, float* out, volumes::DepthTile* tiles, int32_t* valid))
 GGSLAM_DECLARE_KERNEL(void tsdf_erode_row(const float* depth, int width, int v, float* out))
 GGSLAM_DECLARE_KERNEL(void tsdf_erode_column(const float* rows, int width, int height, int v, float* out))
 GGSLAM_DECLARE_KERNEL(void tsdf_pack_color(const uint8_t* color, std::size_t begin, std::size_t end, int32_t* out))
 GGSLAM_DECLARE_KERNEL(unsigned tsdf_fuse_block(const volumes::VoxelUpdate& update, volumes::VoxelBlock& block))
+GGSLAM_DECLARE_KERNEL(void tsdf_octants_of_row(const volumes::OctantRow& row))
 GGSLAM_DECLARE_KERNEL(unsigned tsdf_decay_block(volumes::VoxelBlock& block, float factor, int least))
 
 namespace ggslam::volumes {
@@ -57,7 +58,8 @@ void erode(const FusionInput& in, Context& context, FusionImages& images) {
   });
 }
 
-void prepare(const FusionInput& in, const FusionSettings& settings, Context& context, FusionImages& images) {
+void prepare(const FusionInput& in, const FusionSettings& settings, float truncation, Context& context,
+             FusionImages& images) {
   const std::size_t pixels = static_cast<std::size_t>(in.width) * in.height;
   const int columns = (in.width + kTile - 1) / kTile, rows = (in.height + kTile - 1) / kTile;
   DepthPyramid& pyramid = images.pyramid;
@@ -75,8 +77,9 @@ void prepare(const FusionInput& in, const FusionSettings& settings, Context& con
   context.pool.parallel_for(rows, 8, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t row = begin; row < end; ++row) {
       const int first = static_cast<int>(row) * kTile, last = std::min(first + kTile, in.height);
-      depth_kernel(in.depth, in.width, in.height, static_cast<int>(row), settings.min_depth, settings.max_depth,
-                   images.depth.data(), base.tiles.data() + row * columns, &pyramid.valid[(row + 1) * stride + 1]);
+      depth_kernel(in.depth, in.width, in.height, static_cast<int>(row), settings.min_depth,
+                   settings.max_depth + 2 * truncation, images.depth.data(), base.tiles.data() + row * columns,
+                   &pyramid.valid[(row + 1) * stride + 1]);
       for (int v = first; v < last; ++v) erosion_kernel(images.depth.data(), in.width, v, images.eroded_rows.data());
     }
     if (in.color == nullptr) return;
@@ -153,6 +156,66 @@ std::size_t make_blocks(Tsdf& map, const FusionSettings& settings, FusionScratch
   return first;
 }
 
+// Marks the octants of a row's points in the listed blocks; `corner`: the block that they are counted from.
+void mark_row(const Tsdf& map, FusionScratch& scratch, const OctantRow& row, const Vec3i& corner) {
+  const int32_t *x = row.out[0], *y = row.out[1], *z = row.out[2];
+  const float *depth = row.depth, farthest = row.max_depth;
+  constexpr int32_t kNowhere = std::numeric_limits<int32_t>::max();
+  Vec3i block = Vec3i::all(kNowhere);
+  int32_t last_x = kNowhere, last_y = kNowhere, last_z = kNowhere;
+  uint8_t* octants = nullptr;
+  for (int u = 0, width = row.width; u < width; ++u) {
+    if (x[u] == last_x && y[u] == last_y && z[u] == last_z) continue;
+    if (!(depth[u] > 0 && depth[u] <= farthest)) continue;
+    last_x = x[u], last_y = y[u], last_z = z[u];
+    const Vec3i of{{last_x >> 4, last_y >> 4, last_z >> 4}};
+    if (!(of == block)) {
+      block = of;
+      const int64_t found = map.find({corner[0] + of[0], corner[1] + of[1], corner[2] + of[2]});
+      const int32_t n = found < 0 ? -1 : scratch.update_of_row[found];
+      octants = n < 0 ? nullptr : scratch.octants.data() + static_cast<std::size_t>(n) * kVoxels;
+    }
+    if (octants == nullptr) continue;
+    const int voxel = (last_x >> 1 & 7) + (last_y >> 1 & 7) * kSide + (last_z >> 1 & 7) * kSide * kSide;
+    const auto bit = static_cast<uint8_t>(1 << ((last_x & 1) + 2 * (last_y & 1) + 4 * (last_z & 1)));
+    if (!(__atomic_load_n(octants + voxel, __ATOMIC_RELAXED) & bit))
+      __atomic_fetch_or(octants + voxel, bit, __ATOMIC_RELAXED);
+  }
+}
+
+// Marks the octants of the listed blocks' voxels that the view has points in.
+void mark_points(const Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context,
+                 FusionScratch& scratch) {
+  constexpr int kOctants = 2 * kSide;  // along the edge of a block
+  scratch.octants.assign(scratch.updates.size() * kVoxels, 0);
+  scratch.update_of_row.assign(map.size(), -1);
+  for (std::size_t n = 0; n < scratch.updates.size(); ++n)
+    scratch.update_of_row[scratch.updates[n].row] = static_cast<int32_t>(n);
+  const Mat3d axes = Mat3d::from(in.rotation).transpose();
+  const double octant = 0.5 * map.voxel;
+  const Vec3d position = -1.0 / (kOctants * octant) * (axes * Vec3d::from(in.translation));
+  const Vec3i corner = floor(position);
+  OctantRow common{};
+  common.width = in.width, common.max_depth = settings.max_depth;
+  cast<float>(kOctants * (position - cast<double>(corner))).to(common.origin);
+  const auto kernel = GGSLAM_DISPATCH(context.isa, tsdf_octants_of_row);
+  context.pool.parallel_for(in.height, 8, [&](std::size_t begin, std::size_t end, int) {
+    std::vector<int32_t> found(3 * static_cast<std::size_t>(in.width));
+    OctantRow row = common;
+    for (int a = 0; a < 3; ++a) row.out[a] = found.data() + static_cast<std::size_t>(a) * in.width;
+    for (std::size_t v = begin; v < end; ++v) {
+      row.depth = scratch.images.depth.data() + v * in.width;
+      for (int a = 0; a < 3; ++a) {
+        const double y = (static_cast<double>(v) - in.cy) / in.fy;
+        row.first[a] = static_cast<float>((axes(a, 0) * (-in.cx / in.fx) + axes(a, 1) * y + axes(a, 2)) / octant);
+        row.step[a] = static_cast<float>(axes(a, 0) / in.fx / octant);
+      }
+      kernel(row);
+      mark_row(map, scratch, row, corner);
+    }
+  });
+}
+
 void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context,
                    FusionScratch& scratch) {
   VoxelUpdate view{};
@@ -163,7 +226,7 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
   view.width = in.width, view.height = in.height;
   view.fx = in.fx, view.fy = in.fy, view.cx = in.cx, view.cy = in.cy;
   view.truncation = map.truncation, view.voxel = map.voxel, view.edge = settings.edge;
-  view.clearing = settings.clearing;
+  view.clearing = settings.clearing, view.max_depth = settings.max_depth;
   view.weight_scale = kFullWeight / map.max_weight;
   view.max_free_weight = settings.max_free_weight * view.weight_scale;
   const Mat3d rotation = Mat3d::from(in.rotation);
@@ -175,6 +238,7 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
       FusionScratch::Update& update = scratch.updates[n];
       const Vec3d p = map.voxel * (kSide * cast<double>(vector_of(update.at)) + Vec3d::all(0.5));
       cast<float>(rotation * p + Vec3d::from(in.translation)).to(own.origin);
+      own.octants = scratch.octants.data() + n * kVoxels;
       update.flags = kernel(own, *update.voxels);
     }
   });
@@ -212,6 +276,7 @@ void fuse(Tsdf& map, const FusionInput& in, const FusionSettings& settings, Cont
   scratch.gone.clear();
   for (std::size_t first = 0; first < scratch.candidates.size();) {
     first = make_blocks(map, settings, scratch, stats, first);
+    mark_points(map, in, settings, context, scratch);
     update_blocks(map, in, settings, context, scratch);
     finish_blocks(map, scratch, stats);
     stats.updated += scratch.updates.size();
@@ -225,7 +290,7 @@ FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const
                       const FusionSettings& settings) {
   FusionStats stats{};
   const auto start = Clock::now();
-  prepare(in, settings, context, scratch.images);
+  prepare(in, settings, map.truncation, context, scratch.images);
   const auto prepared = Clock::now();
   select(map, in, settings, context, scratch);
   ++map.revision, ++map.views;

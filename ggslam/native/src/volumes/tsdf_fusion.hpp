@@ -34,7 +34,9 @@ struct DepthPyramid {
 };
 
 // The prepared images: depth with 0 for none, with room to read a row and a pixel past the end; the smallest depth
-// within kErosion pixels, infinite for none; colour as red + 256 green + 65536 blue.
+// within kErosion pixels, infinite for none; colour as red + 256 green + 65536 blue. Depth beyond the range is no
+// surface's, but proves what lies before it free: it is kept, cut off two truncations beyond the range, so that all voxels
+// that a surface in range has touched have it behind them.
 struct FusionImages {
   std::vector<float> depth, eroded_rows, eroded;
   std::vector<int32_t> color;
@@ -45,7 +47,8 @@ struct FusionImages {
 enum class Sight : uint8_t {
   surface,  // depth lies within the truncation of the block
   free,     // the block is wholly in view and all depth lies behind it
-  partial   // a part of it is in view and free
+  partial,  // a part of it is in view and free
+  passed    // the range ends in it: what has voxels there is free up to the range
 };
 
 struct Candidate {
@@ -120,6 +123,7 @@ class CandidateSearch {
   bool meets(int level, int u, int v, const Cube& cube, float& z0, float& z1) const;
   unsigned look(int level, int u, int v, const Footprint& area, const Cube& cube) const;
   unsigned look_at_pixels(int u, int v, float low, float high) const;
+  unsigned look_beyond(int u, int v, float low, float high) const;
   float valid_share(const Footprint& area) const;
 };
 
@@ -137,8 +141,20 @@ struct VoxelUpdate {
   float origin[3];         // of the block's first voxel centre, camera frame
   float step[3][3];        // from voxel to voxel along the block's axes, camera frame
   float truncation, voxel, edge, clearing;
+  float max_depth;         // depth beyond it tells of free space alone
   float weight_scale;      // 65535 / largest weight
   float max_free_weight;   // in 65535ths of the largest
+  const uint8_t* octants;  // [kVoxels], those of the block that the view has points in
+};
+
+// A row of the depth image as octants of voxels from a corner of blocks: at depth z of column u they are floor(origin + z
+// (first + u step)) along the map's axes.
+struct OctantRow {
+  const float* depth;
+  int width;
+  float max_depth;  // farther depth is none
+  float origin[3], first[3], step[3];
+  int32_t* out[3];  // [width]; where there is no depth they may be anything
 };
 
 FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const FusionInput& input,

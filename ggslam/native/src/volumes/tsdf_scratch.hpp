@@ -26,6 +26,8 @@ struct FusionScratch {
   std::vector<Update> updates;
   std::vector<BlockCoordinates> gone;
   std::vector<uint8_t> emptied;
+  std::vector<int32_t> update_of_row;  // number of a block's update; -1: none
+  std::vector<uint8_t> octants;        // [updates, kVoxels], those that the view has points in
 };
 
 }  // namespace ggslam::volumes

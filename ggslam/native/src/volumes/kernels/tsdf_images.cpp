@@ -11,16 +11,16 @@ using volumes::DepthTile;
 using volumes::kErosion;
 using volumes::kTile;
 
-// Copies row `row` of tiles of the depth image (0 where it is not in range), with the tiles' ranges and numbers of
-// pixels with depth.
-void tsdf_prepare_depth(const float* depth, int width, int height, int row, float min_depth, float max_depth,
-                        float* out, DepthTile* tiles, int32_t* valid) {
+// Copies row `row` of tiles of the depth image (0 where nothing was measured), with the tiles' ranges and numbers of
+// pixels with depth. What lies beyond max_depth (+inf included: the sensor found nothing) is cut off at `farthest`.
+void tsdf_prepare_depth(const float* depth, int width, int height, int row, float min_depth, float farthest, float* out,
+                        DepthTile* tiles, int32_t* valid) {
   const int first = row * kTile, last = std::min(first + kTile, height), columns = (width + kTile - 1) / kTile;
   for (int c = 0; c < columns; ++c) tiles[c] = {std::numeric_limits<float>::infinity(), 0.0f}, valid[c] = 0;
   for (int v = first; v < last; ++v) {
     const float* from = depth + static_cast<std::size_t>(v) * width;
     float* to = out + static_cast<std::size_t>(v) * width;
-    for (int u = 0; u < width; ++u) to[u] = from[u] >= min_depth && from[u] <= max_depth ? from[u] : 0.0f;
+    for (int u = 0; u < width; ++u) to[u] = from[u] >= min_depth ? std::min(from[u], farthest) : 0.0f;
     for (int c = 0; c < columns; ++c) {
       const int end = std::min((c + 1) * kTile, width);
       float low = tiles[c].low, high = tiles[c].high;
@@ -64,6 +64,22 @@ void tsdf_erode_column(const float* rows, int width, int height, int v, float* o
   for (int y = first + 1; y <= last; ++y) {
     const float* from = rows + static_cast<std::size_t>(y) * width;
     for (int u = 0; u < width; ++u) to[u] = std::min(to[u], from[u]);
+  }
+}
+
+void tsdf_octants_of_row(const volumes::OctantRow& row) {
+  const int width = row.width;
+  const float max_depth = row.max_depth;
+  const float* __restrict depth = row.depth;
+  for (int a = 0; a < 3; ++a) {
+    const float origin = row.origin[a], first = row.first[a], step = row.step[a];
+    int32_t* __restrict out = row.out[a];
+    for (int u = 0; u < width; ++u) {
+      const float z = std::min(depth[u], max_depth);
+      const float x = origin + z * (first + static_cast<float>(u) * step);
+      const int32_t whole = static_cast<int32_t>(x);
+      out[u] = whole - (x < static_cast<float>(whole) ? 1 : 0);  // std::floor is not vectorised
+    }
   }
 }
 

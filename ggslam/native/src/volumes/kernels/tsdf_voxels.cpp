@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Fuses a view into the voxels of a block, kLanes voxels at a time.
 #include <algorithm>
+#include <cstring>
 
 #include "volumes/kernels/voxel_vectors.hpp"
 #include "volumes/tsdf_fusion.hpp"
@@ -17,6 +18,7 @@ using volumes::VoxelUpdate;
 
 constexpr float kSurprise = 0.5f;           // of the truncation: how far depth must contradict a voxel to clear it
 constexpr float kFreeFrom = 0.98f * kFreeValue;  // a voxel seen as free counts as free from this value on
+constexpr float kRangeSlack = 1.00001f;     // of the range: rounding when depth is added up again
 constexpr float kLabelVoxels = 2.0f;        // labels are told to voxels this near to the surface
 constexpr float kColorShare = 0.125f;       // of a new colour at least: less would be rounded away
 
@@ -62,6 +64,7 @@ void project(const VoxelUpdate& t, Work& w) {
       offset[a][lane] = (lane & 7) * t.step[0][a] + (lane >> 3) * t.step[1][a];
   const Float near = broadcast(volumes::kNear), left = broadcast(-0.5f), nothing = broadcast(kNothing);
   const Float right = broadcast(t.width - 0.5f), bottom = broadcast(t.height - 0.5f);
+  const Float max_depth = broadcast(t.max_depth);
   for (int n = 0; n < kGroups; ++n) {
     const int first = n * kLanes;
     const float i = first & 7, j = first >> 3 & 7, k = first >> 6;
@@ -74,7 +77,10 @@ void project(const VoxelUpdate& t, Work& w) {
                              both(greater_equal(v, left), greater(bottom, v)));
     const Int pixel = truncate(zero_unless(inside, v + 0.5f)) * t.width + truncate(zero_unless(inside, u + 0.5f));
     const Float depth = gather(t.depth, pixel);
-    const Float distance = select(both(inside, greater(depth, Float{})), depth - p[2], nothing);
+    // Depth beyond the range is no surface's: it tells of what lies before it alone.
+    const Float gap = depth - p[2], least = select(greater(depth, max_depth), Float{}, nothing);
+    const Mask told = both(both(inside, greater(depth, Float{})), greater_equal(gap, least));
+    const Float distance = select(told, gap, nothing);
     const Float band = reach(t, depth);
     const Mask seen = greater_equal(distance, -band);
     w.groups[n] = {p[2], inverse, u, v, distance, Float{}, pixel};
@@ -83,7 +89,7 @@ void project(const VoxelUpdate& t, Work& w) {
   }
 }
 
-// Takes the depth between the four pixels around a voxel, where they are all there and differ little.
+// Takes the depth between the four pixels around a voxel, where they are all there, in range, and differ little.
 void interpolate(const VoxelUpdate& t, Group& g) {
   const Float u = g.u, v = g.v;
   const Mask inside =
@@ -96,7 +102,8 @@ void interpolate(const VoxelUpdate& t, Group& g) {
   gather_pairs(t.depth, at, a, b), gather_pairs(t.depth + t.width, at, c, d);
   const Float low = minimum(minimum(a, b), minimum(c, d)), high = maximum(maximum(a, b), maximum(c, d));
   const Float allowed = maximum(broadcast(t.edge), low * 0.02f);
-  const Mask smooth = both(wanted, both(greater(low, Float{}), greater_equal(allowed, high - low)));
+  const Mask within = both(greater(low, Float{}), greater_equal(broadcast(t.max_depth), high));
+  const Mask smooth = both(wanted, both(within, greater_equal(allowed, high - low)));
   const Float x = u - to_float(u0), y = v - to_float(v0);
   const Float top = a + x * (b - a), bottom = c + x * (d - c);
   g.distance = select(smooth, top + y * (bottom - top) - g.z, g.distance);
@@ -108,6 +115,43 @@ Float cleared(const VoxelUpdate& t, const Group& g, Mask through, Float weight) 
   return select(through, rounded(weight * (1 - t.clearing)), weight);
 }
 
+// Whether kLanes bytes are all the same as one that is repeated in a word.
+bool all_are(const std::uint8_t* bytes, std::uint64_t repeated) {
+  static_assert(kLanes == 4 || kLanes % 8 == 0);
+  std::uint64_t other = 0, word = 0;
+  constexpr int kStep = kLanes < 8 ? kLanes : 8;
+  for (int lane = 0; lane < kLanes; lane += kStep) {
+    std::memcpy(&word, bytes + lane, kStep);
+    other |= word ^ (kStep < 8 ? repeated & 0xffffffffu : repeated);
+  }
+  return other == 0;
+}
+
+constexpr std::uint64_t kAllEmpty = 0x0101010101010101u * volumes::kLeastHits;
+
+// Counts hits and misses of the voxels from `first` on. Returns whether there are hits.
+bool count_points(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block, Mask& changed) {
+  const bool none = all_are(t.octants + first, 0);
+  if (none && (all_are(block.hits + first, kAllEmpty) || !any(greater_equal(g.distance, broadcast(t.voxel)))))
+    return false;
+  const Int old = load_widened(block.hits + first), octants = load_widened(block.octants + first);
+  const Int now = load_widened(t.octants + first);
+  const Float before = to_float(old), start = select(greater(before, Float{}), before, broadcast(volumes::kOccupied));
+  const Mask hit = greater(to_float(now), Float{});
+  const Mask miss = neither_of(greater_equal(g.distance, broadcast(t.voxel)), hit);
+  const Float up = minimum(start + broadcast(volumes::kHit), broadcast(volumes::kMostHits));
+  const Float down = maximum(start - broadcast(volumes::kMiss), broadcast(volumes::kLeastHits));
+  const Float after = select(hit, up, select(miss, down, before));
+  const Mask was = greater_equal(before, broadcast(volumes::kOccupied));
+  const Mask is = greater_equal(after, broadcast(volumes::kOccupied));
+  const Float kept = select(either(hit, is), to_float(octants | now), Float{});
+  const Mask grown = both(is, greater(kept, to_float(octants)));
+  changed = either(changed, either(grown, either(neither_of(is, was), neither_of(was, is))));
+  store_narrowed(block.hits + first, truncate(after));
+  store_narrowed(block.octants + first, truncate(kept));
+  return !none;
+}
+
 // Averages values and weights.
 void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& changed) {
   const int first = n * kLanes;
@@ -116,11 +160,16 @@ void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& chan
   const Float distance = g.distance;
   const Float drop = minimum((distance + t.truncation) * (1.0f / (t.truncation - t.voxel)), one);
   const Float measured = minimum(rounded(t.weight_scale * g.inverse * g.inverse * drop), broadcast(kFullWeight));
-  const Mask valid = both(greater_equal(distance, -truncation), greater_equal(measured, one));
-
   const Int old_value = load_widened(block.value + first), old_weight = load_widened(block.weight + first);
   const Float value = to_float(old_value);
   Float weight = to_float(old_weight);
+  // Depth beyond the range makes known what is free up to the range. What a surface in range left nearer to it, or behind
+  // the range, goes with that surface.
+  const Mask in_range = greater_equal(broadcast(t.max_depth * kRangeSlack), distance + g.z);
+  const Mask before = both(greater_equal(distance, truncation), greater_equal(broadcast(t.max_depth), g.z));
+  const Mask told = either(greater(weight, Float{}), either(in_range, before));
+  const Mask valid = both(told, both(greater_equal(distance, -truncation), greater_equal(measured, one)));
+
   const Mask behind = both(valid, greater_equal(distance, truncation));  // the surface is: the voxel is free
   const Float scaled = (kFreeValue / t.truncation) * distance;
   const Mask surface = both(greater(weight, Float{}), greater(broadcast(kFreeFrom), value));
@@ -188,9 +237,10 @@ bool vote(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block) {
 unsigned summary(const VoxelBlock& block) {
   int weights = 0, unseen = 0, occupied = 0;
   for (int k = 0; k < kVoxels; ++k) {
-    weights |= block.weight[k];
+    const int hit = block.hits[k] >= volumes::kOccupied;
+    weights |= block.weight[k] | hit;
     unseen |= block.weight[k] == 0;
-    occupied |= block.value[k] != kFreeValue;
+    occupied |= (block.value[k] != kFreeValue) | hit;
   }
   return (weights == 0 ? volumes::kNoneSeen : 0u) | (unseen == 0 && occupied == 0 ? volumes::kAllFree : 0u);
 }
@@ -204,13 +254,15 @@ unsigned tsdf_fuse_block(const VoxelUpdate& t, VoxelBlock& block) {
   for (int n = 0; n < w.near.count; ++n) interpolate(t, w.groups[w.near.group[n]]);
   Mask changed{};
   for (int n = 0; n < w.seen.count; ++n) average(t, w, w.seen.group[n], block, changed);
+  bool points = false;
+  for (int n = 0; n < kGroups; ++n) points |= count_points(t, w.groups[n], n * kLanes, block, changed);
   bool relabelled = false;
   for (int n = 0; n < w.band.count; ++n) {
     const int first = w.band.group[n] * kLanes;
     if (t.color != nullptr) paint(t, w.groups[w.band.group[n]], first, block);
     if (t.labels != nullptr) relabelled |= vote(t, w.groups[w.band.group[n]], first, block);
   }
-  return (relabelled || any(changed) ? volumes::kChanged : 0u) | (w.band.count > 0 ? volumes::kInBand : 0u) |
+  return (relabelled || any(changed) ? volumes::kChanged : 0u) | (w.band.count > 0 || points ? volumes::kInBand : 0u) |
          summary(block);
 }
 
@@ -221,6 +273,10 @@ unsigned tsdf_decay_block(VoxelBlock& block, float factor, int least) {
     const int weight = static_cast<int>(block.weight[k] * factor + 0.5f);
     const bool forgotten = weight < least && block.weight[k] > 0;
     block.weight[k] = weight < least ? 0 : static_cast<std::uint16_t>(weight);
+    if (block.weight[k] == 0) {
+      flags |= block.hits[k] >= volumes::kOccupied ? volumes::kChanged : 0u;
+      block.hits[k] = block.octants[k] = 0;
+    }
     if (!forgotten) continue;
     block.value[k] = kFreeValue, block.label[k] = 0, block.votes[k] = 0;
     block.red[k] = block.green[k] = block.blue[k] = 0;
