@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import field
 
 import numpy as np
 
-from ggslam.localization.localizer import ANY_NORMAL, FrontEndResult, LocalizationStatus
+from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
+from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, SearchSettings
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.settings import setting, settings_class
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
-from ggslam.tracking.scan_points import ScanSettings, scan_points
-from ggslam.tracking.settings import AlignSettings, DepthNoise
+from ggslam.tracking.gicp import AlignmentStatus, GicpTarget
+from ggslam.tracking.scan_points import ScanSettings
+from ggslam.tracking.settings import AlignSettings
 
 
 @settings_class(frozen=True)
@@ -27,8 +28,12 @@ class ScanTrackerSettings:
     """Standard deviation of a range."""
     align: AlignSettings = field(default_factory=lambda: AlignSettings(min_normal_dot=0.0, coarse_iterations=8))
     """The points' "normals" point to the sensor, hence the cosine."""
+    search: SearchSettings = field(default_factory=SearchSettings)
+    """How a scan is located whose start is far off."""
     min_overlap: float = setting(0.5, 0, 0.9)
-    """Under this share of points that match, the scan is lost."""
+    """Under this share of points that match, of those that the map can contain, the scan is lost."""
+    min_counted: int = setting(200, 6, 10**6)
+    """Points that the map can contain; with fewer the scan is lost."""
 
 
 class ScanTracker:
@@ -42,39 +47,64 @@ class ScanTracker:
 
     def __init__(self, settings: ScanTrackerSettings, context: NativeContext, T_world_sensor: np.ndarray) -> None:
         self.settings = settings
-        self._context = context
+        self.aligner = ScanAligner(settings.scan, settings.align, settings.search, settings.sigma, context)
         self._pose = np.array(T_world_sensor, float)
         self._velocity = np.eye(4)
+        self._sure = False
 
     def track(self, item: np.ndarray, surface: Surface, target: GicpTarget) -> FrontEndResult:
-        """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still."""
-        best: AlignmentResult | None = None
-        source = scan_points(item, self.settings.scan)
-        dot = self.settings.align.min_normal_dot if surface.has_sides else ANY_NORMAL
-        settings = replace(self.settings.align, min_normal_dot=dot)
-        noise = DepthNoise(self.settings.sigma, 0.0)
+        """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still, then a search around
+        it. Of the first scan, and after one that was lost, nothing but the match speaks for a pose: it is judged more
+        strictly."""
+        source = self.aligner.source(item)
+        best: ScanMatch | None = None
         for guess in (self._pose @ self._velocity, self._pose):
-            found = align(source, target, guess, settings, noise, self._context)
-            if best is None or (found.status is not AlignmentStatus.LOST and found.overlap > best.overlap):
-                best = found
+            match = self.aligner.fine(source, surface, target, guess)
+            if best is None or _is_better(match, best):
+                best = match
             if self._convinces(best):
                 break
         assert best is not None
-        return self._outcome(best, len(source))
+        if not self._convinces(best):
+            guess = self._pose @ self._velocity
+            best = self.aligner.search(source, surface, target, guess, self.settings.min_overlap) or best
+        return self._outcome(best)
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`."""
         return None
 
-    def _convinces(self, found: AlignmentResult) -> bool:
-        return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.min_overlap
+    def _convinces(self, match: ScanMatch) -> bool:
+        if match.counted < self.settings.min_counted or match.found.status is AlignmentStatus.LOST:
+            return False
+        if self._sure:
+            return match.found.overlap >= self.settings.min_overlap
+        return self.aligner.is_right(match, self.settings.min_overlap)
 
-    def _outcome(self, found: AlignmentResult, count: int) -> FrontEndResult:
-        if not self._convinces(found):
-            self._velocity = np.eye(4)
-            reason = f"{found.overlap:.0%} of {count} points match the map, {self.settings.min_overlap:.0%} needed"
-            return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, found.overlap, found.rmse, reason)
+    def _outcome(self, match: ScanMatch) -> FrontEndResult:
+        found = match.found
+        if not self._convinces(match):
+            self._velocity, self._sure = np.eye(4), False
+            pose, status = self._pose.copy(), LocalizationStatus.LOST
+            return FrontEndResult(pose, status, found.overlap, found.rmse, self._why_lost(match), match.beyond)
         T = orthonormalize(found.T_world_camera)
-        self._velocity, self._pose = inverse(self._pose) @ T, T
+        self._velocity = inverse(self._pose) @ T if self._sure else np.eye(4)
+        self._pose, self._sure = T, True
         status = LocalizationStatus.DEGENERATE if found.degenerate else LocalizationStatus.OK
-        return FrontEndResult(T.copy(), status, found.overlap, found.rmse)
+        return FrontEndResult(T.copy(), status, found.overlap, found.rmse, "", match.beyond)
+
+    def _why_lost(self, match: ScanMatch) -> str:
+        overlap, needed = match.found.overlap, self.settings.min_overlap
+        if match.counted < self.settings.min_counted:
+            return (
+                f"only {match.counted} of {match.total} points lie where the map in memory reaches, "
+                f"{self.settings.min_counted} needed"
+            )
+        text = f"{overlap:.0%} of {match.counted} points match the map, {needed:.0%} needed"
+        if overlap < needed:
+            return text
+        return f"{text}, but of those off the largest plane only {match.structure:.0%}, from every start"
+
+
+def _is_better(match: ScanMatch, other: ScanMatch) -> bool:
+    return match.found.status is not AlignmentStatus.LOST and match.found.overlap > other.found.overlap

@@ -18,6 +18,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.geometry.normals import estimate_normals
+from ggslam.localization.coverage import Coverage, Everywhere, coverage_of, reach_of
 from ggslam.native.loader import NativeContext
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import POINTS
@@ -71,10 +72,11 @@ def load_surface(store: GridStore, key: CellKey) -> tuple[np.ndarray, np.ndarray
 
 @dataclass(frozen=True)
 class SurfaceCell:
-    """A cell of the map as part of targets; `has_sides`: see `Surface`."""
+    """A cell of the map as part of targets; `has_sides`: see `Surface`; `reach`: see `reach_of`."""
 
     part: TargetPart
     has_sides: bool
+    reach: float
 
 
 class SurfaceLoader:
@@ -90,9 +92,8 @@ class SurfaceLoader:
         flat = np.log(self.settings.voxel * np.array([1, 1, FLATNESS])).astype(np.float32)
         log_scales, opacity_logits = np.tile(flat, (len(points), 1)), np.full(len(points), _OPACITY_LOGIT, np.float32)
         rank = _rank(key)
-        return SurfaceCell(
-            TargetPart(points, turn, log_scales, opacity_logits, self.settings, self.context, rank), has_sides
-        )
+        part = TargetPart(points, turn, log_scales, opacity_logits, self.settings, self.context, rank)
+        return SurfaceCell(part, has_sides, reach_of(points, key, store.grid))
 
 
 def _rank(key: CellKey) -> int:
@@ -130,6 +131,9 @@ class Surface(Protocol):
     def move_to(self, position: np.ndarray, velocity: np.ndarray | None = None) -> bool:
         """Makes the target that of a place [3] in the world; whether it is another one than before."""
 
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Whether the target can contain world points [n, 3]: those that lie elsewhere say nothing about a pose."""
+
     def close(self) -> None:
         """Nothing is asked of it any more."""
 
@@ -153,6 +157,7 @@ class PartialSurface:
         self.has_sides = True
         self.points = 0
         self._settings, self._context = settings, context
+        self._coverage: Coverage = Everywhere()
         self.damage: set[str] = set()
         """What is wrong with cells that were within R' and cannot be read."""
 
@@ -165,10 +170,16 @@ class PartialSurface:
         cells = self.map.cells.values()
         self.points = sum(cell.part.count for cell in cells)
         self.has_sides = all(cell.has_sides for cell in cells)
+        reaches = {key: cell.reach for key, cell in self.map.cells.items()}
+        self._coverage = coverage_of(reaches, self.map.settings, np.asarray(position, np.float64))
         before = self.target
         parts = [cell.part for cell in cells]
         self.target = composed_target(parts, self._settings, self._context, before) if self.points else None
         return self.target is not None or before is not None
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """See `Surface`."""
+        return self._coverage.covers(points)
 
     def close(self) -> None:
         """Ends loading ahead."""
@@ -193,6 +204,7 @@ class FullSurface:
         self.damage: list[str] = []
         self._store, self._settings, self._context = store, settings, context
         self._read = False
+        self._coverage: Coverage = Everywhere()
 
     def move_to(self, position: np.ndarray, velocity: np.ndarray | None = None) -> bool:
         """See `Surface`; the first call reads the map."""
@@ -200,13 +212,19 @@ class FullSurface:
             return False
         self._read = True
         loader = SurfaceLoader(self._settings, self._context)
-        cells = [cell for key in self._store.cells() if (cell := self._cell(loader, key)) is not None]
+        held = {key: cell for key in self._store.cells() if (cell := self._cell(loader, key)) is not None}
+        cells = held.values()
         self.points = sum(cell.part.count for cell in cells)
+        self._coverage = coverage_of({key: cell.reach for key, cell in held.items()}, self._store.settings)
         if not self.points:
             return False
         self.has_sides = all(cell.has_sides for cell in cells)
         self.target = composed_target([cell.part for cell in cells], self._settings, self._context)
         return True
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """See `Surface`."""
+        return self._coverage.covers(points)
 
     def close(self) -> None:
         """Nothing to end."""

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Aligns laser scans to the surface of a map: from a good guess, or from one that is metres and degrees off.
+
+Far from the pose the nearest surface is another one. A search therefore starts with voxels as wide as the start may be
+off, whose planes are few and large, with a kernel of their size, and halves both until the map's own voxels take over.
+
+Most of what a scan sees from near is ground, which matches at any place of a flat world. Whether a pose found from far
+off is the right one is therefore judged without the points on the largest plane: what matches off it, and what matches
+nothing, tells places apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ggslam.localization.localizer import ANY_NORMAL
+from ggslam.localization.surface import SCAN_TARGET, Surface
+from ggslam.native.loader import NativeContext
+from ggslam.scene.poses import orthonormalize, se3_exp, transform_points
+from ggslam.system.settings import setting, settings_class
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
+from ggslam.tracking.points import FramePoints
+from ggslam.tracking.scan_points import ScanSettings, scan_points
+from ggslam.tracking.settings import AlignSettings, DepthNoise, TargetSettings
+from ggslam.tracking.surface import FLATNESS, quaternions_from_normals
+
+_OPACITY_LOGIT = 3.0
+_KERNEL = 0.6
+"""Width of a search's kernel, in voxels."""
+_OWN_COARSE = 4
+"""A target's coarse voxels are so many times as wide as its fine ones."""
+_ITERATIONS = 30
+_SMALL = 1e-3
+"""Metres and radians of the last step of a search's stage."""
+_PLANE_COSINE = np.cos(np.radians(30))
+"""Normals within this of the most common one are those of the largest plane."""
+_PLAIN_OVERLAP = 0.9
+"""Where so much matches, it does not matter that all of it is one plane."""
+_AROUND = (0.5, -0.5)
+"""Shares of the reach by which further starts lie beside the guess, along two directions on the ground."""
+
+
+@settings_class(frozen=True)
+class SearchSettings:
+    """How a scan is located whose start pose is far off: the first one, and those that were lost."""
+
+    reach: float = setting(2.4, 0, 100, "m")
+    """Edge of the widest voxels: starts so far off converge mostly. 0: no search."""
+    turn_deg: float = setting(12.0, 0, 180, "deg")
+    """Starts turned by this either way about the ground's normal are tried, too."""
+    voxel: float = setting(1.0, 1e-3, 100, "m")
+    """Of the points in a cube with this edge one is used, until the map's own voxels take over."""
+    min_structure: float = setting(0.45, 0, 1)
+    """Share that must match of the points off the largest plane (matched off it, or not matched), unless nearly all
+    points match."""
+
+
+@dataclass(frozen=True)
+class ScanMatch:
+    """How a scan lies in the map.
+
+    Attributes:
+        found: the alignment of the points that the map can contain.
+        counted: how many those are.
+        total: points of the scan, evenly spread.
+        target: what was aligned to.
+        inlier: metres to the surface within which a point matches.
+    """
+
+    found: AlignmentResult
+    counted: int
+    total: int
+    target: GicpTarget
+    inlier: float
+
+    @cached_property
+    def structure(self) -> float:
+        """Share that matches of the points off the largest plane."""
+        matches = self.found.matches.read()
+        matched = matches.squared_distances < self.inlier**2  # infinite without a match
+        normals = self.target.normals(matches.voxels[matched])
+        if not len(normals):
+            return 0.0
+        off = int((np.abs(normals @ _common_direction(normals)) < _PLANE_COSINE).sum())
+        return off / max(1, off + int((~matched).sum()))
+
+    @property
+    def beyond(self) -> float:
+        """Share of the points that lie beyond what the map can contain."""
+        return 1 - self.counted / max(1, self.total)
+
+
+class ScanSource:
+    """Points of one scan, dense for aligning and sparse for searching.
+
+    Args:
+        points: [n, 3], metres, in the sensor's frame.
+        settings: which are used.
+        sparse: edge of the cubes that one point each is searched with, metres.
+    """
+
+    def __init__(self, points: np.ndarray, settings: ScanSettings, sparse: float) -> None:
+        self.dense = scan_points(points, settings)
+        self._settings, self._width = settings, sparse
+        self._sparse: FramePoints | None = None
+
+    @property
+    def sparse(self) -> FramePoints:
+        """For searching."""
+        if self._sparse is None:
+            width = max(self._width, self._settings.voxel)
+            self._sparse = scan_points(self.dense.points, replace(self._settings, voxel=width))
+        return self._sparse
+
+
+class ScanAligner:
+    """Aligns scans to the target of a surface.
+
+    Args:
+        scan, align, search: see the classes.
+        sigma: standard deviation of a range, metres.
+        context: threads.
+    """
+
+    def __init__(
+        self, scan: ScanSettings, align: AlignSettings, search: SearchSettings, sigma: float, context: NativeContext
+    ) -> None:
+        self._scan, self._settings, self._search = scan, align, search
+        self._noise, self._context = DepthNoise(sigma, 0.0), context
+        self._pyramid: tuple[GicpTarget, list[GicpTarget], np.ndarray] | None = None
+
+    def source(self, points: np.ndarray) -> ScanSource:
+        """The points of a scan [n, 3] as `fine` and `search` want them."""
+        return ScanSource(points, self._scan, self._search.voxel)
+
+    def fine(self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray) -> ScanMatch:
+        """Aligns from a guess that is right to about a coarse voxel of the target."""
+        dot = self._settings.min_normal_dot if surface.has_sides else ANY_NORMAL
+        return self._match(source, surface, target, guess, replace(self._settings, min_normal_dot=dot))
+
+    def is_right(self, match: ScanMatch, min_overlap: float) -> bool:
+        """Whether a pose is believed that nothing but the match speaks for."""
+        enough = match.found.status is not AlignmentStatus.LOST and match.found.overlap >= min_overlap
+        return enough and (
+            match.structure >= self._search.min_structure or match.found.overlap >= max(_PLAIN_OVERLAP, min_overlap)
+        )
+
+    def search(
+        self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray, min_overlap: float
+    ) -> ScanMatch | None:
+        """Aligns from a guess that is metres and degrees off, then from places around it; ends with the first match
+        that is right. None: there is none. The surface moves to where the scan is."""
+        if not self._search.reach or not len(target):
+            return None
+        levels, up = self._levels(target)
+        for start in self._starts(guess, up):
+            T = start
+            for level in levels:
+                T = self._stage(source.sparse, surface, level, T)
+            found = self._last_stage(source, surface, target, T)
+            if self.is_right(found, min_overlap):
+                return self._moved(source, surface, found)
+        return None
+
+    def _moved(self, source: ScanSource, surface: Surface, found: ScanMatch) -> ScanMatch:
+        """The match with the map around the place that was found."""
+        T = found.found.T_world_camera
+        if not surface.move_to(T[:3, 3]) or surface.target is None:
+            return found
+        return self.fine(source, surface, surface.target, T)
+
+    def _starts(self, guess: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
+        """The guess, turned and moved over the ground, nearest first."""
+        turns = [np.eye(3), *(_turn(up, sign * self._search.turn_deg) for sign in (1, -1))]
+        across = np.linalg.svd(up[None])[2][1:]
+        shifts = [np.zeros(3), *(share * self._search.reach * axis for axis in across for share in _AROUND)]
+        for shift in shifts:
+            for turn in turns:
+                T = guess.copy()
+                T[:3, :3], T[:3, 3] = turn @ guess[:3, :3], guess[:3, 3] + shift
+                yield T
+
+    def _stage(self, points: FramePoints, surface: Surface, level: GicpTarget, guess: np.ndarray) -> np.ndarray:
+        settings = replace(
+            self._settings, min_normal_dot=ANY_NORMAL, coarse_iterations=0, fine_iterations=_ITERATIONS,
+            kernel_constant=_KERNEL * level.voxel, kernel_sigmas=0.0, translation_tolerance=_SMALL,
+            rotation_tolerance=_SMALL,
+        )  # fmt: skip
+        points = _rows(points, surface.covers(transform_points(points.points.astype(float), guess)))
+        if len(points) < settings.min_matches:
+            return guess
+        return orthonormalize(align(points, level, guess, settings, self._noise, self._context).T_world_camera)
+
+    def _last_stage(
+        self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray
+    ) -> ScanMatch:
+        """On the target's own voxels, the coarse ones with a kernel of their size; then again with the points that the
+        map can contain from there."""
+        width = self._settings.kernel_constant + self._settings.kernel_sigmas * self._noise.constant
+        settings = replace(
+            self._settings, min_normal_dot=ANY_NORMAL, coarse_iterations=_ITERATIONS,
+            coarse_kernel_factor=min(100.0, _KERNEL * _OWN_COARSE * target.voxel / width),
+        )  # fmt: skip
+        found = self._match(source, surface, target, guess, settings)
+        return self.fine(source, surface, target, orthonormalize(found.found.T_world_camera))
+
+    def _match(
+        self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray, settings: AlignSettings
+    ) -> ScanMatch:
+        points = source.dense
+        inside = surface.covers(transform_points(points.points.astype(float), guess))
+        counted = points if inside.all() else _rows(points, inside)
+        found = align(counted, target, guess, settings, self._noise, self._context)
+        limit = settings.overlap_constant + settings.overlap_sigmas * self._noise.constant
+        return ScanMatch(found, len(counted), len(points), target, limit)
+
+    def _levels(self, target: GicpTarget) -> tuple[list[GicpTarget], np.ndarray]:
+        """Targets of wide voxels, the widest first, made of the target's coarse ones; and the most common normal."""
+        if self._pyramid is None or self._pyramid[0] is not target:
+            voxels, levels, width = target.voxels(1), [], self._search.reach
+            while width > 1.2 * _OWN_COARSE * target.voxel:
+                levels.append(_widened(voxels, width, self._context))
+                width /= 2
+            self._pyramid = target, levels, _common_direction(voxels["normals"])
+        return self._pyramid[1:]
+
+
+def _widened(voxels: dict[str, np.ndarray], width: float, context: NativeContext) -> GicpTarget:
+    """Voxels of a target gathered in wider ones, `width` metres."""
+    means = np.ascontiguousarray(voxels["means"])
+    turns = np.ascontiguousarray(quaternions_from_normals(_unit(voxels["normals"])), np.float32)
+    flat = np.log(width * np.array([1, 1, FLATNESS])).astype(np.float32)
+    log_scales, logits = np.tile(flat, (len(means), 1)), np.full(len(means), _OPACITY_LOGIT, np.float32)
+    settings: TargetSettings = replace(SCAN_TARGET, voxel=width)
+    return GicpTarget.from_arrays(means, turns, log_scales, logits, settings, context)
+
+
+def _common_direction(normals: np.ndarray) -> np.ndarray:
+    """The unit vector [3] that most normals [n, 3] are near to, of either sign."""
+    if not len(normals):
+        return np.array([0.0, 0.0, 1.0])
+    return np.linalg.eigh((normals.T @ normals).astype(np.float64))[1][:, 2]
+
+
+def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:
+    return se3_exp(np.concatenate([np.zeros(3), np.radians(degrees) * axis]))[:3, :3]
+
+
+def _unit(normals: np.ndarray) -> np.ndarray:
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6)
+
+
+def _rows(points: FramePoints, chosen: np.ndarray) -> FramePoints:
+    return FramePoints(
+        points.points[chosen], points.normals[chosen], points.covariances[chosen], points.pixels[chosen],
+        points.weights[chosen],
+    )  # fmt: skip
