@@ -20,7 +20,7 @@ import numpy as np
 from ggslam.localization.localizer import ANY_NORMAL
 from ggslam.localization.surface import SCAN_TARGET, Surface
 from ggslam.native.loader import NativeContext
-from ggslam.scene.poses import orthonormalize, se3_exp, transform_points
+from ggslam.scene.poses import orthonormalize, se3_exp, separation, transform_points
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
 from ggslam.tracking.points import FramePoints
@@ -40,6 +40,10 @@ _PLANE_COSINE = np.cos(np.radians(30))
 """Normals within this of the most common one are those of the largest plane."""
 _PLAIN_OVERLAP = 0.9
 """Where so much matches, it does not matter that all of it is one plane."""
+_REPEATS = 4
+"""Alignments from where the last one ended."""
+_SETTLED = 0.002
+"""Metres: a match that moves less has settled."""
 _AROUND = (0.5, -0.5)
 """Shares of the reach by which further starts lie beside the guess, along two directions on the ground."""
 
@@ -76,6 +80,11 @@ class ScanMatch:
     total: int
     target: GicpTarget
     inlier: float
+
+    @property
+    def pose(self) -> np.ndarray:
+        """T_world_sensor, float64 [4, 4]."""
+        return orthonormalize(self.found.T_world_camera)
 
     @cached_property
     def structure(self) -> float:
@@ -140,7 +149,20 @@ class ScanAligner:
     def fine(self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray) -> ScanMatch:
         """Aligns from a guess that is right to about a coarse voxel of the target."""
         dot = self._settings.min_normal_dot if surface.has_sides else ANY_NORMAL
-        return self._match(source, surface, target, guess, replace(self._settings, min_normal_dot=dot))
+        return self._match(source.dense, surface, target, guess, replace(self._settings, min_normal_dot=dot))
+
+    def settled(self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch) -> ScanMatch:
+        """Aligns again from a match while that still moves it: an alignment that begins far off ends short of the
+        pose, with the points that the map can contain from where it began."""
+        for _ in range(_REPEATS):
+            again = self.fine(source, surface, target, match.pose)
+            if again.found.status is AlignmentStatus.LOST or again.found.overlap < match.found.overlap:
+                break
+            moved, _ = separation(match.pose, again.pose)
+            match = again
+            if moved < _SETTLED:
+                break
+        return match
 
     def is_right(self, match: ScanMatch, min_overlap: float) -> bool:
         """Whether a pose is believed that nothing but the match speaks for."""
@@ -161,17 +183,20 @@ class ScanAligner:
             T = start
             for level in levels:
                 T = self._stage(source.sparse, surface, level, T)
-            found = self._last_stage(source, surface, target, T)
-            if self.is_right(found, min_overlap):
-                return self._moved(source, surface, found)
+            sparse = self._last_stage(source.sparse, surface, target, T)
+            if self.is_right(sparse, min_overlap):
+                found = self._around(source, surface, target, sparse.pose)
+                if self.is_right(found, min_overlap):
+                    return found
+                surface.move_to(guess[:3, 3])
+                target = surface.target or target
         return None
 
-    def _moved(self, source: ScanSource, surface: Surface, found: ScanMatch) -> ScanMatch:
-        """The match with the map around the place that was found."""
-        T = found.found.T_world_camera
-        if not surface.move_to(T[:3, 3]) or surface.target is None:
-            return found
-        return self.fine(source, surface, surface.target, T)
+    def _around(self, source: ScanSource, surface: Surface, target: GicpTarget, T: np.ndarray) -> ScanMatch:
+        """The match at a place, with the map around it."""
+        if surface.move_to(T[:3, 3]) and surface.target is not None:
+            target = surface.target
+        return self.settled(source, surface, target, self.fine(source, surface, target, T))
 
     def _starts(self, guess: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
         """The guess, turned and moved over the ground, nearest first."""
@@ -196,7 +221,7 @@ class ScanAligner:
         return orthonormalize(align(points, level, guess, settings, self._noise, self._context).T_world_camera)
 
     def _last_stage(
-        self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray
+        self, points: FramePoints, surface: Surface, target: GicpTarget, guess: np.ndarray
     ) -> ScanMatch:
         """On the target's own voxels, the coarse ones with a kernel of their size; then again with the points that the
         map can contain from there."""
@@ -205,13 +230,12 @@ class ScanAligner:
             self._settings, min_normal_dot=ANY_NORMAL, coarse_iterations=_ITERATIONS,
             coarse_kernel_factor=min(100.0, _KERNEL * _OWN_COARSE * target.voxel / width),
         )  # fmt: skip
-        found = self._match(source, surface, target, guess, settings)
-        return self.fine(source, surface, target, orthonormalize(found.found.T_world_camera))
+        found = self._match(points, surface, target, guess, settings)
+        return self._match(points, surface, target, found.pose, replace(self._settings, min_normal_dot=ANY_NORMAL))
 
     def _match(
-        self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray, settings: AlignSettings
+        self, points: FramePoints, surface: Surface, target: GicpTarget, guess: np.ndarray, settings: AlignSettings
     ) -> ScanMatch:
-        points = source.dense
         inside = surface.covers(transform_points(points.points.astype(float), guess))
         counted = points if inside.all() else _rows(points, inside)
         found = align(counted, target, guess, settings, self._noise, self._context)

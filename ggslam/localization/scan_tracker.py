@@ -68,6 +68,8 @@ class ScanTracker:
         if not self._convinces(best):
             guess = self._pose @ self._velocity
             best = self.aligner.search(source, surface, target, guess, self.settings.min_overlap) or best
+        elif not self._sure:
+            best = self.aligner.settled(source, surface, target, best)
         return self._outcome(best)
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
