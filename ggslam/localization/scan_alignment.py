@@ -40,6 +40,8 @@ _PLANE_COSINE = np.cos(np.radians(30))
 """Normals within this of the most common one are those of the largest plane."""
 _PLAIN_OVERLAP = 0.9
 """Where so much matches, it does not matter that all of it is one plane."""
+_PROMISING = 0.5
+"""Share of what must match that sparse points must reach: more of them than of all points are far or seldom seen."""
 _REPEATS = 4
 """Alignments from where the last one ended."""
 _SETTLED = 0.002
@@ -58,7 +60,7 @@ class SearchSettings:
     """Starts turned by this either way about the ground's normal are tried, too."""
     voxel: float = setting(1.0, 1e-3, 100, "m")
     """Of the points in a cube with this edge one is used, until the map's own voxels take over."""
-    min_structure: float = setting(0.45, 0, 1)
+    min_structure: float = setting(0.4, 0, 1)
     """Share that must match of the points off the largest plane (matched off it, or not matched), unless nearly all
     points match."""
 
@@ -164,12 +166,12 @@ class ScanAligner:
                 break
         return match
 
-    def is_right(self, match: ScanMatch, min_overlap: float) -> bool:
-        """Whether a pose is believed that nothing but the match speaks for."""
-        enough = match.found.status is not AlignmentStatus.LOST and match.found.overlap >= min_overlap
-        return enough and (
-            match.structure >= self._search.min_structure or match.found.overlap >= max(_PLAIN_OVERLAP, min_overlap)
-        )
+    def is_right(self, match: ScanMatch, min_overlap: float, share: float = 1.0) -> bool:
+        """Whether a pose is believed that nothing but the match speaks for; `share`: of what must match."""
+        if match.found.status is AlignmentStatus.LOST or match.found.overlap < share * min_overlap:
+            return False
+        enough = share * self._search.min_structure
+        return match.structure >= enough or match.found.overlap >= max(_PLAIN_OVERLAP, min_overlap)
 
     def search(
         self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray, min_overlap: float
@@ -184,7 +186,7 @@ class ScanAligner:
             for level in levels:
                 T = self._stage(source.sparse, surface, level, T)
             sparse = self._last_stage(source.sparse, surface, target, T)
-            if self.is_right(sparse, min_overlap):
+            if self.is_right(sparse, min_overlap, _PROMISING):
                 found = self._around(source, surface, target, sparse.pose)
                 if self.is_right(found, min_overlap):
                     return found
