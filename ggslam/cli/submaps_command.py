@@ -16,7 +16,7 @@ from ggslam.cli.observer import ProgressObserver
 from ggslam.system.json_files import json_ready
 
 if TYPE_CHECKING:
-    from ggslam.jobs.submaps.fill import StoreListing
+    from ggslam.jobs.submaps.fill import StoreListing, SubmapsRequest
     from ggslam.submaps.store_objects import ObjectEvent
 
 EPILOG = """
@@ -91,30 +91,33 @@ def submaps(
     as_json: Annotated[bool, typer.Option("--json", help="Print what is in the store as JSON.")] = False,
 ) -> None:  # fmt: skip
     """Make a grid store, add a visit to one, or list its cells, parts, visits, objects and what changed."""
-    from ggslam.jobs.changes.store_visits import add_run
-    from ggslam.jobs.submaps.fill import SubmapsRequest, list_store, make_store
+    from ggslam.jobs.submaps.fill import SubmapsRequest, list_store
     from ggslam.jobs.submaps.settings import store_overrides
     from ggslam.runs.recordings import SequenceRequest
 
     if out is not None:
-        settings = {"spacing": spacing, "axes": axes, "voxel": voxel, "radius": radius, "refresh": refresh,
-                    "sensor_range": sensor_range}  # fmt: skip
-        given = {name: value for name, value in settings.items() if value is not None}
-        request = SubmapsRequest(
-            source, out, visit, poses, at, {**store_overrides(overrides), **given},
-            SequenceRequest(
-                source, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
-                camera=camera, intrinsics=intrinsics,
-            ), columns,
+        given = {"spacing": spacing, "axes": axes, "voxel": voxel, "radius": radius, "refresh": refresh,
+                 "sensor_range": sensor_range}  # fmt: skip
+        settings = {**store_overrides(overrides), **{name: v for name, v in given.items() if v is not None}}
+        reading = SequenceRequest(
+            source, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
+            camera=camera, intrinsics=intrinsics,
         )  # fmt: skip
-        with progress_bar() as bar:
-            observer = ProgressObserver(bar)
-            make_store(request, observer, partial(add_run, observer=observer))
+        _make(SubmapsRequest(source, out, visit, poses, at, settings, reading, columns))
     listing = list_store(source if out is None else out, since)
     if as_json:
         typer.echo(json.dumps(json_ready(listing.to_dict()), indent=1))
     else:
         _print(listing)
+
+
+def _make(request: SubmapsRequest) -> None:
+    from ggslam.jobs.changes.store_visits import add_run
+    from ggslam.jobs.submaps.fill import make_store
+
+    with progress_bar() as bar:
+        observer = ProgressObserver(bar)
+        make_store(request, observer, partial(add_run, observer=observer))
 
 
 def _print(listing: StoreListing) -> None:

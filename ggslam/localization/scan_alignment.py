@@ -4,9 +4,9 @@
 Far from the pose the nearest surface is another one. A search therefore starts with voxels as wide as the start may be
 off, whose planes are few and large, with a kernel of their size, and halves both until the map's own voxels take over.
 
-Most of what a scan sees from near is ground, which matches at any place of a flat world. Whether a pose found from far
-off is the right one is therefore judged without the points on the largest plane: what matches off it, and what matches
-nothing, tells places apart.
+Most of what a scan sees from near is ground, which matches at any place of a flat world, and walls match along a whole
+street. Whether a pose found from far off is the right one is therefore judged by the direction of motion that matches
+tell the least of: the points that match across it, against those that match nothing.
 """
 
 from __future__ import annotations
@@ -36,11 +36,13 @@ _OWN_COARSE = 4
 _ITERATIONS = 30
 _SMALL = 1e-3
 """Metres and radians of the last step of a search's stage."""
-_PLANE_COSINE = np.cos(np.radians(30))
-"""Normals within this of the most common one are those of the largest plane."""
+_ACROSS = np.cos(np.radians(60))
+"""A surface whose normal is within this of a direction lies across it."""
+_VOXEL_SIGMAS = 8
+"""Surfaces of a map are known to a voxel's edge over this at best, which counts where a map is sparse."""
 _PLAIN_OVERLAP = 0.9
 """Where so much matches, it does not matter that all of it is one plane."""
-_PROMISING = 0.5
+_PROMISING = 0.35
 """Share of what must match that sparse points must reach: more of them than of all points are far or seldom seen."""
 _REPEATS = 4
 """Alignments from where the last one ended."""
@@ -60,9 +62,9 @@ class SearchSettings:
     """Starts turned by this either way about the ground's normal are tried, too."""
     voxel: float = setting(1.0, 1e-3, 100, "m")
     """Of the points in a cube with this edge one is used, until the map's own voxels take over."""
-    min_structure: float = setting(0.4, 0, 1)
-    """Share that must match of the points off the largest plane (matched off it, or not matched), unless nearly all
-    points match."""
+    min_structure: float = setting(0.34, 0, 1)
+    """Share that must match of the points that tell one place from another along the least seen direction of motion
+    (matched to surfaces across it, or not matched), unless nearly all points match."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +92,14 @@ class ScanMatch:
 
     @cached_property
     def structure(self) -> float:
-        """Share that matches of the points off the largest plane."""
+        """Share that matches of the points that tell of the least seen direction of motion."""
         matches = self.found.matches.read()
         matched = matches.squared_distances < self.inlier**2  # infinite without a match
         normals = self.target.normals(matches.voxels[matched])
         if not len(normals):
             return 0.0
-        off = int((np.abs(normals @ _common_direction(normals)) < _PLANE_COSINE).sum())
-        return off / max(1, off + int((~matched).sum()))
+        across = int((np.abs(normals @ _directions(normals)[:, 0]) > _ACROSS).sum())
+        return across / max(1, across + int((~matched).sum()))
 
     @property
     def beyond(self) -> float:
@@ -141,7 +143,7 @@ class ScanAligner:
         self, scan: ScanSettings, align: AlignSettings, search: SearchSettings, sigma: float, context: NativeContext
     ) -> None:
         self._scan, self._settings, self._search = scan, align, search
-        self._noise, self._context = DepthNoise(sigma, 0.0), context
+        self._sigma, self._context = sigma, context
         self._pyramid: tuple[GicpTarget, list[GicpTarget], np.ndarray] | None = None
 
     def source(self, points: np.ndarray) -> ScanSource:
@@ -220,14 +222,15 @@ class ScanAligner:
         points = _rows(points, surface.covers(transform_points(points.points.astype(float), guess)))
         if len(points) < settings.min_matches:
             return guess
-        return orthonormalize(align(points, level, guess, settings, self._noise, self._context).T_world_camera)
+        noise = DepthNoise(self._sigma, 0.0)
+        return orthonormalize(align(points, level, guess, settings, noise, self._context).T_world_camera)
 
     def _last_stage(
         self, points: FramePoints, surface: Surface, target: GicpTarget, guess: np.ndarray
     ) -> ScanMatch:
         """On the target's own voxels, the coarse ones with a kernel of their size; then again with the points that the
         map can contain from there."""
-        width = self._settings.kernel_constant + self._settings.kernel_sigmas * self._noise.constant
+        width = self._settings.kernel_constant + self._settings.kernel_sigmas * self._sigma_of(target)
         settings = replace(
             self._settings, min_normal_dot=ANY_NORMAL, coarse_iterations=_ITERATIONS,
             coarse_kernel_factor=min(100.0, _KERNEL * _OWN_COARSE * target.voxel / width),
@@ -240,9 +243,13 @@ class ScanAligner:
     ) -> ScanMatch:
         inside = surface.covers(transform_points(points.points.astype(float), guess))
         counted = points if inside.all() else _rows(points, inside)
-        found = align(counted, target, guess, settings, self._noise, self._context)
-        limit = settings.overlap_constant + settings.overlap_sigmas * self._noise.constant
+        sigma = self._sigma_of(target)
+        found = align(counted, target, guess, settings, DepthNoise(sigma, 0.0), self._context)
+        limit = settings.overlap_constant + settings.overlap_sigmas * sigma
         return ScanMatch(found, len(counted), len(points), target, limit)
+
+    def _sigma_of(self, target: GicpTarget) -> float:
+        return max(self._sigma, target.voxel / _VOXEL_SIGMAS)
 
     def _levels(self, target: GicpTarget) -> tuple[list[GicpTarget], np.ndarray]:
         """Targets of wide voxels, the widest first, made of the target's coarse ones; and the most common normal."""
@@ -251,7 +258,7 @@ class ScanAligner:
             while width > 1.2 * _OWN_COARSE * target.voxel:
                 levels.append(_widened(voxels, width, self._context))
                 width /= 2
-            self._pyramid = target, levels, _common_direction(voxels["normals"])
+            self._pyramid = target, levels, _directions(voxels["normals"])[:, 2]
         return self._pyramid[1:]
 
 
@@ -265,11 +272,9 @@ def _widened(voxels: dict[str, np.ndarray], width: float, context: NativeContext
     return GicpTarget.from_arrays(means, turns, log_scales, logits, settings, context)
 
 
-def _common_direction(normals: np.ndarray) -> np.ndarray:
-    """The unit vector [3] that most normals [n, 3] are near to, of either sign."""
-    if not len(normals):
-        return np.array([0.0, 0.0, 1.0])
-    return np.linalg.eigh((normals.T @ normals).astype(np.float64))[1][:, 2]
+def _directions(normals: np.ndarray) -> np.ndarray:
+    """Orthonormal columns [3, 3]: the direction that normals [n, 3] lie along the least, ..., the most."""
+    return np.linalg.eigh((normals.T @ normals).astype(np.float64))[1]
 
 
 def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:

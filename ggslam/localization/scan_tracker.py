@@ -105,7 +105,7 @@ class ScanTracker:
         text = f"{overlap:.0%} of {match.counted} points match the map, {needed:.0%} needed"
         if overlap < needed:
             return text
-        return f"{text}, but of those off the largest plane only {match.structure:.0%}, from every start"
+        return f"{text}, but only {match.structure:.0%} of those that tell the place, from every start"
 
 
 def _is_better(match: ScanMatch, other: ScanMatch) -> bool:

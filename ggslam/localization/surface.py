@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ggslam.errors import FormatError
 from ggslam.geometry.normals import estimate_normals
@@ -38,6 +39,7 @@ SCAN_TARGET = TargetSettings(voxel=0.15, neighbour_weight=0.0)
 """For scans. The map's normals are known and its points lie on surfaces, so that the scatter of neighbouring voxels
 adds nothing to a voxel's shape; without it a cell's voxels are finished when it is read, but for those that it shares
 with others."""
+_SAMPLED_CELLS, _SAMPLED_POINTS = 12, 2000
 _NEIGHBOURS = 10
 _OPACITY_LOGIT = 3.0
 _ANYWHERE = np.array([0.36, 0.48, 0.8], np.float32)
@@ -100,6 +102,22 @@ def _rank(key: CellKey) -> int:
     """A number that no two cells within 2^21 cells share."""
     mask = (1 << _RANK_BITS) - 1
     return sum((coordinate & mask) << (_RANK_BITS * axis) for axis, coordinate in enumerate(key))
+
+
+def point_spacing(store: GridStore) -> float:
+    """Metres from a point of the map to the next one, as three of four points have it at most; 0 without points. A few
+    cells are looked at."""
+    keys = [key for key in store.cells() if POINTS in store.cell(key).parts]
+    apart = []
+    for number in np.unique(np.linspace(0, len(keys) - 1, _SAMPLED_CELLS).round().astype(int)).tolist() if keys else []:
+        try:
+            points = load_points(store, keys[number])["points"]
+        except (FormatError, KeyError):  # who needs the cell says so
+            continue
+        if len(points) > 1:
+            few = points[:: max(1, len(points) // _SAMPLED_POINTS)]
+            apart.append(cKDTree(points).query(few, 2)[0][:, 1])
+    return float(np.percentile(np.concatenate(apart), 75)) if apart else 0.0
 
 
 def surface_normals(points: np.ndarray) -> np.ndarray:

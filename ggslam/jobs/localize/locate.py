@@ -25,7 +25,7 @@ from ggslam.localization.localizer import Localization, Localizer
 from ggslam.localization.places import StoredPlaces
 from ggslam.localization.scan_tracker import ScanTracker
 from ggslam.localization.scans import ScanSequence, scan_files
-from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface
+from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface, point_spacing
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
@@ -44,7 +44,8 @@ _CELLS = "cells"
 _FARTHEST = 1e7
 """Metres from the origin of the map that a start pose may be."""
 _FINEST = 1.5
-"""A target's voxels are at least this many times as wide as those that the map was thinned with."""
+"""A target's voxels are at least this many times as wide as those that the map was thinned with, and for scans as its
+points are apart."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,8 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         context = NativeContext(request.threads)
         submaps = replace(store.settings, **chosen.submaps)
         submaps = submaps if request.radius is None else replace(submaps, partial_radius=request.radius)
-        target = _target(request, submaps, SCAN_TARGET if scans is not None else chosen.settings.tracking.target)
+        own = SCAN_TARGET if scans is not None else chosen.settings.tracking.target
+        target = _target(request, submaps, own, point_spacing(store) if scans is not None else 0.0)
         surface: Surface = (
             FullSurface(store, target, context) if request.full else PartialSurface(store, target, context, submaps)
         )
@@ -213,8 +215,8 @@ def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | N
     return truth[0]
 
 
-def _target(request: LocalizeRequest, submaps: SubmapSettings, own: TargetSettings) -> TargetSettings:
-    voxel = max(own.voxel, _FINEST * submaps.voxel)
+def _target(request: LocalizeRequest, submaps: SubmapSettings, own: TargetSettings, spacing: float) -> TargetSettings:
+    voxel = max(own.voxel, _FINEST * submaps.voxel, _FINEST * spacing)
     return replace(own, voxel=voxel if request.voxel is None else request.voxel)
 
 
