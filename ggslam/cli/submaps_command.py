@@ -46,6 +46,28 @@ SourcePath = Annotated[
                    "or laser scans) with poses."),
 ]  # fmt: skip
 
+Spacing = Annotated[
+    float | None,
+    typer.Option(
+        help="S: edge of a cell of a new store, metres (default 2, or what suits a LiDAR).", min=1e-3, max=1e6
+    ),
+]
+Axes = Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz (default), xz or xy.")]
+Voxel = Annotated[
+    float | None, typer.Option(help="Keep one point in each cube of this edge, metres; 0 keeps all.", min=0)
+]
+Radius = Annotated[
+    float | None,
+    typer.Option(help="R: record a cell from so near its centre, metres (default 1, or 0.9 S of a LiDAR).", min=0),
+]
+Refresh = Annotated[
+    float | None, typer.Option(help="T: seconds before a cell is recorded again (default 300).", min=0)
+]
+SensorRange = Annotated[
+    float | None,
+    typer.Option(help="Leave out points farther than this, metres (default 10, or what suits a LiDAR).", min=1e-3),
+]
+
 
 def submaps(
     source: SourcePath,
@@ -58,26 +80,12 @@ def submaps(
     at: Annotated[
         float | None, typer.Option(help="When this visit began, seconds on a clock that all visits share.")
     ] = None,
-    spacing: Annotated[
-        float | None,
-        typer.Option(help="S: edge of a cell of a new store, metres (default 2, or what suits a LiDAR).", min=1e-3,
-                     max=1e6),
-    ] = None,
-    axes: Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz (default), xz or xy.")] = None,
-    voxel: Annotated[
-        float | None, typer.Option(help="Keep one point in each cube of this edge, metres; 0 keeps all.", min=0)
-    ] = None,
-    radius: Annotated[
-        float | None,
-        typer.Option(help="R: record a cell from so near its centre, metres (default 1, or 0.9 S of a LiDAR).", min=0),
-    ] = None,
-    refresh: Annotated[
-        float | None, typer.Option(help="T: seconds before a cell is recorded again (default 300).", min=0)
-    ] = None,
-    sensor_range: Annotated[
-        float | None,
-        typer.Option(help="Leave out points farther than this, metres (default 10, or what suits a LiDAR).", min=1e-3),
-    ] = None,
+    spacing: Spacing = None,
+    axes: Axes = None,
+    voxel: Voxel = None,
+    radius: Radius = None,
+    refresh: Refresh = None,
+    sensor_range: SensorRange = None,
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,

@@ -155,7 +155,7 @@ class ScanAligner:
         dot = self._settings.min_normal_dot if surface.has_sides else ANY_NORMAL
         return self._match(source.dense, surface, target, guess, replace(self._settings, min_normal_dot=dot))
 
-    def settled(self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch) -> ScanMatch:
+    def settle(self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch) -> ScanMatch:
         """Aligns again from a match while that still moves it: an alignment that begins far off ends short of the
         pose, with the points that the map can contain from where it began."""
         for _ in range(_REPEATS):
@@ -176,14 +176,15 @@ class ScanAligner:
         return match.structure >= enough or match.found.overlap >= max(_PLAIN_OVERLAP, min_overlap)
 
     def search(
-        self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray, min_overlap: float
-    ) -> ScanMatch | None:
-        """Aligns from a guess that is metres and degrees off, then from places around it; ends with the first match
-        that is right. None: there is none. The surface moves to where the scan is."""
+        self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray, min_overlap: float,
+        around: bool = True,
+    ) -> ScanMatch | None:  # fmt: skip
+        """Aligns from a guess that is metres and degrees off, then, with `around`, from places around it; ends with the
+        first match that is right. None: there is none. The surface moves to where the scan is."""
         if not self._search.reach or not len(target):
             return None
         levels, up = self._levels(target)
-        for start in self._starts(guess, up):
+        for start in self._starts(guess, up) if around else [guess]:
             T = start
             for level in levels:
                 T = self._stage(source.sparse, surface, level, T)
@@ -200,7 +201,7 @@ class ScanAligner:
         """The match at a place, with the map around it."""
         if surface.move_to(T[:3, 3]) and surface.target is not None:
             target = surface.target
-        return self.settled(source, surface, target, self.fine(source, surface, target, T))
+        return self.settle(source, surface, target, self.fine(source, surface, target, T))
 
     def _starts(self, guess: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
         """The guess, turned and moved over the ground, nearest first."""
@@ -256,13 +257,13 @@ class ScanAligner:
         if self._pyramid is None or self._pyramid[0] is not target:
             voxels, levels, width = target.voxels(1), [], self._search.reach
             while width > 1.2 * _OWN_COARSE * target.voxel:
-                levels.append(_widened(voxels, width, self._context))
+                levels.append(_wider(voxels, width, self._context))
                 width /= 2
             self._pyramid = target, levels, _directions(voxels["normals"])[:, 2]
         return self._pyramid[1:]
 
 
-def _widened(voxels: dict[str, np.ndarray], width: float, context: NativeContext) -> GicpTarget:
+def _wider(voxels: dict[str, np.ndarray], width: float, context: NativeContext) -> GicpTarget:
     """Voxels of a target gathered in wider ones, `width` metres."""
     means = np.ascontiguousarray(voxels["means"])
     turns = np.ascontiguousarray(quaternions_from_normals(_unit(voxels["normals"])), np.float32)

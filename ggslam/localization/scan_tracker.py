@@ -50,48 +50,51 @@ class ScanTracker:
         self.aligner = ScanAligner(settings.scan, settings.align, settings.search, settings.sigma, context)
         self._pose = np.array(T_world_sensor, float)
         self._velocity = np.eye(4)
-        self._sure = False
+        self._located = 0
+
+    @property
+    def _sure(self) -> bool:
+        """Whether the motion is known: from then on it speaks for a pose, too."""
+        return self._located >= 2
 
     def track(self, item: np.ndarray, surface: Surface, target: GicpTarget) -> FrontEndResult:
         """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still, then a search around
-        it. Of the first scan, and after one that was lost, nothing but the match speaks for a pose: it is judged more
-        strictly."""
+        it. As long as the motion is not known, nothing but the match speaks for a pose: it is judged more strictly."""
         source = self.aligner.source(item)
         best: ScanMatch | None = None
         for guess in (self._pose @ self._velocity, self._pose):
             match = self.aligner.fine(source, surface, target, guess)
             if best is None or _is_better(match, best):
                 best = match
-            if self._convinces(best):
-                break
+            if self._is_right(best):
+                return self._outcome(best if self._sure else self.aligner.settle(source, surface, target, best))
         assert best is not None
-        if not self._convinces(best):
-            guess = self._pose @ self._velocity
-            best = self.aligner.search(source, surface, target, guess, self.settings.min_overlap) or best
-        elif not self._sure:
-            best = self.aligner.settled(source, surface, target, best)
-        return self._outcome(best)
+        guess, around = self._pose @ self._velocity, not self._convinces(best)
+        found = self.aligner.search(source, surface, target, guess, self.settings.min_overlap, around)
+        return self._outcome(found or best)
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`."""
         return None
 
+    def _is_right(self, match: ScanMatch) -> bool:
+        return match.counted >= self.settings.min_counted and self.aligner.is_right(match, self.settings.min_overlap)
+
     def _convinces(self, match: ScanMatch) -> bool:
-        if match.counted < self.settings.min_counted or match.found.status is AlignmentStatus.LOST:
-            return False
-        if self._sure:
-            return match.found.overlap >= self.settings.min_overlap
-        return self.aligner.is_right(match, self.settings.min_overlap)
+        if not self._sure or match.counted < self.settings.min_counted:
+            return self._is_right(match)
+        enough = match.found.overlap >= self.settings.min_overlap
+        return enough and match.found.status is not AlignmentStatus.LOST
 
     def _outcome(self, match: ScanMatch) -> FrontEndResult:
         found = match.found
         if not self._convinces(match):
-            self._velocity, self._sure = np.eye(4), False
+            self._velocity, self._located = np.eye(4), 0
             pose, status = self._pose.copy(), LocalizationStatus.LOST
             return FrontEndResult(pose, status, found.overlap, found.rmse, self._why_lost(match), match.beyond)
         T = orthonormalize(found.T_world_camera)
-        self._velocity = inverse(self._pose) @ T if self._sure else np.eye(4)
-        self._pose, self._sure = T, True
+        self._velocity = inverse(self._pose) @ T if self._located else np.eye(4)
+        self._pose, self._located = T, self._located + 1
         status = LocalizationStatus.DEGENERATE if found.degenerate else LocalizationStatus.OK
         return FrontEndResult(T.copy(), status, found.overlap, found.rmse, "", match.beyond)
 

@@ -13,7 +13,7 @@ import numpy as np
 from ggslam.errors import ConfigError, FormatError, SequenceError
 from ggslam.formats.trajectory import read_trajectory
 from ggslam.jobs.progress import Observer
-from ggslam.jobs.submaps.sensor_settings import settings_of_cloud, settings_of_scans, told, with_chosen
+from ggslam.jobs.submaps.sensor_settings import settings_of_cloud, settings_of_scans, in_words, with_chosen
 from ggslam.jobs.submaps.stores import (
     INDOORS,
     Cloud,
@@ -203,7 +203,7 @@ def _settings(request: SubmapsRequest, cloud: Cloud | None, observer: Observer) 
         base = settings_of_scans(_scans(request))
     settings = with_chosen(base, request.settings)
     if base != INDOORS:
-        observer.note(f"the store's settings suit the {'cloud' if cloud is not None else 'scanner'}: {told(settings)}")
+        observer.note(f"the store's settings suit the {'cloud' if cloud is not None else 'scanner'}: {in_words(settings)}")
     return settings
 
 

@@ -76,7 +76,7 @@ def with_chosen(settings: SubmapSettings, chosen: Mapping[str, Any]) -> SubmapSe
     return replace(settings, **({"radius": _NEAR_CENTRE * edge} if follows else {}), **chosen)
 
 
-def told(settings: SubmapSettings) -> str:
+def in_words(settings: SubmapSettings) -> str:
     """The lengths in one line."""
     s = settings
     return (
@@ -88,14 +88,14 @@ def told(settings: SubmapSettings) -> str:
 def _of_reach(reach: float, farthest: float, cut: bool) -> SubmapSettings:
     if reach <= INDOORS.partial_radius:
         return INDOORS
-    radius = min(_FARTHEST, _rounded(reach))
+    radius = min(_FARTHEST, _round_up(reach))
     spacing = max(INDOORS.spacing, round(radius / (_CUT_CELLS if cut else _CELLS)))
     return replace(
         INDOORS, partial_radius=radius, spacing=spacing, radius=_NEAR_CENTRE * spacing,
-        sensor_range=min(_FARTHEST, max(radius, _rounded(farthest))), voxel=round(radius / _VOXELS, 2),
+        sensor_range=min(_FARTHEST, max(radius, _round_up(farthest))), voxel=round(radius / _VOXELS, 2),
         change_distance=max(INDOORS.change_distance, 2 * radius / _VOXELS), lookahead=max(INDOORS.lookahead, spacing),
     )  # fmt: skip
 
 
-def _rounded(metres: float) -> float:
+def _round_up(metres: float) -> float:
     return _STEP * math.ceil(metres / _STEP - 1e-9)
