@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from ggslam.jobs.localize.settings import LocalizeSettings
 from ggslam.slam.config import Config, presets
 from ggslam.system.settings import Known, group_of, walk
 
@@ -41,6 +42,13 @@ Names that do not exist and values out of their range are refused before a run b
 `tracking.photometric.shrink: expected 1 to 16, found 0`. Every run writes all settings, with their values, to
 `config.yaml` in its folder. `ggslam run --help-settings` prints the table below, `--help-setting all` every setting,
 `--help-setting depth` those with "depth" in their names. In Python: `Config(mapping={{"iterations_per_frame": 8}})`.
+"""
+
+
+_STORED = """# Settings of stored maps
+
+`ggslam localize` takes these with `--set`, and `tracking.*` as above; `ggslam submaps` takes `submaps.*`. Lengths of
+`submaps` that are not set are the store's own, and of a new store, or of a cloud, what suits the sensor.
 """
 
 
@@ -89,15 +97,24 @@ def groups(kind: type, path: str = "") -> Iterator[tuple[str, str]]:
             yield from groups(group, f"{path}{name}.")
 
 
+def sections(kind: type, known: list[Known]) -> list[str]:
+    """A heading, a text and a table for each group of settings."""
+    parts = []
+    for path, text in groups(kind):
+        if inside := [one for one in known if one.path.rpartition(".")[0] == path.rstrip(".")]:
+            parts += [f"## {path.rstrip('.') or 'General'}", "", text, "", table(inside)]
+    return parts
+
+
 def page() -> str:
     """The whole page."""
     known = list(walk(Config))
+    stored = [one for one in walk(LocalizeSettings) if not one.path.startswith("tracking.")]
     parts = [_INTRODUCTION.format(presets=", ".join(f"`{name}`" for name in presets()))]
     parts += ["## The ones to know", "", table(one for one in known if one.declaration.basic)]
     parts += ["Those below are for experts, all of them by their groups.", ""]
-    for path, text in groups(Config):
-        if inside := [one for one in known if one.path.rpartition(".")[0] == path.rstrip(".")]:
-            parts += [f"## {path.rstrip('.') or 'General'}", "", text, "", table(inside)]
+    parts += sections(Config, known)
+    parts += [_STORED, *sections(LocalizeSettings, stored)]
     return "\n".join(parts)
 
 

@@ -23,6 +23,8 @@ EPILOG = """
   ggslam localize office.grid scans/tuesday --start-pose "12.5 3 1.3 0 0 0 1"
 
   ggslam localize campus.pcd scans/tuesday --start-pose given --full-map --out localized/full
+
+  ggslam localize campus.pcd scans/tuesday --start-pose given --set scans.search.reach=4 --set scans.scan.farthest=100
 """
 
 _OTHER_WORLD = 4.0
@@ -51,7 +53,8 @@ FullMap = Annotated[bool, typer.Option("--full-map", help="Align to the whole ma
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")]
 Radius = Annotated[
     float | None,
-    typer.Option(help="R': align to cells whose centres are so near, metres; default: the map's.", min=0, max=1e7),
+    typer.Option(help="R': align to cells whose centres are so near, metres; default: the map's, of a cloud what suits "
+                 "the scanner.", min=0, max=1e7),
 ]
 Voxel = Annotated[
     float | None,
@@ -84,6 +87,7 @@ def localize(
     columns: options.Columns = None,
     skip_bad_frames: options.SkipBadFrames = False,
     threads: options.Threads = None,
+    settings: options.Settings = None,
 ) -> None:
     """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
     from ggslam.jobs.localize.locate import LocalizeRequest
@@ -99,7 +103,7 @@ def localize(
             depth_delay=depth_delay, upright=upright,
         ),
         start_pose=start_pose, no_start_pose=no_start_pose, full=full_map, out=out, radius=radius, voxel=voxel,
-        columns=columns, threads=threads,
+        columns=columns, threads=threads, overrides=settings or [],
     )  # fmt: skip
     with progress_bar() as bar:
         report = locate_all(request, ProgressObserver(bar))

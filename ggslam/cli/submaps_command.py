@@ -16,7 +16,7 @@ from ggslam.cli.observer import ProgressObserver
 from ggslam.system.json_files import json_ready
 
 if TYPE_CHECKING:
-    from ggslam.jobs.submaps.fill import StoreListing
+    from ggslam.jobs.submaps.fill import StoreListing, SubmapsRequest
     from ggslam.submaps.store_objects import ObjectEvent
 
 EPILOG = """
@@ -27,6 +27,8 @@ EPILOG = """
   ggslam submaps data/kitchen_again --out kitchen.grid --visit tuesday --poses localized/kitchen_again/trajectory.txt
 
   ggslam submaps kitchen.grid --since tuesday
+
+  ggslam submaps scans/monday --out campus.grid --set submaps.partial_radius=40
 """
 
 _PROBLEMS = 5
@@ -44,6 +46,28 @@ SourcePath = Annotated[
                    "or laser scans) with poses."),
 ]  # fmt: skip
 
+Spacing = Annotated[
+    float | None,
+    typer.Option(
+        help="S: edge of a cell of a new store, metres (default 2, or what suits a LiDAR).", min=1e-3, max=1e6
+    ),
+]
+Axes = Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz (default), xz or xy.")]
+Voxel = Annotated[
+    float | None, typer.Option(help="Keep one point in each cube of this edge, metres; 0 keeps all.", min=0)
+]
+Radius = Annotated[
+    float | None,
+    typer.Option(help="R: record a cell from so near its centre, metres (default 1, or 0.9 S of a LiDAR).", min=0),
+]
+Refresh = Annotated[
+    float | None, typer.Option(help="T: seconds before a cell is recorded again (default 300).", min=0)
+]
+SensorRange = Annotated[
+    float | None,
+    typer.Option(help="Leave out points farther than this, metres (default 10, or what suits a LiDAR).", min=1e-3),
+]
+
 
 def submaps(
     source: SourcePath,
@@ -56,22 +80,12 @@ def submaps(
     at: Annotated[
         float | None, typer.Option(help="When this visit began, seconds on a clock that all visits share.")
     ] = None,
-    spacing: Annotated[
-        float | None, typer.Option(help="S: edge of a cell of a new store, metres (default 2).", min=1e-3, max=1e6)
-    ] = None,
-    axes: Annotated[str | None, typer.Option(help="World axes of a new store's grid: xyz (default), xz or xy.")] = None,
-    voxel: Annotated[
-        float | None, typer.Option(help="Keep one point in each cube of this edge, metres; 0 keeps all.", min=0)
-    ] = None,
-    radius: Annotated[
-        float | None, typer.Option(help="R: record a cell from so near its centre, metres (default 1).", min=0)
-    ] = None,
-    refresh: Annotated[
-        float | None, typer.Option(help="T: seconds before a cell is recorded again (default 300).", min=0)
-    ] = None,
-    sensor_range: Annotated[
-        float | None, typer.Option(help="Leave out points farther than this, metres (default 10).", min=1e-3)
-    ] = None,
+    spacing: Spacing = None,
+    axes: Axes = None,
+    voxel: Voxel = None,
+    radius: Radius = None,
+    refresh: Refresh = None,
+    sensor_range: SensorRange = None,
     start: options.Start = 0,
     stop: options.Stop = None,
     stride: options.Stride = 1,
@@ -81,31 +95,37 @@ def submaps(
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
     columns: options.Columns = None,
+    overrides: options.Settings = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what is in the store as JSON.")] = False,
 ) -> None:  # fmt: skip
     """Make a grid store, add a visit to one, or list its cells, parts, visits, objects and what changed."""
-    from ggslam.jobs.changes.store_visits import add_run
-    from ggslam.jobs.submaps.fill import SubmapsRequest, list_store, make_store
+    from ggslam.jobs.submaps.fill import SubmapsRequest, list_store
+    from ggslam.jobs.submaps.settings import store_overrides
     from ggslam.runs.recordings import SequenceRequest
 
     if out is not None:
-        settings = {"spacing": spacing, "axes": axes, "voxel": voxel, "radius": radius, "refresh": refresh,
-                    "sensor_range": sensor_range}  # fmt: skip
-        request = SubmapsRequest(
-            source, out, visit, poses, at, {name: value for name, value in settings.items() if value is not None},
-            SequenceRequest(
-                source, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
-                camera=camera, intrinsics=intrinsics,
-            ), columns,
+        given = {"spacing": spacing, "axes": axes, "voxel": voxel, "radius": radius, "refresh": refresh,
+                 "sensor_range": sensor_range}  # fmt: skip
+        settings = {**store_overrides(overrides), **{name: v for name, v in given.items() if v is not None}}
+        reading = SequenceRequest(
+            source, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
+            camera=camera, intrinsics=intrinsics,
         )  # fmt: skip
-        with progress_bar() as bar:
-            observer = ProgressObserver(bar)
-            make_store(request, observer, partial(add_run, observer=observer))
+        _make(SubmapsRequest(source, out, visit, poses, at, settings, reading, columns))
     listing = list_store(source if out is None else out, since)
     if as_json:
         typer.echo(json.dumps(json_ready(listing.to_dict()), indent=1))
     else:
         _print(listing)
+
+
+def _make(request: SubmapsRequest) -> None:
+    from ggslam.jobs.changes.store_visits import add_run
+    from ggslam.jobs.submaps.fill import make_store
+
+    with progress_bar() as bar:
+        observer = ProgressObserver(bar)
+        make_store(request, observer, partial(add_run, observer=observer))
 
 
 def _print(listing: StoreListing) -> None:

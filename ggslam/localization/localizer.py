@@ -53,6 +53,7 @@ class FrontEndResult:
         overlap: share of its points with a match near enough.
         rmse_m: root mean square point-to-plane distance of those, metres.
         reason: why it was lost or how it was found, else empty.
+        beyond: share of its points that lie beyond what the map in memory can contain; they do not count.
     """
 
     T_world_sensor: np.ndarray
@@ -60,6 +61,7 @@ class FrontEndResult:
     overlap: float
     rmse_m: float
     reason: str = ""
+    beyond: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,8 @@ class Localizer(Generic[Item]):
         self._follow(found)
         spent = time.perf_counter() - began
         return Localization(
-            found.T_world_sensor, found.status, found.overlap, found.rmse_m, found.reason, self.surface.points,
-            changed, map_seconds, spent - map_seconds,
+            found.T_world_sensor, found.status, found.overlap, found.rmse_m, found.reason, found.beyond,
+            self.surface.points, changed, map_seconds, spent - map_seconds,
         )  # fmt: skip
 
     def _move(self) -> bool:

@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import field
 
 import numpy as np
 
-from ggslam.localization.localizer import ANY_NORMAL, FrontEndResult, LocalizationStatus
+from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
+from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, SearchSettings
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.settings import setting, settings_class
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
-from ggslam.tracking.scan_points import ScanSettings, scan_points
-from ggslam.tracking.settings import AlignSettings, DepthNoise
+from ggslam.tracking.gicp import AlignmentStatus, GicpTarget
+from ggslam.tracking.scan_points import ScanSettings
+from ggslam.tracking.settings import AlignSettings
 
 
 @settings_class(frozen=True)
@@ -27,8 +28,12 @@ class ScanTrackerSettings:
     """Standard deviation of a range."""
     align: AlignSettings = field(default_factory=lambda: AlignSettings(min_normal_dot=0.0, coarse_iterations=8))
     """The points' "normals" point to the sensor, hence the cosine."""
+    search: SearchSettings = field(default_factory=SearchSettings)
+    """How a scan is located whose start is far off."""
     min_overlap: float = setting(0.5, 0, 0.9)
-    """Under this share of points that match, the scan is lost."""
+    """Under this share of points that match, of those that the map can contain, the scan is lost."""
+    min_counted: int = setting(200, 6, 10**6)
+    """Points that the map can contain; with fewer the scan is lost."""
 
 
 class ScanTracker:
@@ -42,39 +47,69 @@ class ScanTracker:
 
     def __init__(self, settings: ScanTrackerSettings, context: NativeContext, T_world_sensor: np.ndarray) -> None:
         self.settings = settings
-        self._context = context
+        self.aligner = ScanAligner(settings.scan, settings.align, settings.search, settings.sigma, context)
         self._pose = np.array(T_world_sensor, float)
         self._velocity = np.eye(4)
+        self._located = 0
+
+    @property
+    def _sure(self) -> bool:
+        """Whether the motion is known: from then on it speaks for a pose, too."""
+        return self._located >= 2
 
     def track(self, item: np.ndarray, surface: Surface, target: GicpTarget) -> FrontEndResult:
-        """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still."""
-        best: AlignmentResult | None = None
-        source = scan_points(item, self.settings.scan)
-        dot = self.settings.align.min_normal_dot if surface.has_sides else ANY_NORMAL
-        settings = replace(self.settings.align, min_normal_dot=dot)
-        noise = DepthNoise(self.settings.sigma, 0.0)
+        """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still, then a search around
+        it. As long as the motion is not known, nothing but the match speaks for a pose: it is judged more strictly."""
+        source = self.aligner.source(item)
+        best: ScanMatch | None = None
         for guess in (self._pose @ self._velocity, self._pose):
-            found = align(source, target, guess, settings, noise, self._context)
-            if best is None or (found.status is not AlignmentStatus.LOST and found.overlap > best.overlap):
-                best = found
-            if self._convinces(best):
-                break
+            match = self.aligner.fine(source, surface, target, guess)
+            if best is None or _is_better(match, best):
+                best = match
+            if self._is_right(best):
+                return self._outcome(best if self._sure else self.aligner.settle(source, surface, target, best))
         assert best is not None
-        return self._outcome(best, len(source))
+        guess, around = self._pose @ self._velocity, not self._convinces(best)
+        found = self.aligner.search(source, surface, target, guess, self.settings.min_overlap, around)
+        return self._outcome(found or best)
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`."""
         return None
 
-    def _convinces(self, found: AlignmentResult) -> bool:
-        return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.min_overlap
+    def _is_right(self, match: ScanMatch) -> bool:
+        return match.counted >= self.settings.min_counted and self.aligner.is_right(match, self.settings.min_overlap)
 
-    def _outcome(self, found: AlignmentResult, count: int) -> FrontEndResult:
-        if not self._convinces(found):
-            self._velocity = np.eye(4)
-            reason = f"{found.overlap:.0%} of {count} points match the map, {self.settings.min_overlap:.0%} needed"
-            return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, found.overlap, found.rmse, reason)
+    def _convinces(self, match: ScanMatch) -> bool:
+        if not self._sure or match.counted < self.settings.min_counted:
+            return self._is_right(match)
+        enough = match.found.overlap >= self.settings.min_overlap
+        return enough and match.found.status is not AlignmentStatus.LOST
+
+    def _outcome(self, match: ScanMatch) -> FrontEndResult:
+        found = match.found
+        if not self._convinces(match):
+            self._velocity, self._located = np.eye(4), 0
+            pose, status = self._pose.copy(), LocalizationStatus.LOST
+            return FrontEndResult(pose, status, found.overlap, found.rmse, self._why_lost(match), match.beyond)
         T = orthonormalize(found.T_world_camera)
-        self._velocity, self._pose = inverse(self._pose) @ T, T
+        self._velocity = inverse(self._pose) @ T if self._located else np.eye(4)
+        self._pose, self._located = T, self._located + 1
         status = LocalizationStatus.DEGENERATE if found.degenerate else LocalizationStatus.OK
-        return FrontEndResult(T.copy(), status, found.overlap, found.rmse)
+        return FrontEndResult(T.copy(), status, found.overlap, found.rmse, "", match.beyond)
+
+    def _why_lost(self, match: ScanMatch) -> str:
+        overlap, needed = match.found.overlap, self.settings.min_overlap
+        if match.counted < self.settings.min_counted:
+            return (
+                f"only {match.counted} of {match.total} points lie where the map in memory reaches, "
+                f"{self.settings.min_counted} needed"
+            )
+        text = f"{overlap:.0%} of {match.counted} points match the map, {needed:.0%} needed"
+        if overlap < needed:
+            return text
+        return f"{text}, but only {match.structure:.0%} of those that tell the place, from every start"
+
+
+def _is_better(match: ScanMatch, other: ScanMatch) -> bool:
+    return match.found.status is not AlignmentStatus.LOST and match.found.overlap > other.found.overlap

@@ -18,9 +18,11 @@ from types import TracebackType
 from typing import Protocol
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ggslam.errors import FormatError
 from ggslam.geometry.normals import estimate_normals
+from ggslam.localization.coverage import Coverage, Everywhere, coverage_of, reach_of
 from ggslam.native.loader import NativeContext
 from ggslam.scene.origin import is_far, local_origin
 from ggslam.submaps.cell_keys import CellKey
@@ -41,6 +43,7 @@ SCAN_TARGET = TargetSettings(voxel=0.15, neighbour_weight=0.0)
 """For scans. The map's normals are known and its points lie on surfaces, so that the scatter of neighbouring voxels
 adds nothing to a voxel's shape; without it a cell's voxels are finished when it is read, but for those that it shares
 with others."""
+_SAMPLED_CELLS, _SAMPLED_POINTS = 12, 2000
 _NEIGHBOURS = 10
 _OPACITY_LOGIT = 3.0
 _ANYWHERE = np.array([0.36, 0.48, 0.8], np.float32)
@@ -79,10 +82,11 @@ def load_surface(
 
 @dataclass(frozen=True)
 class SurfaceCell:
-    """A cell of the map as part of targets; `has_sides`: see `Surface`."""
+    """A cell of the map as part of targets; `has_sides`: see `Surface`; `reach`: see `reach_of`."""
 
     part: TargetPart
     has_sides: bool
+    reach: float
 
 
 class SurfaceLoader:
@@ -99,9 +103,8 @@ class SurfaceLoader:
         flat = np.log(self.settings.voxel * np.array([1, 1, FLATNESS])).astype(np.float32)
         log_scales, opacity_logits = np.tile(flat, (len(points), 1)), np.full(len(points), _OPACITY_LOGIT, np.float32)
         rank = _rank(key)
-        return SurfaceCell(
-            TargetPart(points, turn, log_scales, opacity_logits, self.settings, self.context, rank), has_sides
-        )
+        part = TargetPart(points, turn, log_scales, opacity_logits, self.settings, self.context, rank)
+        return SurfaceCell(part, has_sides, reach_of(points + self.origin, key, store.grid))
 
 
 def _rank(key: CellKey) -> int:
@@ -109,6 +112,22 @@ def _rank(key: CellKey) -> int:
     mask = (1 << _RANK_BITS) - 1
     half = 1 << (_RANK_BITS - 1)  # neighbours about zero are in order, too
     return sum(((coordinate + half) & mask) << (_RANK_BITS * axis) for axis, coordinate in enumerate(key))
+
+
+def point_spacing(store: GridStore) -> float:
+    """Metres from a point of the map to the next one, as three of four points have it at most; 0 without points. A few
+    cells are looked at."""
+    keys = [key for key in store.cells() if POINTS in store.cell(key).parts]
+    apart = []
+    for number in np.unique(np.linspace(0, len(keys) - 1, _SAMPLED_CELLS).round().astype(int)).tolist() if keys else []:
+        try:
+            points = load_points(store, keys[number])["points"]
+        except (FormatError, KeyError):  # who needs the cell says so
+            continue
+        if len(points) > 1:
+            few = points[:: max(1, len(points) // _SAMPLED_POINTS)]
+            apart.append(cKDTree(points).query(few, 2)[0][:, 1])
+    return float(np.percentile(np.concatenate(apart), 75)) if apart else 0.0
 
 
 def surface_normals(points: np.ndarray) -> np.ndarray:
@@ -140,6 +159,9 @@ class Surface(Protocol):
     def move_to(self, position: np.ndarray, velocity: np.ndarray | None = None) -> bool:
         """Makes the target that of a place [3] in the world; whether it is another one than before."""
 
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """Whether the target can contain world points [n, 3]: those that lie elsewhere say nothing about a pose."""
+
     def close(self) -> None:
         """Nothing is asked of it any more."""
 
@@ -163,6 +185,7 @@ class PartialSurface:
         self.target: GicpTarget | None = None
         self.has_sides = True
         self.points = 0
+        self._coverage: Coverage = Everywhere()
         self.damage: set[str] = set()
         """What is wrong with cells that were within R' and cannot be read."""
 
@@ -180,6 +203,8 @@ class PartialSurface:
         cells = self.map.cells.values()
         self.points = sum(cell.part.count for cell in cells)
         self.has_sides = all(cell.has_sides for cell in cells)
+        reaches = {key: cell.reach for key, cell in self.map.cells.items()}
+        self._coverage = coverage_of(reaches, self.map.settings, np.asarray(position, np.float64))
         parts, like = [cell.part for cell in cells], self.target
         self.target = None
         if self.points:
@@ -191,6 +216,10 @@ class PartialSurface:
         self._origin = origin
         loader = SurfaceLoader(self._settings, self._context, origin)
         return CellsAround(self._store, loader, POINTS, lambda cell: cell.part.nbytes, self._submaps)
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """See `Surface`."""
+        return self._coverage.covers(points)
 
     def close(self) -> None:
         """Ends loading ahead."""
@@ -216,6 +245,7 @@ class FullSurface:
         self.damage: list[str] = []
         self._store, self._settings, self._context = store, settings, context
         self._read = False
+        self._coverage: Coverage = Everywhere()
 
     def move_to(self, position: np.ndarray, velocity: np.ndarray | None = None) -> bool:
         """See `Surface`; the first call reads the map."""
@@ -223,14 +253,20 @@ class FullSurface:
             return False
         self._read = True
         loader = SurfaceLoader(self._settings, self._context, local_origin(position))
-        cells = [cell for key in self._store.cells() if (cell := self._cell(loader, key)) is not None]
+        held = {key: cell for key in self._store.cells() if (cell := self._cell(loader, key)) is not None}
+        cells = held.values()
         self.points = sum(cell.part.count for cell in cells)
+        self._coverage = coverage_of({key: cell.reach for key, cell in held.items()}, self._store.settings)
         if not self.points:
             return False
         self.has_sides = all(cell.has_sides for cell in cells)
         parts = [cell.part for cell in cells]
         self.target = composed_target(parts, self._settings, self._context, origin=loader.origin)
         return True
+
+    def covers(self, points: np.ndarray) -> np.ndarray:
+        """See `Surface`."""
+        return self._coverage.covers(points)
 
     def close(self) -> None:
         """Nothing to end."""

@@ -25,6 +25,7 @@ from ggslam.slam.object_masks import MaskSettings
 from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.system.atomic import write_text
 from ggslam.system.foreign import given_path, read_foreign_text
+from ggslam.system.overrides import with_overrides
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
@@ -128,8 +129,6 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
     Raises:
         ConfigError: naming the file and the setting.
     """
-    if overrides is not None and (isinstance(overrides, (str, bytes)) or not isinstance(overrides, Sequence)):
-        raise ConfigError(f'`overrides`: expected a list like ["mapping.iterations_per_frame=1"], found {overrides!r}')
     values: dict[str, Any] = {}
     origin = "settings"
     if preset_or_file is not None:
@@ -138,24 +137,8 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
             path = presets()[str(preset_or_file)]
         values, origin = _read_yaml(path), str(path)
         config_from_dict(values, origin)
-    for override in overrides or []:
-        name, equals, text = override.partition("=")
-        if not equals:
-            raise ConfigError(f"`overrides` {override}: expected name=value")
-        try:
-            value = parse_yaml(text)
-        except PlainYamlError as error:
-            raise ConfigError(f"`overrides` {override}: cannot be read as a value: {error}") from None
-        _assign(values, name.strip().split("."), value, override)
+    with_overrides(overrides, values)
     return config_from_dict(values, "`overrides`" if overrides else origin)
-
-
-def _assign(values: dict[str, Any], names: list[str], value: Any, override: str) -> None:
-    for name in names[:-1]:
-        values = values.setdefault(name, {})
-        if not isinstance(values, dict):
-            raise ConfigError(f"`overrides` {override}: {name} is a value, not a group")
-    values[names[-1]] = value
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

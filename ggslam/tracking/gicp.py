@@ -153,6 +153,13 @@ class GicpTarget:
         self._library.ggslam_gicp_target_voxels(self.handle, level, address(rows))
         return {"means": rows[:, :3], "weights": rows[:, 3], "normals": rows[:, 4:7], "covariances": rows[:, 8:14]}
 
+    def normals(self, voxels: np.ndarray) -> np.ndarray:
+        """Unit normals float32 [n, 3] of fine voxels by index [n]; zero where that is negative."""
+        indices = np.ascontiguousarray(voxels, np.int32)
+        found = np.empty((len(indices), 3), np.float32)
+        self._library.ggslam_gicp_target_normals(self.handle, address(indices), len(indices), address(found))
+        return found
+
 
 def native_target_settings(settings: TargetSettings, voxel: float) -> structures.TargetSettings:
     """The core's form of the settings, with `voxel` metres for the edge of a fine voxel."""

@@ -7,7 +7,7 @@ in pictures; column 0 is where x is smallest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -138,11 +138,11 @@ def slice_field(
         hit |= (found <= cell / 2) & (found >= -cell)
         through |= np.abs(found) <= along * resolution / 2 + _ROUGH * field.voxel
     distance, occupied = least.reshape(height, width), hit.reshape(height, width)
-    octants = measured_octants(field.tsdf)
-    points = _cells_with_points(octants, field.voxel, plane, resolution, (low, high), occupied.shape)
+    octants, local = measured_octants(field.tsdf), replace(plane, origin=plane.origin - field.origin)
+    points = _cells_with_points(octants, field.voxel, local, resolution, (low, high), occupied.shape)
     lone = octants[_thin_octants(octants, field)]
     points &= through.reshape(height, width) | _cells_with_points(
-        lone, field.voxel, plane, resolution, (low, high), occupied.shape
+        lone, field.voxel, local, resolution, (low, high), occupied.shape
     )
     # Where what is behind one side of a thing meets space seen free from another, the field has a surface that nobody
     # saw.
@@ -154,9 +154,10 @@ def slice_field(
 
 
 def _thin_octants(octants: np.ndarray, field: DistanceField) -> np.ndarray:
-    """Which octants [N, 3] lie in voxels that are surface for their points alone, bool [N]."""
+    """Which octants [N, 3] (from the field's origin) lie in voxels that are surface for their points alone, bool [N]."""
     points, normals = field.surface()
-    voxels = [np.floor(p / field.voxel).astype(np.int64) for p in (points[~normals.any(1)].astype(float), octants)]
+    lone = points[~normals.any(1)].astype(float) - field.origin
+    voxels = [np.floor(p / field.voxel).astype(np.int64) for p in (lone, octants)]
     thin, own = ((v[:, 0] << 42) + (v[:, 1] << 21) + v[:, 2] for v in voxels)
     return np.isin(own, thin)
 

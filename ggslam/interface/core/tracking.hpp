@@ -154,6 +154,9 @@ GGSLAM_EXPORT int ggslam_gicp_target_moments(const void* target, int level, floa
 // Copies a level's voxels, [n, 16] in the order of struct Voxel.
 GGSLAM_EXPORT int ggslam_gicp_target_voxels(const void* target, int level, float* out);
 
+// Copies the unit normals of some fine voxels, [n, 3]; zero where the index is negative.
+GGSLAM_EXPORT int ggslam_gicp_target_normals(const void* target, const int32_t* voxels, int64_t count, float* out);
+
 // Number of blocks of a level. Copies them unless `out` is null: [n, 3] key, occupied, first.
 GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target, int level, uint64_t* out);
 

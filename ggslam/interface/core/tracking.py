@@ -8,7 +8,7 @@ from ctypes import POINTER, Structure, c_double, c_float, c_int, c_int32, c_int6
 from typing import Any
 
 HEADER = "core/tracking.hpp"
-HEADER_SHA256 = "96fb5d1f871f370458b09b6b21258e663cd89b5d585ac4d415a888796fc0e0d6"
+HEADER_SHA256 = "320c2a5b729dfe7de799b815a71f2b6b5eb2e3654dd22af498ae740ea56e1f5b"
 
 
 class DepthPointsSettings(Structure):
@@ -132,6 +132,7 @@ FUNCTIONS: dict[str, tuple[Any, list[Any]]] = {
     "ggslam_gicp_target_size": (c_int, [c_void_p, c_int]),
     "ggslam_gicp_target_moments": (c_int, [c_void_p, c_int, c_void_p]),
     "ggslam_gicp_target_voxels": (c_int, [c_void_p, c_int, c_void_p]),
+    "ggslam_gicp_target_normals": (c_int, [c_void_p, c_void_p, c_int64, c_void_p]),
     "ggslam_gicp_target_blocks": (c_int, [c_void_p, c_int, c_void_p]),
     "ggslam_target_part_create": (c_void_p, [c_void_p, POINTER(TargetInput), POINTER(TargetSettings), c_uint64]),
     "ggslam_target_part_destroy": (c_int, [c_void_p]),

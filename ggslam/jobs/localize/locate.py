@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Sequence as Several
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +16,16 @@ import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.localize.report import LocalizationReport, write_localization
+from ggslam.jobs.localize.settings import LocalizeSettings, localize_settings
 from ggslam.jobs.progress import Observer
+from ggslam.jobs.submaps.sensor_settings import settings_of_scans, with_chosen
 from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
 from ggslam.localization.frames import FrameTracker
 from ggslam.localization.localizer import Localization, Localizer
 from ggslam.localization.places import StoredPlaces
-from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
+from ggslam.localization.scan_tracker import ScanTracker
 from ggslam.localization.scans import ScanSequence, scan_files
-from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface
+from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface, point_spacing
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
@@ -32,7 +36,7 @@ from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.links import refuse_links_below, remove_folder
-from ggslam.tracking.settings import TargetSettings, TrackerSettings
+from ggslam.tracking.settings import TargetSettings
 
 GIVEN = "given"
 """As a start pose: the recording's own first pose."""
@@ -40,7 +44,8 @@ _CELLS = "cells"
 _FARTHEST = 1e7
 """Metres from the origin of the map that a start pose may be."""
 _FINEST = 1.5
-"""A target's voxels are at least this many times as wide as those that the map was thinned with."""
+"""A target's voxels are at least this many times as wide as those that the map was thinned with, and for scans as its
+points are apart."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ class LocalizeRequest:
         voxel: edge of the target's voxels in metres; None: 0.03 for images, 0.15 for scans, or what the map allows.
         columns: numbers of a point in .bin scans; None: as they tell themselves.
         threads: None: all processors.
-        tracker, scans: settings of the front-ends.
+        overrides: settings as "name.of.setting=value", see `LocalizeSettings`.
     """
 
     map: Path
@@ -71,8 +76,7 @@ class LocalizeRequest:
     voxel: float | None = None
     columns: int | None = None
     threads: int | None = None
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
-    scans: ScanTrackerSettings = field(default_factory=ScanTrackerSettings)
+    overrides: Several[str] = ()
 
 
 def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport:
@@ -84,6 +88,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     """
     if request.start_pose is not None and request.no_start_pose:
         raise ConfigError("`start_pose` and `no_start_pose`: one of them")
+    chosen = localize_settings(request.overrides)
     out = request.out or Path("localized") / request.sequence.path.resolve().name
     with ExitStack() as opened:
         recording = _open_recording(request)
@@ -93,17 +98,19 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
                 f"{recording.path}: laser scans have no images to look the place of the first one up by: give its "
                 f'pose with `start_pose` "x y z qx qy qz qw", or `start_pose` {GIVEN} where the recording has poses'
             )
-        store = open_map(request.map, opened, observer)
+        scans = recording if isinstance(recording, ScanSequence) else None
+        store = open_map(request.map, opened, observer, partial(_of_cloud, scans, chosen.submaps, observer))
         context = NativeContext(request.threads)
-        settings = store.settings
-        submaps = settings if request.radius is None else replace(settings, partial_radius=request.radius)
-        target = _target(request, submaps, isinstance(recording, ScanSequence))
+        submaps = replace(store.settings, **chosen.submaps)
+        submaps = submaps if request.radius is None else replace(submaps, partial_radius=request.radius)
+        own = SCAN_TARGET if scans is not None else chosen.settings.tracking.target
+        target = _target(request, submaps, own, point_spacing(store) if scans is not None else 0.0)
         surface: Surface = (
             FullSurface(store, target, context) if request.full else PartialSurface(store, target, context, submaps)
         )
         opened.callback(surface.close)
         places = None if isinstance(recording, ScanSequence) else _places(request, recording, store, start, observer)
-        localizer = _localizer(request, recording, places, surface, context, start)
+        localizer = _localizer(chosen.settings, recording, places, surface, context, start)
         results, error = _run(localizer, recording, observer)
         if error is not None and not results:
             raise error
@@ -111,7 +118,10 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         report = LocalizationReport(
             str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
+            submaps.partial_radius,
         )  # fmt: skip
+    for warning in report.warnings():
+        observer.note(warning)
     with delay_interrupts():
         write_localization(report, out, observer)
     if error is not None:
@@ -120,9 +130,11 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     return report
 
 
-def open_map(path: Path, opened: ExitStack, observer: Observer) -> GridStore:
+def open_map(
+    path: Path, opened: ExitStack, observer: Observer, of_cloud: Callable[[], SubmapSettings] | None = None
+) -> GridStore:
     """The store of a folder, of a run (made in RUN/cells if it is not there or not of this run), or of a cloud (made in
-    a temporary folder). `opened` closes and removes what is to be.
+    a temporary folder). `opened` closes and removes what is to be; `of_cloud` gives the settings for a cloud.
 
     Raises:
         FormatError, RunFolderError: it is none of them, or damaged.
@@ -133,10 +145,20 @@ def open_map(path: Path, opened: ExitStack, observer: Observer) -> GridStore:
     if is_cloud(path):
         observer.note(f"{path} is cut into cells; `ggslam submaps` keeps them for the next time")
         folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="ggslam-")))
-        store = opened.enter_context(GridStore.create(folder / _CELLS, replace(INDOORS, voxel=0.0)))
+        settings = replace(INDOORS, voxel=0.0) if of_cloud is None else of_cloud()
+        store = opened.enter_context(GridStore.create(folder / _CELLS, settings))
         store_of_cloud(path, store)
         return store
     return opened.enter_context(_store_in_run(path, observer))
+
+
+def _of_cloud(scans: ScanSequence | None, chosen: Mapping[str, Any], observer: Observer) -> SubmapSettings:
+    """Settings of the cells that a cloud is cut into: all points, lengths that suit the scanner."""
+    base = INDOORS if scans is None else settings_of_scans(scans, cut=True)
+    settings = with_chosen(replace(base, voxel=0.0), chosen)
+    if base != INDOORS:
+        observer.note(f"R' {settings.partial_radius:g} m and cells of {settings.spacing:g} m suit the scanner")
+    return settings
 
 
 def _store_in_run(path: Path, observer: Observer) -> GridStore:
@@ -193,9 +215,8 @@ def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | N
     return truth[0]
 
 
-def _target(request: LocalizeRequest, submaps: SubmapSettings, scans: bool) -> TargetSettings:
-    own = SCAN_TARGET if scans else request.tracker.target
-    voxel = max(own.voxel, _FINEST * submaps.voxel)
+def _target(request: LocalizeRequest, submaps: SubmapSettings, own: TargetSettings, spacing: float) -> TargetSettings:
+    voxel = max(own.voxel, _FINEST * submaps.voxel, _FINEST * spacing)
     return replace(own, voxel=voxel if request.voxel is None else request.voxel)
 
 
@@ -217,13 +238,13 @@ def _places(
 
 
 def _localizer(
-    request: LocalizeRequest, recording: Sequence | ScanSequence, places: StoredPlaces | None, surface: Surface,
+    settings: LocalizeSettings, recording: Sequence | ScanSequence, places: StoredPlaces | None, surface: Surface,
     context: NativeContext, start: np.ndarray | None,
 ) -> Localizer[Any]:  # fmt: skip
     if isinstance(recording, ScanSequence):
         assert start is not None
-        return Localizer(surface, ScanTracker(request.scans, context, start), start)
-    front_end = FrameTracker(recording.camera, request.tracker, context, start, places)
+        return Localizer(surface, ScanTracker(settings.scans, context, start), start)
+    front_end = FrameTracker(recording.camera, settings.tracking, context, start, places)
     return Localizer(surface, front_end, start)
 
 

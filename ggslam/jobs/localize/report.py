@@ -22,6 +22,9 @@ from ggslam.system.atomic import make_folder
 from ggslam.system.json_files import write_json
 from ggslam.system.process_memory import peak_memory_mb
 
+_MOST = 0.5
+"""A warning where more than this share of a scan lies beyond the map."""
+
 
 @dataclass(frozen=True)
 class LocalizationReport:
@@ -34,6 +37,7 @@ class LocalizationReport:
         results: of each frame or scan.
         truth: given poses [n, 4, 4], NaN where unknown, or None.
         damaged: what is wrong with cells that were left out.
+        radius: R' in metres.
     """
 
     map: str
@@ -43,6 +47,7 @@ class LocalizationReport:
     results: Sequence[Localization]
     truth: np.ndarray | None
     damaged: Sequence[str] = ()
+    radius: float = 0.0
 
     def poses(self) -> np.ndarray:
         """T_world_sensor [n, 4, 4], NaN where it was not located."""
@@ -54,6 +59,19 @@ class LocalizationReport:
         if self.truth is None:
             return None
         return np.asarray(np.linalg.norm(self.poses()[:, :3, 3] - self.truth[: len(self.results), :3, 3], axis=1))
+
+    def beyond(self) -> float:
+        """Median share of a scan's points that lie beyond the map in memory; 0 of images."""
+        return float(np.median([r.beyond for r in self.results])) if self.results else 0.0
+
+    def warnings(self) -> list[str]:
+        """What the user should know of the map and the recording."""
+        if self.beyond() <= _MOST:
+            return []
+        what = f"{self.beyond():.0%} of the points of a scan (median) lie beyond"
+        if self.full:
+            return [f"{what} the map and do not count"]
+        return [f"{what} the map in memory (R' {self.radius:g} m) and do not count"]
 
     def summary(self) -> dict[str, Any]:
         """All numbers; None for what is not known."""
@@ -70,6 +88,7 @@ class LocalizationReport:
             "align_ms_mean": 1e3 * sum(r.align_seconds for r in self.results) / n,
             "map_points_mean": float(np.mean(points)) if points else 0.0,
             "map_changes": sum(r.map_changed for r in self.results),
+            "beyond_map_median": self.beyond(), "warnings": self.warnings(),
             "damaged_cells": list(self.damaged), "peak_rss_mb": peak_memory_mb(), **self._accuracy(),
         }  # fmt: skip
 
@@ -99,6 +118,7 @@ def write_localization(report: LocalizationReport, out: Path, observer: Observer
     write_tum(out / "trajectory.txt", report.timestamps[: len(report.results)], report.poses())
     frames = [
         {"timestamp": time, "status": r.status.value, "overlap": r.overlap, "rmse_m": r.rmse_m, "reason": r.reason,
+         "beyond_map": r.beyond,
          "map_points": r.map_points, "map_ms": 1e3 * r.map_seconds, "align_ms": 1e3 * r.align_seconds}
         for time, r in zip(report.timestamps.tolist(), report.results, strict=False)
     ]  # fmt: skip

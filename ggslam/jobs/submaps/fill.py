@@ -13,7 +13,17 @@ import numpy as np
 from ggslam.errors import ConfigError, FormatError, SequenceError
 from ggslam.formats.trajectory import read_trajectory
 from ggslam.jobs.progress import Observer
-from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, open_or_create, store_of_cloud, store_of_run
+from ggslam.jobs.submaps.sensor_settings import in_words, settings_of_cloud, settings_of_scans, with_chosen
+from ggslam.jobs.submaps.stores import (
+    INDOORS,
+    Cloud,
+    is_cloud,
+    is_store,
+    open_or_create,
+    read_cloud,
+    store_of_cloud,
+    store_of_run,
+)
 from ggslam.localization.scans import LaserScan, ScanSequence, scan_files
 from ggslam.localization.visits import FrameSights, ScanSights, record_visit
 from ggslam.native.loader import NativeContext
@@ -121,16 +131,17 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
         raise ConfigError(f"{source}: is a grid store already; `out` wants a run, a cloud or a recording")
     if is_cloud(source) and not source.is_file():
         raise FormatError(f"cannot read {source}: no such file")
-    recording = None if is_cloud(source) or (source / MARKER).is_file() else _open(request)
-    with open_or_create(request.store, _settings(request)) as store:
+    cloud = read_cloud(source, request.columns) if is_cloud(source) else None
+    recording = None if cloud is not None or (source / MARKER).is_file() else _open(request)
+    with open_or_create(request.store, _settings(request, cloud, observer)) as store:
         if recording is not None:
             items, poses, sights = recording
             observer.begin("record", len(poses))
             watched = _with_progress(items, observer, len(poses))
             written = record_visit(store, watched, poses, sights, request.visit or source.resolve().name, request.at)
             observer.note(f"{len(written)} cells written")
-        elif is_cloud(source):
-            store_of_cloud(source, store, request.visit, request.at, request.columns)
+        elif cloud is not None:
+            store_of_cloud(source, store, request.visit, request.at, cloud=cloud)
         else:
             add_run(source, store, request.visit, request.at)
 
@@ -180,12 +191,26 @@ def _visit_total(store: GridStore, name: str, following: str | None) -> VisitTot
     return VisitTotal(name, sum(c.added for c in own), sum(not c.added for c in own))
 
 
-def _settings(request: SubmapsRequest) -> SubmapSettings:
-    base = INDOORS
+def _settings(request: SubmapsRequest, cloud: Cloud | None, observer: Observer) -> SubmapSettings:
+    """Of the store if there is one, else what suits the sensor; with what was set on purpose."""
     if is_store(request.store):
         with GridStore.open(request.store) as store:
-            base = store.settings
-    return replace(base, **request.settings)
+            return replace(store.settings, **request.settings)
+    base = INDOORS
+    if cloud is not None:
+        base = settings_of_cloud(cloud[0])
+    elif scan_files(request.source):
+        base = settings_of_scans(_scans(request))
+    settings = with_chosen(base, request.settings)
+    if base != INDOORS:
+        whose = "cloud" if cloud is not None else "scanner"
+        observer.note(f"the store's settings suit the {whose}: {in_words(settings)}")
+    return settings
+
+
+def _scans(request: SubmapsRequest) -> ScanSequence:
+    wanted = request.sequence
+    return ScanSequence(request.source, wanted.start, wanted.stop, wanted.stride, request.columns)
 
 
 def _open(
@@ -194,7 +219,7 @@ def _open(
     """Items, their poses and what takes sights from them."""
     wanted = request.sequence
     if scan_files(request.source):
-        scans = ScanSequence(request.source, wanted.start, wanted.stop, wanted.stride, request.columns)
+        scans = _scans(request)
         return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights()
     frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())

@@ -85,7 +85,7 @@ def store_of_run(
     if (folder.path / PLACES_FILE).is_file():
         arrays = read_all_arrays(folder.path / PLACES_FILE, "the places of a run")
     try:
-        points, attributes = _surface(arrays) if arrays else _cloud(folder.path / "points.ply")
+        points, attributes = _surface(arrays) if arrays else read_cloud(folder.path / "points.ply")
         views, camera = _views(arrays) if arrays else ([], None)
     except (KeyError, ValueError, IndexError, TypeError, FormatError) as error:
         if not arrays:
@@ -120,16 +120,21 @@ def visit_of(folder: RunFolder) -> str:
     return f"run {fingerprint(folder)[:16]}"
 
 
+Cloud = tuple[np.ndarray, dict[str, np.ndarray]]
+"""Points [n, 3], and attributes [n, ...] by name."""
+
+
 def store_of_cloud(
-    path: Path, store: GridStore, visit: str | None = None, at: float | None = None, columns: int | None = None
-) -> None:
-    """Cuts a cloud into the cells of a store; `columns`: see `read_cloud_file`.
+    path: Path, store: GridStore, visit: str | None = None, at: float | None = None, columns: int | None = None,
+    cloud: Cloud | None = None,
+) -> None:  # fmt: skip
+    """Cuts a cloud into the cells of a store; `columns`: see `read_cloud_file`; `cloud`: the file's, if it was read.
 
     Raises:
         FormatError: the file is missing or damaged.
     """
     store.begin_visit(visit or path.name)
-    points, attributes = _cloud(path, columns)
+    points, attributes = read_cloud(path, columns) if cloud is None else cloud
     due = _Due(store, at or 0.0).of(points)
     store_cloud(store, points[due], {name: values[due] for name, values in attributes.items()}, at or 0.0)
 
@@ -165,7 +170,12 @@ def _put(store: GridStore, writes: list[CellWrite]) -> None:
     store.put_cells(list(merged.values()))
 
 
-def _cloud(path: Path, columns: int | None = None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def read_cloud(path: Path, columns: int | None = None) -> Cloud:
+    """A cloud as cells keep it; `columns`: see `read_cloud_file`.
+
+    Raises:
+        FormatError: the file is missing or damaged.
+    """
     cloud = read_cloud_file(path, columns)
     return cloud.points, {} if cloud.colors is None else {"color": cloud.colors}
 

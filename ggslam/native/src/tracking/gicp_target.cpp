@@ -361,6 +361,17 @@ GGSLAM_EXPORT int ggslam_gicp_target_voxels(const void* target_, int level, floa
   return 0;
 } GGSLAM_CATCH_ALL
 
+GGSLAM_EXPORT int ggslam_gicp_target_normals(const void* target_, const int32_t* voxels, int64_t count,
+                                              float* out) try {
+  const auto& level = ggslam::object_of<ggslam::GicpTarget>(target_).fine.voxels;
+  ggslam::check_array("voxels", voxels, count), ggslam::check_array("out", out, count);
+  for (int64_t i = 0; i < count; ++i) {
+    if (voxels[i] >= static_cast<int64_t>(level.size())) ggslam::refuse("voxels: there is no such voxel");
+    for (int a = 0; a < 3; ++a) out[3 * i + a] = voxels[i] < 0 ? 0.0f : level[voxels[i]].normal[a];
+  }
+  return 0;
+} GGSLAM_CATCH_ALL
+
 GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target_, int level_, uint64_t* out) try {
   const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
   const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;

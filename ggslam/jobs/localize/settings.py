@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can be set where recordings are located in stored maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+from ggslam.errors import ConfigError
+from ggslam.localization.scan_tracker import ScanTrackerSettings
+from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.overrides import with_overrides
+from ggslam.system.settings import settings_class
+from ggslam.tracking.settings import TrackerSettings
+
+
+@settings_class(frozen=True)
+class LocalizeSettings:
+    """Settings of `ggslam localize`."""
+
+    is_root: ClassVar[bool] = True
+    """Errors name settings by their path from here."""
+    scans: ScanTrackerSettings = field(default_factory=ScanTrackerSettings)
+    """Of laser scans."""
+    tracking: TrackerSettings = field(default_factory=TrackerSettings)
+    """Of images, as for a run."""
+    submaps: SubmapSettings = field(default_factory=SubmapSettings)
+    """Of the map in memory, instead of the store's own or what suits the sensor. Grid and voxels are for clouds, which
+    are cut into cells first."""
+
+
+@dataclass(frozen=True)
+class ChosenSettings:
+    """Settings, and what of the map's was set on purpose: fields of `SubmapSettings`."""
+
+    settings: LocalizeSettings
+    submaps: Mapping[str, Any]
+
+
+def localize_settings(overrides: Sequence[str] | None) -> ChosenSettings:
+    """The settings with `name.of.setting=value` overrides.
+
+    Raises:
+        ConfigError: naming the setting.
+    """
+    values = with_overrides(overrides)
+    try:
+        settings = LocalizeSettings(**values)
+    except ConfigError as error:
+        raise ConfigError(f"`overrides`: {error}") from None
+    chosen = values.get("submaps", {})
+    return ChosenSettings(settings, {name: getattr(settings.submaps, name) for name in chosen})

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of a new store that suit the sensor: a depth camera sees some metres, a LiDAR on a street a hundred.
+
+Most of a scan's points lie within R'; farther ones are few and add little. A scanner's sub-maps reach far beyond their
+cells, so cells of a third of R' are enough of them. Where a whole cloud is cut, a cell has only what lies in it, and
+smaller cells follow the ball of R' better. Depth cameras and scanners that see no farther than 10 m get `INDOORS`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ggslam.jobs.submaps.stores import INDOORS
+from ggslam.localization.scans import ScanSequence
+from ggslam.submaps.settings import SubmapSettings
+
+_SCANS = 5
+"""Scans that are looked at, over the whole recording."""
+_MOST, _ALMOST_ALL = 95, 99
+"""Percentiles of the ranges."""
+_SPARE = 1.2
+"""R' over the range that most points lie within."""
+_STEP = 5.0
+"""Metres that lengths are rounded up to."""
+_FARTHEST = 100.0
+_CELLS = 3
+"""R' over the edge of a scanner's cells."""
+_CUT_CELLS = 6
+"""R' over the edge of a cloud's cells."""
+_NEAR_CENTRE = 0.9
+"""R over the edge of a cell: from 0.87 on each place in a cube is within R of its centre."""
+_VOXELS = 300
+"""R' over the edge of a voxel."""
+_OUTDOORS_M = 60.0
+"""A cloud that is longer than this along two axes is no room or flat."""
+_OUTDOORS_RADIUS = 30.0
+_SAMPLE = 200_000
+
+
+def settings_of_scans(scans: ScanSequence, cut: bool = False) -> SubmapSettings:
+    """What suits the scanner of a recording; `cut`: for a cloud that is cut into cells.
+
+    Raises:
+        FormatError: a scan is damaged.
+    """
+    chosen = np.unique(np.linspace(0, len(scans) - 1, _SCANS).round().astype(int))
+    ranges = np.concatenate([np.linalg.norm(scans.scan(number).points, axis=1) for number in chosen.tolist()])
+    ranges = ranges[np.isfinite(ranges) & (ranges > 0)]
+    if not len(ranges):
+        return INDOORS
+    most, farthest = np.percentile(ranges, [_MOST, _ALMOST_ALL]).tolist()
+    return _of_reach(most * _SPARE, farthest, cut)
+
+
+def settings_of_cloud(points: np.ndarray) -> SubmapSettings:
+    """What suits a cloud [n, 3] that is cut into cells, where no scanner is known: by its size."""
+    few = points[:: max(1, len(points) // _SAMPLE)]
+    few = few[np.isfinite(few).all(1)]
+    if not len(few):
+        return INDOORS
+    low, high = np.percentile(few, [1, 99], axis=0)
+    if np.sort(high - low)[1] < _OUTDOORS_M:
+        return INDOORS
+    return _of_reach(_OUTDOORS_RADIUS, _OUTDOORS_RADIUS, cut=True)
+
+
+def with_chosen(settings: SubmapSettings, chosen: Mapping[str, Any]) -> SubmapSettings:
+    """Settings with fields that were set on purpose; R goes with an edge of a cell that was."""
+    edge = chosen.get("spacing")
+    if edge is not None and "radius" not in chosen and settings.spacing != INDOORS.spacing:
+        settings = replace(settings, radius=_NEAR_CENTRE * edge)
+    return replace(settings, **chosen)
+
+
+def in_words(settings: SubmapSettings) -> str:
+    """The lengths in one line."""
+    s = settings
+    return (
+        f"R' {s.partial_radius:g} m, cells of {s.spacing:g} m, R {s.radius:g} m, points up to {s.sensor_range:g} m, "
+        f"voxels of {100 * s.voxel:g} cm"
+    )
+
+
+def _of_reach(reach: float, farthest: float, cut: bool) -> SubmapSettings:
+    if reach <= INDOORS.partial_radius:
+        return INDOORS
+    radius = min(_FARTHEST, _round_up(reach))
+    spacing = max(INDOORS.spacing, round(radius / (_CUT_CELLS if cut else _CELLS)))
+    return replace(
+        INDOORS, partial_radius=radius, spacing=spacing, radius=_NEAR_CENTRE * spacing,
+        sensor_range=min(_FARTHEST, max(radius, _round_up(farthest))), voxel=round(radius / _VOXELS, 2),
+        change_distance=max(INDOORS.change_distance, 2 * radius / _VOXELS), lookahead=max(INDOORS.lookahead, spacing),
+    )  # fmt: skip
+
+
+def _round_up(metres: float) -> float:
+    return _STEP * math.ceil(metres / _STEP - 1e-9)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ggslam submaps` and `ggslam localize` with scans of a LiDAR: what suits it, what is set, what is warned of."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ggslam.cli.main import app
+from ggslam.errors import GgslamError
+from ggslam.formats.trajectory import read_tum, write_tum
+from ggslam.jobs.submaps.sensor_settings import settings_of_cloud, settings_of_scans, with_chosen
+from ggslam.jobs.submaps.stores import INDOORS
+from ggslam.localization.scans import ScanSequence
+from ggslam.scene.poses import se3_exp
+from ggslam.submaps.grid import GridStore
+from ggslam.synthetic.world import World
+from ggslam.synthetic.world_scanner import Scanner
+
+
+def done(*arguments: object) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "140"})
+    assert result.exit_code == 0 and result.exception is None, (result.output, result.exception)
+    return " ".join(result.output.split())
+
+
+def summary(out: Path) -> dict:
+    return json.loads((out / "localization.json").read_text())["summary"]
+
+
+@pytest.fixture(scope="module")
+def ride(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Scans along 8 m of a street of boxes, seen up to 60 m."""
+    folder = tmp_path_factory.mktemp("rides") / "street"
+    (folder / "scans").mkdir(parents=True)
+    generator = np.random.default_rng(2)
+    boxes = []
+    while len(boxes) < 90:
+        x, y = generator.uniform(2, 98), 50 + generator.choice([-1, 1]) * generator.uniform(3.5, 25)
+        half, height = generator.uniform(0.2, 2.5, 2), generator.uniform(1.0, 7.0)
+        if abs(y - 50) > 2 + half.max() * 1.5:
+            boxes.append([x, y, height / 2, *half, height / 2, generator.uniform(0, np.pi)])
+    world = World(100.0, 30.0, 2, np.array(boxes), np.zeros((0, 2)), np.zeros((0, 2), np.int64))
+    scanner = Scanner(columns=900, rings=32, lowest_deg=-20, highest_deg=10, farthest=60.0, noise=0.01)
+    poses = np.array([se3_exp(np.array([0, 0, 0, 0, 0, 0.02 * n])) for n in range(9)])
+    poses[:, :3, 3] = [[46.0 + n, 50.0, 1.7] for n in range(9)]
+    for number, T in enumerate(poses):
+        np.save(folder / "scans" / f"{number:06d}.npy", scanner.scan(world, T, number).points)
+    write_tum(folder / "trajectory.txt", np.arange(9) / 10, poses)
+    return folder
+
+
+def errors(out: Path, ride: Path) -> np.ndarray:
+    found, truth = (read_tum(folder / "trajectory.txt").T_world_camera for folder in (out, ride))
+    return np.linalg.norm(found[:, :3, 3] - truth[: len(found), :3, 3], axis=1)
+
+
+def test_a_store_by_defaults_suits_the_scanner_and_locates_its_scans(ride: Path, tmp_path: Path) -> None:
+    ranges = np.concatenate([np.linalg.norm(scan.points, axis=1) for scan in ScanSequence(ride).stream()])
+    output = done("submaps", ride, "--out", tmp_path / "street.grid")
+    with GridStore.open(tmp_path / "street.grid") as store:
+        settings = store.settings
+    assert np.percentile(ranges, 95) < settings.partial_radius < 1.2 * np.percentile(ranges, 95) + 5
+    assert settings.sensor_range >= np.percentile(ranges, 99) and settings.spacing > 5 and settings.voxel > 0.05
+    assert output.count("suit the scanner") == 1 and f"R' {settings.partial_radius:g} m" in output
+    output = done("localize", tmp_path / "street.grid", ride, "--start-pose", "given", "--out", tmp_path / "out")
+    assert summary(tmp_path / "out")["located_share"] == 1 and errors(tmp_path / "out", ride).max() < 0.02
+    assert "suit the scanner" not in output  # the store keeps its own
+    assert settings_of_scans(ScanSequence(ride), cut=True).spacing < settings.spacing
+
+
+def test_what_is_set_wins_and_a_map_that_is_too_small_is_warned_of(ride: Path, tmp_path: Path) -> None:
+    seed = ["--spacing", 2, "--radius", 1.5, "--sensor-range", 10, "--voxel", 0.05]
+    done("submaps", ride, "--out", tmp_path / "small.grid", *seed, "--set", "submaps.partial_radius=10")
+    with GridStore.open(tmp_path / "small.grid") as store:
+        s = store.settings
+    assert (s.spacing, s.radius, s.sensor_range, s.voxel, s.partial_radius) == (2, 1.5, 10, 0.05, 10)
+    output = done("localize", tmp_path / "small.grid", ride, "--start-pose", "given", "--out", tmp_path / "out")
+    found = summary(tmp_path / "out")
+    assert found["located_share"] == 1 and errors(tmp_path / "out", ride).max() < 0.03
+    assert found["beyond_map_median"] > 0.5 and "beyond the map in memory (R' 10 m)" in found["warnings"][0]
+    assert "lie beyond the map in memory" in output
+    stricter = ["--set", "scans.min_overlap=0.9", "--set", "scans.min_counted=1000000", "--out", tmp_path / "strict"]
+    done("localize", tmp_path / "small.grid", ride, "--start-pose", "given", *stricter)
+    assert summary(tmp_path / "strict")["statuses"] == {"lost": 9}
+
+
+def test_settings_that_do_not_exist_are_one_error(ride: Path, tmp_path: Path) -> None:
+    for words, text in ((["scans.reach=1"], "scans.reach"), (["scans.sigma=-1"], "scans.sigma"), (["x"], "name=value")):
+        command = ["localize", tmp_path / "none.ply", ride, "--start-pose", "given", "--set", *words]
+        error = CliRunner().invoke(app, [str(word) for word in command]).exception
+        assert isinstance(error, GgslamError) and error.exit_code == 2 and text in str(error) and "--set" in str(error)
+    command = ["submaps", str(ride), "--out", str(tmp_path / "g"), "--set", "scans.sigma=1"]
+    error = CliRunner().invoke(app, command).exception
+    assert isinstance(error, GgslamError) and "scans" in str(error)
+
+
+def test_small_scenes_keep_their_settings(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    (tmp_path / "near").mkdir()
+    np.save(tmp_path / "near" / "0.npy", rng.uniform(-4, 4, (5000, 3)))
+    assert settings_of_scans(ScanSequence(tmp_path / "near")) == INDOORS
+    assert settings_of_cloud(rng.uniform(-10, 10, (5000, 3))) == INDOORS
+    assert settings_of_cloud(np.zeros((0, 3))) == INDOORS
+    outdoors = settings_of_cloud(rng.uniform(-80, 80, (5000, 3)) * [1, 1, 0.05])
+    assert outdoors.partial_radius == 30 and outdoors.spacing == 5
+    assert with_chosen(outdoors, {"spacing": 3.0}).radius == pytest.approx(2.7)
+    assert with_chosen(outdoors, {"spacing": 3.0, "radius": 1.0}).radius == 1.0
+
+
+def test_the_lidar_of_the_field_is_located(shared_data: Path, tmp_path: Path) -> None:
+    """Raw scans of KITTI in a map of three of them: as near the given poses as against the whole map."""
+    case = shared_data / "field" / "maps" / "lidar_radius"
+    if not case.is_dir():
+        pytest.skip(f"{case} is not there")
+    for name, options in (("partial", []), ("full", ["--full-map"])):
+        command = ["localize", case / "map.ply", case, "--columns", 3, "--start-pose", "given", *options]
+        done(*command, "--out", tmp_path / name)
+        assert summary(tmp_path / name)["statuses"] == {"ok": 2}
+        assert errors(tmp_path / name, case).max() < 0.006
+    turned = "1.4 -1.4 0 0 0 0.0871557 0.9961947"  # 2 m and 10 degrees off
+    command = ["localize", case / "map.ply", case, "--columns", 3, "--start-pose", turned, "--out", tmp_path / "far"]
+    done(*command)
+    assert errors(tmp_path / "far", case).max() < 0.006
