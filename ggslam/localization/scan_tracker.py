@@ -8,6 +8,7 @@ from dataclasses import field, replace
 import numpy as np
 
 from ggslam.localization.localizer import ANY_NORMAL, FrontEndResult, LocalizationStatus
+from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, orthonormalize
@@ -15,6 +16,9 @@ from ggslam.system.settings import setting, settings_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
 from ggslam.tracking.scan_points import ScanSettings, scan_points
 from ggslam.tracking.settings import AlignSettings, DepthNoise
+
+MOST_PASSED = 7
+"""Lost scans between two that are looked up, at most."""
 
 
 @settings_class(frozen=True)
@@ -32,26 +36,30 @@ class ScanTrackerSettings:
 
 
 class ScanTracker:
-    """Locates laser scans, float [n, 3] in metres in the sensor's frame. They show no places to look up.
+    """Locates laser scans, float [n, 3] in metres in the sensor's frame.
 
     Args:
         settings: see `ScanTrackerSettings`.
         context: threads.
-        T_world_sensor: pose of the first scan.
+        T_world_sensor: pose of the first scan; None: it is looked up.
+        places: where lost scans are looked up; None: they are not.
     """
 
-    def __init__(self, settings: ScanTrackerSettings, context: NativeContext, T_world_sensor: np.ndarray) -> None:
+    def __init__(
+        self, settings: ScanTrackerSettings, context: NativeContext, T_world_sensor: np.ndarray | None,
+        places: ScanLookUp | None = None,
+    ) -> None:  # fmt: skip
         self.settings = settings
-        self._context = context
-        self._pose = np.array(T_world_sensor, float)
+        self._context, self._places = context, places
+        self._pose = np.full((4, 4), np.nan) if T_world_sensor is None else np.array(T_world_sensor, float)
         self._velocity = np.eye(4)
+        self._passes, self._wait = 0, 0
 
     def track(self, item: np.ndarray, surface: Surface, target: GicpTarget) -> FrontEndResult:
         """See `FrontEnd`. Tries constant velocity, and if that does not convince, standing still."""
         best: AlignmentResult | None = None
         source = scan_points(item, self.settings.scan)
-        dot = self.settings.align.min_normal_dot if surface.has_sides else ANY_NORMAL
-        settings = replace(self.settings.align, min_normal_dot=dot)
+        settings = self._align_settings(surface)
         noise = DepthNoise(self.settings.sigma, 0.0)
         for guess in (self._pose @ self._velocity, self._pose):
             found = align(source, target, guess, settings, noise, self._context)
@@ -63,8 +71,32 @@ class ScanTracker:
         return self._outcome(best, len(source))
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
-        """See `FrontEnd`."""
-        return None
+        """See `FrontEnd`. After a scan was not found, ever more are passed over, `MOST_PASSED` at most."""
+        if self._places is None:
+            return None
+        if self._passes:
+            self._passes -= 1
+            return None
+        source, settings = scan_points(item, self.settings.scan), self._align_settings(surface)
+        noise = DepthNoise(self.settings.sigma, 0.0)
+
+        def align_at(guess: np.ndarray) -> AlignmentResult:
+            assert surface.target is not None
+            return align(source, surface.target, guess, settings, noise, self._context)
+
+        found, reason = self._places.find(item, surface, align_at)
+        if found is None:
+            self._passes = self._wait
+            self._wait = min(2 * self._wait + 1, MOST_PASSED)
+            return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, 0.0, 0.0, reason)
+        self._passes = self._wait = 0
+        self._velocity, self._pose = np.eye(4), orthonormalize(found.alignment.T_world_camera)
+        alignment = found.alignment
+        return FrontEndResult(self._pose.copy(), LocalizationStatus.FOUND, alignment.overlap, alignment.rmse, reason)
+
+    def _align_settings(self, surface: Surface) -> AlignSettings:
+        dot = self.settings.align.min_normal_dot if surface.has_sides else ANY_NORMAL
+        return replace(self.settings.align, min_normal_dot=dot)
 
     def _convinces(self, found: AlignmentResult) -> bool:
         return found.status is not AlignmentStatus.LOST and found.overlap >= self.settings.min_overlap

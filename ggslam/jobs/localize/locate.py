@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,10 @@ from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
 from ggslam.localization.frames import FrameTracker
 from ggslam.localization.localizer import Localization, Localizer
+from ggslam.localization.near import Near, parse_near
 from ggslam.localization.places import StoredPlaces
+from ggslam.localization.scan_look_up import ScanLookUp
+from ggslam.localization.scan_maps import scan_places
 from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
 from ggslam.localization.scans import ScanSequence, scan_files
 from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface
@@ -51,7 +55,9 @@ class LocalizeRequest:
         map: folder of a grid store or a run, or a cloud.
         sequence: the recording.
         start_pose: pose of the first frame or scan: 7 numbers (position, quaternion xyzw), or `GIVEN`, or None.
-        no_start_pose: the first frame is looked up among the map's places.
+        no_start_pose: the first frame is looked up among the map's places, as it is without a start pose.
+        near: roughly where the recording was made: "x y sigma" or "x y z sigma", metres in the map's world; only
+            places within three sigma are looked at; None: all.
         full: against the whole map.
         out: folder for the results; None: localized/NAME.
         radius: R' in metres; None: the store's.
@@ -65,6 +71,7 @@ class LocalizeRequest:
     sequence: SequenceRequest
     start_pose: str | None = None
     no_start_pose: bool = False
+    near: str | None = None
     full: bool = False
     out: Path | None = None
     radius: float | None = None
@@ -88,11 +95,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     with ExitStack() as opened:
         recording = _open_recording(request)
         start = _start(request, recording.ground_truth)
-        if start is None and isinstance(recording, ScanSequence):
-            raise ConfigError(
-                f"{recording.path}: laser scans have no images to look the place of the first one up by: give its "
-                f'pose with `start_pose` "x y z qx qy qz qw", or `start_pose` {GIVEN} where the recording has poses'
-            )
+        near = None if request.near is None else parse_near(request.near)
         store = open_map(request.map, opened, observer)
         context = NativeContext(request.threads)
         settings = store.settings
@@ -102,7 +105,11 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
             FullSurface(store, target, context) if request.full else PartialSurface(store, target, context, submaps)
         )
         opened.callback(surface.close)
-        places = None if isinstance(recording, ScanSequence) else _places(request, recording, store, start, observer)
+        places: StoredPlaces | ScanLookUp | None
+        if isinstance(recording, ScanSequence):
+            places = ScanLookUp(partial(scan_places, store, near), store.settings.axes)
+        else:
+            places = _places(request, recording, store, start, near, observer)
         localizer = _localizer(request, recording, places, surface, context, start)
         results, error = _run(localizer, recording, observer)
         if error is not None and not results:
@@ -200,11 +207,12 @@ def _target(request: LocalizeRequest, submaps: SubmapSettings, scans: bool) -> T
 
 
 def _places(
-    request: LocalizeRequest, recording: Sequence, store: GridStore, start: np.ndarray | None, observer: Observer
-) -> StoredPlaces | None:
+    request: LocalizeRequest, recording: Sequence, store: GridStore, start: np.ndarray | None, near: Near | None,
+    observer: Observer,
+) -> StoredPlaces | None:  # fmt: skip
     """The places of the map; None if they cannot be used and are not needed for the start."""
     try:
-        places = StoredPlaces(store, recording.camera)
+        places = StoredPlaces(store, recording.camera, near=near)
     except ConfigError as error:
         if start is None:
             raise
@@ -212,17 +220,19 @@ def _places(
         return None
     if start is None and not len(places):
         reason = f"; left out: {places.damaged[0]}" if places.damaged else ""
-        raise ConfigError(f"{request.map}: has no places to look up: `start_pose` is needed{reason}")
+        where = "" if near is None else f" {near}"
+        raise ConfigError(f"{request.map}: has no places to look up{where}: `start_pose` is needed{reason}")
     return places
 
 
 def _localizer(
-    request: LocalizeRequest, recording: Sequence | ScanSequence, places: StoredPlaces | None, surface: Surface,
-    context: NativeContext, start: np.ndarray | None,
+    request: LocalizeRequest, recording: Sequence | ScanSequence, places: StoredPlaces | ScanLookUp | None,
+    surface: Surface, context: NativeContext, start: np.ndarray | None,
 ) -> Localizer[Any]:  # fmt: skip
     if isinstance(recording, ScanSequence):
-        assert start is not None
-        return Localizer(surface, ScanTracker(request.scans, context, start), start)
+        assert isinstance(places, ScanLookUp)
+        return Localizer(surface, ScanTracker(request.scans, context, start, places), start)
+    assert not isinstance(places, ScanLookUp)
     front_end = FrameTracker(recording.camera, request.tracker, context, start, places)
     return Localizer(surface, front_end, start)
 

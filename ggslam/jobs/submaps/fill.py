@@ -195,7 +195,8 @@ def _open(
     wanted = request.sequence
     if scan_files(request.source):
         scans = ScanSequence(request.source, wanted.start, wanted.stop, wanted.stride, request.columns)
-        return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights()
+        poses = _poses(request, scans.timestamps, scans.ground_truth)
+        return scans.stream(), poses, ScanSights(_settings(request).axes)
     frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())
     poses = _poses(request, frames.timestamps, frames.ground_truth, frames.pose_problem)
