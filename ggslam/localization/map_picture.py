@@ -63,14 +63,14 @@ class MapPicture:
     Args:
         points: of the map, [n, 3], in a level frame, one in a cube of 0.25 m.
         axes: of the map's grid.
-        damaged: what is wrong with cells that were left out.
+        damage: what is wrong with cells that were left out.
         near: only places near a position.
     """
 
     def __init__(
-        self, points: np.ndarray, axes: GridAxes, damaged: Sequence[str] = (), near: Near | None = None
+        self, points: np.ndarray, axes: GridAxes, damage: Sequence[str] = (), near: Near | None = None
     ) -> None:
-        self.damaged = list(damaged)
+        self.damage = list(damage)
         self._axes, self._near = axes, near
         self._points, self._R_world_level = points, level_axes(axes)
         self._picture: _Picture | None = None
@@ -95,16 +95,14 @@ class MapPicture:
         picture = self._of(float(np.clip(reach / _ACROSS, _FINEST, _COARSEST)))
         best, turn = _scores(picture, standing, reach)
         if self._near is not None:
-            rows, columns = np.indices(picture.size) + 0.5
-            at = np.stack([rows, columns, np.zeros_like(rows)], -1).reshape(-1, 3) * picture.pixel
-            level = at + [*picture.corner, 0.0]
-            best.reshape(-1)[~self._near.allows(level @ self._R_world_level.T, self._axes)] = -np.inf
+            best[~_pixels_near(picture, self._near, self._axes)] = -np.inf
         for position, angle in _peaks(best, turn, picture, count, apart):
             for z in self._floors(position, -floor):
                 T = np.eye(4)
                 T[:3, :3] = self._R_world_level @ about_z(angle)
                 T[:3, 3] = self._R_world_level @ [*position, z - floor]
-                yield T
+                if self._near is None or self._near.allows(T[None, :3, 3], self._axes)[0]:
+                    yield T
 
     def _of(self, pixel: float) -> _Picture:
         extent = np.ptp(self._points[:, :2], axis=0).max()
@@ -150,11 +148,11 @@ def picture_of_store(store: GridStore, near: Near | None = None, reach: float = 
             continue
         if near is not None:
             points = points[near.allows(points, axes, reach)]
-        chunks.append(_thinned(points))
-    return MapPicture(_thinned(np.concatenate(chunks) @ level_axes(axes)), axes, damaged, near)
+        chunks.append(_thin(points))
+    return MapPicture(_thin(np.concatenate(chunks) @ level_axes(axes)), axes, damaged, near)
 
 
-def _thinned(points: np.ndarray) -> np.ndarray:
+def _thin(points: np.ndarray) -> np.ndarray:
     points = points[np.isfinite(points).all(1)]
     if not len(points):
         return points
@@ -206,6 +204,16 @@ def _scores(picture: _Picture, standing: np.ndarray, reach: float) -> tuple[np.n
         better = score > best
         best[better], turn[better] = score[better], angle
     return best, turn
+
+
+def _pixels_near(picture: _Picture, near: Near, axes: GridAxes) -> np.ndarray:
+    """Which pixels are near a position, whatever its height, bool [h, w]."""
+    R_world_level = level_axes(axes)
+    level = np.zeros((*picture.size, 3))
+    level[..., :2] = (np.stack(np.indices(picture.size), -1) + 0.5) * picture.pixel + picture.corner
+    if len(near.position) == 3:
+        level[..., 2] = (R_world_level.T @ np.array(near.position))[2]
+    return near.allows(level.reshape(-1, 3) @ R_world_level.T, axes).reshape(picture.size)
 
 
 def _peaks(

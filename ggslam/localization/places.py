@@ -75,7 +75,7 @@ class StoredPlaces:
     def __init__(
         self, store: GridStore, camera: Camera, settings: PlaceSettings | None = None, near: Near | None = None
     ) -> None:
-        self.damaged: list[str] = []
+        self.damage: list[str] = []
         """What is wrong with parts that were left out."""
         parts = []
         for key in store.cells():
@@ -83,12 +83,12 @@ class StoredPlaces:
                 try:
                     parts.append((key, _arrays(store, key)))
                 except FormatError as error:
-                    self.damaged.append(str(error))
+                    self.damage.append(str(error))
         for key, arrays in parts:
             _check_camera(store, key, arrays["camera"], camera)
         if near is not None:
             axes = store.settings.axes
-            parts = [(key, _chosen(held, near.allows(held["poses"][:, :3, 3], axes))) for key, held in parts]
+            parts = [(key, _choose(held, near.allows(held["poses"][:, :3, 3], axes))) for key, held in parts]
         merged = {name: np.concatenate([arrays[name] for _, arrays in parts]) for name in _NAMES[:5]} if parts else {}
         self.T_world_camera: np.ndarray = merged.pop("poses", np.zeros((0, 4, 4)))
         """Of each view, float64 [k, 4, 4]."""
@@ -138,7 +138,7 @@ def _arrays(store: GridStore, key: CellKey) -> Mapping[str, np.ndarray]:
     return arrays
 
 
-def _chosen(arrays: Mapping[str, np.ndarray], views: np.ndarray) -> Mapping[str, np.ndarray]:
+def _choose(arrays: Mapping[str, np.ndarray], views: np.ndarray) -> Mapping[str, np.ndarray]:
     """The arrays of a cell with these views alone, bool [k]."""
     landmarks = np.repeat(views, arrays["counts"])
     rows = {"poses": views, "counts": views, "codes": views, "descriptors": landmarks, "points": landmarks}

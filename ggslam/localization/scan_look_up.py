@@ -80,7 +80,7 @@ class Guesser(Protocol):
     """Guesses where a scan was made; see `ScanPlaces`, `MapPicture`."""
 
     @property
-    def damaged(self) -> list[str]:
+    def damage(self) -> list[str]:
         """What is wrong with parts of the map that were left out."""
 
     def __len__(self) -> int: ...
@@ -112,9 +112,9 @@ class ScanLookUp:
         self._map: tuple[object, np.ndarray, np.ndarray] | None = None
 
     @property
-    def damaged(self) -> list[str]:
+    def damage(self) -> list[str]:
         """What is wrong with parts of the map that were left out, as far as they were read."""
-        return [] if self._places is None else self._places.damaged
+        return [] if self._places is None else self._places.damage
 
     def find(self, points: np.ndarray, surface: Surface, align: Align) -> tuple[FoundPose | None, str]:
         """The pose of a scan, and why it is believed or not. Moves the surface.
@@ -131,11 +131,11 @@ class ScanLookUp:
         if floor is None or not len(self._places):
             return None, "the scan shows no floor" if floor is None else "there are no places to look it up among"
         guesses = self._places.guesses(points, floor, self.settings.candidates, self.settings.apart)
-        found = [self._tried(points, floor, guess, surface, align) for guess in guesses]
+        found = [self._try(points, floor, guess, surface, align) for guess in guesses]
         ranked = sorted((pose for pose in found if pose is not None), key=lambda pose: -pose.score)
-        return self._judged(ranked)
+        return self._judge(ranked)
 
-    def _judged(self, ranked: list[FoundPose]) -> tuple[FoundPose | None, str]:
+    def _judge(self, ranked: list[FoundPose]) -> tuple[FoundPose | None, str]:
         limits = self.settings
         if not ranked or ranked[0].fit < limits.min_fit or ranked[0].through > limits.max_through:
             what = f"; at best {ranked[0].fit:.0%} match, {ranked[0].through:.0%} looked through" if ranked else ""
@@ -145,11 +145,11 @@ class ScanLookUp:
         for other in ranked[1:]:
             moved, turned = separation(best.alignment.T_world_camera, other.alignment.T_world_camera)
             if (moved > 0.5 or turned > 5) and other.score > best.score - margin:
-                here, there = (_told(pose.alignment.T_world_camera) for pose in (best, other))
+                here, there = (_position_text(pose.alignment.T_world_camera) for pose in (best, other))
                 return None, f"the scan matches {here} little better than {there}, so neither is believed"
-        return best, f"looks like the map at {_told(best.alignment.T_world_camera)}"
+        return best, f"looks like the map at {_position_text(best.alignment.T_world_camera)}"
 
-    def _tried(
+    def _try(
         self, points: np.ndarray, floor: float, guess: np.ndarray, surface: Surface, align: Align
     ) -> FoundPose | None:
         surface.move_to(guess[:3, 3])
@@ -190,7 +190,7 @@ class ScanLookUp:
         far = float(np.percentile(np.linalg.norm(standing, axis=1), 90))
         reach = float(np.clip(min(far, np.linalg.norm(around, axis=1).max()), 5.0, 60.0))
         pixel = 2 * reach / _PICTURE
-        map_spectrum = np.fft.rfft2(_widened(_picture(around, reach, pixel)))
+        map_spectrum = np.fft.rfft2(_widen(_picture(around, reach, pixel)))
         best = (-1.0, 0.0, np.zeros(2))
         most = int(np.clip(4.0 / pixel, 4, _PICTURE // 4))
         for turn in np.radians(_TURNS_DEG):
@@ -207,7 +207,7 @@ class ScanLookUp:
         return T
 
 
-def _told(T: np.ndarray) -> str:
+def _position_text(T: np.ndarray) -> str:
     return f"({T[0, 3]:.2f}, {T[1, 3]:.2f}, {T[2, 3]:.2f})"
 
 
@@ -220,7 +220,7 @@ def _picture(points: np.ndarray, reach: float, pixel: float) -> np.ndarray:
     return picture
 
 
-def _widened(picture: np.ndarray) -> np.ndarray:
+def _widen(picture: np.ndarray) -> np.ndarray:
     """Each pixel takes half of its brightest neighbour's value at least; the picture has an empty border."""
     across = np.maximum(np.roll(picture, 1, 0), np.roll(picture, -1, 0))
     wide = np.maximum(picture, across)

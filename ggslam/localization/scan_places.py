@@ -79,15 +79,15 @@ class ScanPlaces:
         floors: float64 [n], height of the floor above the sensor (negative).
         codes: uint8 [n, CODE_BYTES].
         axes: of the map's grid.
-        damaged: what is wrong with parts that were left out.
+        damage: what is wrong with parts that were left out.
         any_recorded: whether the map has places at all, these or others.
     """
 
     def __init__(
         self, positions: np.ndarray, floors: np.ndarray, codes: np.ndarray, axes: GridAxes,
-        damaged: Sequence[str] = (), any_recorded: bool = True,
+        damage: Sequence[str] = (), any_recorded: bool = True,
     ) -> None:  # fmt: skip
-        self.positions, self.damaged, self.any_recorded = positions, list(damaged), any_recorded
+        self.positions, self.damage, self.any_recorded = positions, list(damage), any_recorded
         self._floors, self._index, self._R_world_level = floors, ViewIndex(codes), level_axes(axes)
 
     def __len__(self) -> int:

@@ -76,6 +76,11 @@ class ViewIndex:
     def __len__(self) -> int:
         return len(self.codes)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        return self.codes.nbytes + self._all_keys.nbytes
+
     def query(self, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Views in the order of likeness.
 
@@ -92,7 +97,7 @@ class ViewIndex:
         for row, spectrum in enumerate(spectra):
             numbers = np.argpartition(-likeness[row], count - 1)[:count] if count else np.zeros(0, np.int64)
             stored = self._spectra(self.codes[numbers])
-            correlation[row, numbers], turn[row, numbers] = _correlated(stored, spectrum)
+            correlation[row, numbers], turn[row, numbers] = _correlate(stored, spectrum)
         which = correlation.argmax(0)
         each = np.arange(len(self))
         best = correlation[which, each]
@@ -120,7 +125,7 @@ class ViewIndex:
         return keys / np.maximum(np.linalg.norm(keys, axis=1, keepdims=True), 1e-9)
 
 
-def _correlated(stored: np.ndarray, spectrum: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _correlate(stored: np.ndarray, spectrum: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Greatest normalised correlations [k] of spectra [k, ROWS, f] with one, and the turns [k] they have it at."""
     correlation = np.fft.irfft((stored * spectrum.conj()).sum(1), SECTORS, axis=1)
     correlation /= np.maximum(np.sqrt(_energy(stored) * _energy(spectrum[None])), 1e-9)[:, None]

@@ -109,6 +109,23 @@ def test_scans_are_located_in_a_cloud(scans: Path, tmp_path: Path) -> None:
     assert summary(tmp_path / "torn")["located_share"] == 1 and "left out" in output and "points.pcd" in output
 
 
+def test_scans_are_found_without_a_start_pose(scans: Path, tmp_path: Path) -> None:
+    cloud = scans.parent / "cloud.npy"
+    truth = read_tum(scans / "trajectory.txt").T_world_camera
+    done("localize", cloud, scans, "--out", tmp_path / "cloud")
+    done("submaps", scans, "--out", tmp_path / "map.grid", "--axes", "xy", "--radius", 1.5)
+    assert "scan_places.npz" in done("submaps", tmp_path / "map.grid")
+    x, y = truth[0, :2, 3]
+    near = ["--near", f"{x + 1:.1f} {y:.1f} 2", "--no-start-pose"]
+    done("localize", tmp_path / "map.grid", scans, *near, "--out", tmp_path / "store")
+    for out in ("cloud", "store"):
+        found = summary(tmp_path / out)
+        assert found["located_share"] == 1 and found["rmse_m"] < 0.03 and found["statuses"]["found"] == 1
+    far = ["--near", f"{x + 100:.1f} {y:.1f} 2", "--stop", 2, "--out", tmp_path / "far"]
+    done("localize", tmp_path / "map.grid", scans, *far)
+    assert summary(tmp_path / "far")["located_share"] == 0
+
+
 def test_a_visit_is_recorded_with_poses_from_localisation(room: Path, run: Path, tmp_path: Path) -> None:
     store = tmp_path / "room.grid"
     done("submaps", run, "--out", store, "--visit", "first", "--at", 0)
@@ -127,7 +144,8 @@ def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tm
     one_error(ggslam("localize", tmp_path / "none", room), "none", "no such folder")
     one_error(ggslam("localize", room, room), str(room), "neither a grid store")
     one_error(ggslam("localize", tmp_path / "no.pcd", room, "--start-pose", ORIGIN), "no.pcd")
-    one_error(ggslam("localize", cloud, scans), "laser scans", "--start-pose given")
+    one_error(ggslam("localize", cloud, scans, "--near", "1 2"), "--near", "'1 2'")
+    one_error(ggslam("localize", run, room, "--near", "500 500 1"), "no places to look up within 3 m of (500, 500)")
     one_error(ggslam("localize", cloud, room), "no places")
     one_error(ggslam("localize", run, room, "--scale", 0.5), "camera", "--scale")
     one_error(ggslam("localize", run, room, "--start-pose", "1 2 3"), "--start-pose", "'1 2 3'")

@@ -111,6 +111,7 @@ def looked_up(path: Path, scans: list[np.ndarray], near: Near | None = None) -> 
     return [located(path, [scan], near=near)[0] for scan in scans]
 
 
+@pytest.mark.long("ten scans, each looked up on its own")
 @pytest.mark.parametrize("kind", ["recorded", "cloud"])
 def test_scans_are_found_where_they_were_made(made: Made, kind: str, request: pytest.FixtureRequest) -> None:
     path = request.getfixturevalue(kind)
@@ -126,6 +127,7 @@ def test_scans_are_found_where_they_were_made(made: Made, kind: str, request: py
     assert all(reason for reason in lost)
 
 
+@pytest.mark.long("ten scans, each looked up on its own")
 @pytest.mark.parametrize("kind", ["recorded", "cloud"])
 def test_scans_of_another_place_are_not_found(
     strange: list[np.ndarray], kind: str, request: pytest.FixtureRequest
@@ -230,7 +232,7 @@ def test_places_are_kept_with_the_cells(made: Made, recorded: Path, tmp_path: Pa
     parts[0].write_bytes(parts[0].read_bytes()[:-1])
     with GridStore.open(path) as store:
         torn = recorded_places(store)
-        assert len(torn) < 2 * once and len(torn.damaged) == 1 and SCAN_PLACES in torn.damaged[0]
+        assert len(torn) < 2 * once and len(torn.damage) == 1 and SCAN_PLACES in torn.damage[0]
 
 
 def test_a_map_whose_y_points_down_is_looked_at_upright(made: Made, tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         results, error = _run(localizer, recording, observer)
         if error is not None and not results:
             raise error
-        damaged = sorted([*surface.damage, *(places.damaged if places is not None else [])])
+        damaged = sorted({*surface.damage, *(places.damage if places is not None else [])})
         report = LocalizationReport(
             str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
@@ -219,7 +219,7 @@ def _places(
         observer.note(f"lost frames are not looked up: {error}")
         return None
     if start is None and not len(places):
-        reason = f"; left out: {places.damaged[0]}" if places.damaged else ""
+        reason = f"; left out: {places.damage[0]}" if places.damage else ""
         where = "" if near is None else f" {near}"
         raise ConfigError(f"{request.map}: has no places to look up{where}: `start_pose` is needed{reason}")
     return places
