@@ -22,7 +22,7 @@ import argparse
 import shutil
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,14 +101,14 @@ def world(a: argparse.Namespace) -> None:
         places = recorded_places(store)
         print(f"{len(places)} places recorded along {a.walk:g} m of a world of {a.size:g} m")
         for name, wanted in queries.items():
-            show(f"recorded, {name}", store, lambda: places, wanted)
+            show(f"recorded, {name}", store, places, wanted)
     with fresh(a.folder / "cloud.grid", replace(INDOORS, voxel=0.0)) as store:
         tiles = list(cloud_tiles(made, 0.12))
         points, normals = (np.concatenate(arrays) for arrays in zip(*tiles, strict=True))
         store_cloud(store, points, {NORMAL: packed_normals(normals)})
         picture = picture_of_store(store)
         for name, wanted in queries.items():
-            show(f"cloud, {name}", store, lambda: picture, wanted)
+            show(f"cloud, {name}", store, picture, wanted)
 
 
 def query(made: World, scanner: Scanner, poses: np.ndarray, away: float, seed: int) -> Query:
@@ -141,9 +141,9 @@ def submaps(a: argparse.Namespace) -> None:
         with fresh(a.folder / "submaps.grid", OUTDOORS) as store:
             store_cloud(store, np.concatenate([transform_points(clouds[n], truth[n]) for n in others]))
             seen = [place for n in others if (place := place_of(clouds[n], truth[n], "xy")) is not None]
-            arrays = (np.array([getattr(place, name) for place in seen]) for name in ("position", "floor", "code"))
-            places = ScanPlaces(*arrays, axes="xy")
-            for kind, guesser in (("recorded", lambda: places), ("cloud", lambda: picture_of_store(store))):
+            positions, floors = np.array([place.position for place in seen]), np.array([place.floor for place in seen])
+            places = ScanPlaces(positions, floors, np.array([place.code for place in seen]), "xy")
+            for kind, guesser in (("recorded", places), ("cloud", picture_of_store(store))):
                 show(f"{kind}, {folder.name}, {nearest:.1f} m away", store, guesser, [own])
                 if strangers:
                     show(f"{kind}, strangers", store, guesser, [(scan, None) for scan in strangers])
@@ -155,7 +155,7 @@ def fresh(path: Path, settings: SubmapSettings) -> GridStore:
     return GridStore.create(path, settings)
 
 
-def show(name: str, store: GridStore, places: Callable[[], Guesser], queries: Sequence[Query]) -> None:
+def show(name: str, store: GridStore, places: Guesser, queries: Sequence[Query]) -> None:
     """Prints what came of looking scans up."""
     errors, false, seconds = [], 0, []
     for scan, T in queries:
@@ -175,13 +175,13 @@ def show(name: str, store: GridStore, places: Callable[[], Guesser], queries: Se
     )  # fmt: skip
 
 
-def locate(store: GridStore, places: Callable[[], Guesser], scan: np.ndarray) -> tuple[Localization, float]:
+def locate(store: GridStore, places: Guesser, scan: np.ndarray) -> tuple[Localization, float]:
     """Looks a scan up, and the seconds it took."""
     context, outdoors = NativeContext(), store.settings.sensor_range > 30
     target = replace(SCAN_TARGET, voxel=OUTDOOR_VOXEL) if outdoors else SCAN_TARGET
     settings = OUTDOOR_SCANS if outdoors else ScanTrackerSettings()
     with PartialSurface(store, target, context) as surface:
-        look_up = ScanLookUp(places, store.settings.axes)
+        look_up = ScanLookUp(lambda: places, store.settings.axes)
         localizer = Localizer(surface, ScanTracker(settings, context, None, look_up), None)
         began = time.perf_counter()
         return localizer.locate(scan.astype(np.float32)), time.perf_counter() - began

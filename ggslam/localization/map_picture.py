@@ -210,7 +210,7 @@ def _pixels_near(picture: _Picture, near: Near, axes: GridAxes) -> np.ndarray:
     """Which pixels are near a position, whatever its height, bool [h, w]."""
     R_world_level = level_axes(axes)
     level = np.zeros((*picture.size, 3))
-    level[..., :2] = (np.stack(np.indices(picture.size), -1) + 0.5) * picture.pixel + picture.corner
+    level[..., :2] = (np.moveaxis(np.indices(picture.size), 0, -1) + 0.5) * picture.pixel + picture.corner
     if len(near.position) == 3:
         level[..., 2] = (R_world_level.T @ np.array(near.position))[2]
     return near.allows(level.reshape(-1, 3) @ R_world_level.T, axes).reshape(picture.size)

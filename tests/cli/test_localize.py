@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -70,7 +71,15 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def contents(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+        for path in sorted(folder.rglob("*"))
+    }
+
+
 def test_a_recording_is_located_in_a_run(run: Path, room: Path, tmp_path: Path) -> None:
+    before = contents(run)
     output = done("localize", run, room, "--out", tmp_path / "out")
     found = summary(tmp_path / "out")
     assert found["located_share"] == 1 and found["frames"] == 24 and found["rmse_aligned_m"] < 0.01
@@ -79,7 +88,8 @@ def test_a_recording_is_located_in_a_run(run: Path, room: Path, tmp_path: Path) 
     own = read_tum(run / "trajectory.txt")  # the map's world is the run's
     apart = np.linalg.norm(poses.T_world_camera[:12, :3, 3] - own.T_world_camera[:, :3, 3], axis=1)
     assert len(poses) == 24 and apart.max() < 0.02
-    with GridStore.open(run / "cells") as store:
+    (cells,) = tmp_path.glob("*.grid")
+    with GridStore.open(cells) as store:
         cells = [store.cell(key) for key in store.cells()]
     gaussians = sum(c.parts[GAUSSIANS].count for c in cells if GAUSSIANS in c.parts)
     assert gaussians == len(RunFolder.open(run).gaussians())
@@ -87,6 +97,16 @@ def test_a_recording_is_located_in_a_run(run: Path, room: Path, tmp_path: Path) 
     full = ["--full-map", "--start-pose", ORIGIN, "--stop", 6]
     done("localize", run, room, *full, "--out", tmp_path / "full")
     assert summary(tmp_path / "full")["full_map"] and summary(tmp_path / "full")["located_share"] == 1
+    assert contents(run) == before and sorted(path.name for path in tmp_path.glob(".*")) == []
+    done("verify", run)
+
+
+def test_results_in_the_folder_of_a_run_do_not_bring_cells_there(run: Path, room: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    before = contents(copy)
+    done("localize", copy, room, "--stop", 2, "--out", copy / "again")
+    added = set(contents(copy)) - set(before)
+    assert added and all(name.startswith("again") for name in added)
 
 
 def test_scans_are_located_in_a_cloud(scans: Path, tmp_path: Path) -> None:

@@ -34,13 +34,15 @@ from ggslam.sequences.rig import one_camera
 from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
-from ggslam.system.links import refuse_links_below, remove_folder
 from ggslam.tracking.settings import TargetSettings, TrackerSettings
 
 GIVEN = "given"
 """As a start pose: the recording's own first pose."""
 _CELLS = "cells"
+_SHORT = 8
+"""Letters of a run's fingerprint in the name of the store of its map."""
 _FARTHEST = 1e7
 """Metres from the origin of the map that a start pose may be."""
 _FINEST = 1.5
@@ -59,7 +61,7 @@ class LocalizeRequest:
         near: roughly where the recording was made: "x y sigma" or "x y z sigma", metres in the map's world; only
             places within three sigma are looked at; None: all.
         full: against the whole map.
-        out: folder for the results; None: localized/NAME.
+        out: folder for the results; None: localized/NAME. The cells of a run's map are kept beside it.
         radius: R' in metres; None: the store's.
         voxel: edge of the target's voxels in metres; None: 0.03 for images, 0.15 for scans, or what the map allows.
         columns: numbers of a point in .bin scans; None: as they tell themselves.
@@ -96,7 +98,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         recording = _open_recording(request)
         start = _start(request, recording.ground_truth)
         near = None if request.near is None else parse_near(request.near)
-        store = open_map(request.map, opened, observer)
+        store = open_map(request.map, out.parent, opened, observer)
         context = NativeContext(request.threads)
         settings = store.settings
         submaps = settings if request.radius is None else replace(settings, partial_radius=request.radius)
@@ -127,9 +129,9 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     return report
 
 
-def open_map(path: Path, opened: ExitStack, observer: Observer) -> GridStore:
-    """The store of a folder, of a run (made in RUN/cells if it is not there or not of this run), or of a cloud (made in
-    a temporary folder). `opened` closes and removes what is to be.
+def open_map(path: Path, results: Path, opened: ExitStack, observer: Observer) -> GridStore:
+    """The store of a folder, of a run (made in `results` if it is not there, for the next time, too), or of a cloud
+    (made in a temporary folder). `opened` closes and removes what is to be. A run stays as it is.
 
     Raises:
         FormatError, RunFolderError: it is none of them, or damaged.
@@ -143,26 +145,30 @@ def open_map(path: Path, opened: ExitStack, observer: Observer) -> GridStore:
         store = opened.enter_context(GridStore.create(folder / _CELLS, replace(INDOORS, voxel=0.0)))
         store_of_cloud(path, store)
         return store
-    return opened.enter_context(_store_in_run(path, observer))
+    return opened.enter_context(_store_beside(path, results, opened, observer))
 
 
-def _store_in_run(path: Path, observer: Observer) -> GridStore:
+def _store_beside(path: Path, results: Path, opened: ExitStack, observer: Observer) -> GridStore:
     if path.is_dir() and not (path / MARKER).is_file():
         raise ConfigError(f"{path}: neither a grid store (no index.sqlite) nor a run (no {MARKER})")
     folder = RunFolder.open(path)
-    cells, making = folder.path / _CELLS, folder.path / (_CELLS + ".new")
-    refuse_links_below(folder.path, [cells.name, making.name])
+    visit = visit_of(folder)
+    if folder.path.resolve() in (results.resolve(), *results.resolve().parents):  # nothing is written into a run
+        results = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="ggslam-")))
+    cells = results / f"{folder.path.resolve().name}-{visit[-_SHORT:]}.grid"
     if is_store(cells):
         store = GridStore.open(cells)
-        if store.visits()[-1:] == [visit_of(folder)]:
+        if store.visits()[-1:] == [visit]:
             return store
         store.close()
-        remove_folder(cells)
-    observer.note(f"the map of {path} is cut into cells: {cells}")
-    remove_folder(making)
+        raise ConfigError(f"{cells}: is not the map of {path} that its name tells: remove it, or choose another `out`")
+    observer.note(f"the map of {path} is cut into cells: {cells}, which the next time uses")
+    make_folder(results)
+    making = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix=f".{cells.name}-", dir=results))) / _CELLS
     with GridStore.create(making, INDOORS) as store:
         store_of_run(path, store)
-    making.rename(cells)  # a store that was not finished has another name
+    if not is_store(cells):  # another process may have been faster
+        making.rename(cells)  # a store that was not finished has another name
     return GridStore.open(cells)
 
 
