@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory files: TUM (`timestamp tx ty tz qx qy qz qw`), rows of matrices (KITTI 3x4, Replica 4x4), EuRoC tables
-(`timestamp[ns],px,py,pz,qw,qx,qy,qz`, with or without what follows) and pose graphs of g2o (`VERTEX_SE3:QUAT`).
+"""Trajectory files, of four kinds:
 
-Poses are camera to world. The quaternion order xyzw exists only in TUM and g2o files; in memory it is wxyz. Times in
-nano- or microseconds of Unix time are told by their size.
+    TUM         timestamp tx ty tz qx qy qz qw
+    matrices    a row each, KITTI's 3x4 or Replica's 4x4
+    EuRoC       timestamp[ns],px,py,pz,qw,qx,qy,qz, with or without what follows
+    g2o         pose graphs, VERTEX_SE3:QUAT number x y z qx qy qz qw
+
+Poses are camera to world. The quaternion order xyzw exists only in TUM and g2o files; in memory it is wxyz. Times since 1970 in milli-,
+micro- or nanoseconds are told by their digits.
 """
 
 from __future__ import annotations
@@ -17,12 +21,11 @@ import numpy as np
 from ggslam.errors import FormatError, InputError
 from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalize, quaternion_to_matrix
 from ggslam.system.atomic import write_text
+from ggslam.system.clock_units import EPOCH_DIGITS, UNITS
 from ggslam.system.foreign import read_foreign_text
 
 _G2O_TAGS = ("VERTEX_", "EDGE_", "PARAMS_", "FIX")
 _VERTEX = "VERTEX_SE3:QUAT"
-_UNITS = ((1e-9, 1e17), (1e-6, 1e14))
-"""Seconds of a unit, and the least number that Unix time has in it: none of this age has so many of the unit before."""
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, metres)\n"
 
@@ -201,10 +204,8 @@ def _numbers(where: str, words: list[str]) -> np.ndarray:
 
 def _seconds(times: np.ndarray) -> np.ndarray:
     """Times of a file in seconds."""
-    for unit, least in _UNITS:
-        if np.abs(times).min() >= least:
-            return times * unit
-    return times
+    digits = {len(f"{abs(time):.0f}") for time in times.tolist()}
+    return times * UNITS[EPOCH_DIGITS.get(digits.pop(), "s") if len(digits) == 1 else "s"]
 
 
 def _check_finite(where: str, numbers: np.ndarray) -> None:

@@ -30,6 +30,9 @@ _TURNS_DEG = np.arange(-9.0, 10.0, 3.0)
 _PICTURE = 160
 """Pixels along a side of a picture from above, which is padded to `_PADDED`."""
 _PADDED = 256
+_GOOD = 0.9
+_FLOORS = 4
+"""A candidate may stand on several floors."""
 _STEEP = 0.7
 """Surfaces are upright whose normals are less steep than this sine."""
 _ON_SURFACE = 0.4
@@ -45,6 +48,8 @@ class ScanLookUpSettings:
 
     candidates: int = setting(10, 1, 1000)
     """Places that are tried, the likeliest first."""
+    more: int = setting(4, 0, 1000)
+    """After one that matches well so many are tried, to see whether another does, too."""
     apart: float = setting(1.5, 0, 1e4, "m")
     """Of places nearer to each other with about the same azimuth the likeliest is tried."""
     min_fit: float = setting(0.55, 0, 1)
@@ -131,9 +136,17 @@ class ScanLookUp:
         if floor is None or not len(self._places):
             return None, "the scan shows no floor" if floor is None else "there are no places to look it up among"
         guesses = self._places.guesses(points, floor, self.settings.candidates, self.settings.apart)
-        found = [self._try(points, floor, guess, surface, align) for guess in guesses]
-        ranked = sorted((pose for pose in found if pose is not None), key=lambda pose: -pose.score)
-        return self._judge(ranked)
+        found: list[FoundPose] = []
+        left = self.settings.candidates * _FLOORS
+        for guess in guesses:
+            if (pose := self._try(points, floor, guess, surface, align)) is not None:
+                found.append(pose)
+                if pose.score > _GOOD:  # others as good look as likely, and come soon
+                    left = min(left, self.settings.more + 1)
+            left -= 1
+            if not left:
+                break
+        return self._judge(sorted(found, key=lambda pose: -pose.score))
 
     def _judge(self, ranked: list[FoundPose]) -> tuple[FoundPose | None, str]:
         limits = self.settings

@@ -19,10 +19,13 @@ from ggslam.formats.trajectory import read_tum, write_tum
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
 from ggslam.runs.folder import RunFolder
 from ggslam.submaps.grid import GridStore
+from ggslam.submaps.recorder import load_points
 from ggslam.synthetic.world_cloud import cloud_tiles
 from ggslam.synthetic.world_plan import make_world
 from ggslam.synthetic.world_scanner import Scanner
 from ggslam.synthetic.world_walk import walk
+from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.octomap_files import write_octomap
 
 ORIGIN = "0 0 0 0 0 0 1"
 
@@ -144,6 +147,32 @@ def test_scans_are_found_without_a_start_pose(scans: Path, tmp_path: Path) -> No
     far = ["--near", f"{x + 100:.1f} {y:.1f} 2", "--stop", 2, "--out", tmp_path / "far"]
     done("localize", tmp_path / "map.grid", scans, *far)
     assert summary(tmp_path / "far")["located_share"] == 0
+
+
+def test_scans_are_located_in_an_octomap(scans: Path, tmp_path: Path) -> None:
+    points = np.load(scans.parent / "cloud.npy")
+    occupancy = OccupancyMap(0.1)
+    centre = read_tum(scans / "trajectory.txt").T_world_camera[0, :3, 3]
+    occupancy.insert(points.astype(np.float32), centre)
+    write_octomap(occupancy, tmp_path / "map.bt")
+    done("localize", tmp_path / "map.bt", scans, "--start-pose", "given", "--stop", 6, "--out", tmp_path / "out")
+    found = summary(tmp_path / "out")
+    assert found["located_share"] == 1 and found["rmse_m"] < 0.07  # a wall is anywhere in its voxels of 10 cm
+    done("submaps", tmp_path / "map.bt", "--out", tmp_path / "map.grid")
+    with GridStore.open(tmp_path / "map.grid") as store:
+        held = np.concatenate([load_points(store, key)["points"] for key in store.cells()])
+    centres, sizes = occupancy.occupied_centers()
+    assert len(held) >= len(centres)
+    inside = (np.abs(held[:, None, :3] - centres[None, :200]).max(2) <= sizes[None, :200] / 2 + 1e-4).any(0)
+    assert inside.all()
+
+
+@pytest.mark.parametrize("suffix", [".las", ".e57", ".pcap", ".ot", ".bag"])
+def test_kinds_that_are_not_read_are_named(scans: Path, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"map{suffix}"
+    path.write_bytes(b"anything")
+    one_error(ggslam("localize", path, scans, "--out", tmp_path / "o"), suffix, "is not read")
+    one_error(ggslam("submaps", path, "--out", tmp_path / "m.grid"), suffix, "is not read")
 
 
 def test_a_visit_is_recorded_with_poses_from_localisation(room: Path, run: Path, tmp_path: Path) -> None:

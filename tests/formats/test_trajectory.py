@@ -125,7 +125,7 @@ def test_euroc_tables_are_wxyz_in_nanoseconds(tmp_path: Path, rest: str) -> None
         read_trajectory(tmp_path / "short.csv")
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("ns", 10**9), ("us", 10**6), ("s", 1)])
+@pytest.mark.parametrize(("unit", "factor"), [("ns", 10**9), ("us", 10**6), ("ms", 1000), ("s", 1)])
 def test_times_of_tum_files_may_be_in_nanoseconds(tmp_path: Path, unit: str, factor: int) -> None:
     rows = [f"{(1700000000 + n) * factor} 0 0 {n} 0 0 0 1" for n in range(4)]
     (tmp_path / f"{unit}.txt").write_text("\n".join(rows))

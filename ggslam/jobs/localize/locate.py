@@ -16,7 +16,7 @@ import numpy as np
 from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.localize.report import LocalizationReport, write_localization
 from ggslam.jobs.progress import Observer
-from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
+from ggslam.jobs.submaps.stores import INDOORS, cloud_voxel, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
 from ggslam.localization.frames import FrameTracker
 from ggslam.localization.localizer import Localization, Localizer
 from ggslam.localization.near import Near, parse_near
@@ -142,7 +142,7 @@ def open_map(path: Path, results: Path, opened: ExitStack, observer: Observer) -
     if is_cloud(path):
         observer.note(f"{path} is cut into cells; `ggslam submaps` keeps them for the next time")
         folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="ggslam-")))
-        store = opened.enter_context(GridStore.create(folder / _CELLS, replace(INDOORS, voxel=0.0)))
+        store = opened.enter_context(GridStore.create(folder / _CELLS, replace(INDOORS, voxel=cloud_voxel(path))))
         store_of_cloud(path, store)
         return store
     return opened.enter_context(_store_beside(path, results, opened, observer))

@@ -38,6 +38,7 @@ from ggslam.volumes.octomap_files import read_octomap
 INDOORS = SubmapSettings(voxel=0.02)
 """For maps of depth cameras."""
 OCTOMAP = ".bt"
+_MOST_VOXELS = 5e7
 _CELLS_AT_ONCE = 64
 
 
@@ -49,6 +50,15 @@ def is_store(path: Path) -> bool:
 def is_cloud(path: Path) -> bool:
     """Whether a path names a cloud, by its suffix; one of a kind that is not read included."""
     return path.suffix.lower() in (*SUFFIXES, *NOT_READ, OCTOMAP) and not path.is_dir()
+
+
+def cloud_voxel(path: Path) -> float:
+    """How far apart the points of a cloud are by its own word, metres: the voxels of an OctoMap; 0: nothing is told.
+
+    Raises:
+        FormatError: the file is missing or damaged.
+    """
+    return read_octomap(path).resolution if path.suffix.lower() == OCTOMAP else 0.0
 
 
 def open_or_create(path: Path, settings: SubmapSettings) -> GridStore:
@@ -182,6 +192,9 @@ def _octomap(path: Path) -> np.ndarray:
         raise FormatError(f"{path}: no voxel of it is occupied")
     edge = occupancy.resolution
     found = []
+    voxels = float((np.rint(sizes.astype(np.float64) / edge) ** 3).sum())
+    if voxels > _MOST_VOXELS:
+        raise FormatError(f"{path}: {voxels:.3g} voxels are occupied, {_MOST_VOXELS:g} are taken")
     for size in np.unique(sizes):
         across = max(1, round(float(size) / edge))
         steps = (np.arange(across) - (across - 1) / 2) * edge
