@@ -6,8 +6,8 @@
     EuRoC       timestamp[ns],px,py,pz,qw,qx,qy,qz, with or without what follows
     g2o         pose graphs, VERTEX_SE3:QUAT number x y z qx qy qz qw
 
-Poses are camera to world. The quaternion order xyzw exists only in TUM and g2o files; in memory it is wxyz. Times since 1970 in milli-,
-micro- or nanoseconds are told by their digits.
+Poses are camera to world. The quaternion order xyzw exists only in TUM and g2o files; in memory it is wxyz. Times since
+1970 in milli-, micro- or nanoseconds are told by their digits.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ def load_scan_places(store: GridStore, key: CellKey) -> list[ScanPlace]:
 
 
 class ScanPlaces:
-    """Places of a map in memory, whatever else it holds: 3 KB each.
+    """Places of a map in memory, whatever else it holds: 2 KB each.
 
     Args:
         positions: float64 [n, 3], world.

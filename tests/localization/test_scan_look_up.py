@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError
+from ggslam.formats.raw_points import read_pose_graph, read_raw_points
 from ggslam.localization.level import about_z, floor_height
 from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
 from ggslam.localization.map_picture import picture_of_store
@@ -23,7 +24,7 @@ from ggslam.localization.scans import LaserScan
 from ggslam.localization.surface import NORMAL, SCAN_TARGET, PartialSurface, packed_normals
 from ggslam.localization.visits import ScanSights, record_visit
 from ggslam.native.loader import NativeContext
-from ggslam.scene.poses import separation
+from ggslam.scene.poses import separation, transform_points
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
@@ -32,6 +33,7 @@ from ggslam.synthetic.world_cloud import cloud_tiles
 from ggslam.synthetic.world_plan import make_world
 from ggslam.synthetic.world_scanner import Scanner
 from ggslam.synthetic.world_walk import walk
+from ggslam.tracking.scan_points import ScanSettings
 
 GROUND = SubmapSettings(axes="xy", voxel=0.05, partial_radius=10.0, radius=1.5, refresh=0.0)
 SCANNER = Scanner(columns=450)
@@ -249,3 +251,25 @@ def test_a_map_whose_y_points_down_is_looked_at_upright(made: Made, tmp_path: Pa
     assert moved < 0.6 and angle < 6
     place = place_of(scan, down @ T, "xz")
     assert place is not None and place.floor == pytest.approx(-T[2, 3], abs=0.05)
+
+
+def test_a_submap_of_a_street_is_found_in_a_map_of_the_others(shared_data: Path, tmp_path: Path) -> None:
+    folder = shared_data / "clouds" / "kitti_07_submaps"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is not there")
+    poses = list(read_pose_graph(folder / "graph.txt").values())
+    clouds = [read_raw_points(folder / f"{number:06}" / "points.bin")[:, :3].astype(float) for number in range(5)]
+    outdoors = SubmapSettings(spacing=10.0, axes="xy", voxel=0.0, partial_radius=60.0, sensor_range=80.0)
+    turn = np.eye(4)
+    turn[:3, :3] = about_z(2.0)
+    scan = transform_points(clouds[2], np.linalg.inv(turn)).astype(np.float32)  # 5.5 m from the nearest other
+    context = NativeContext()
+    tracker = ScanTrackerSettings(scan=ScanSettings(voxel=0.5, nearest=2.5), sigma=0.05)
+    with GridStore.create(tmp_path / "map.grid", outdoors) as store:
+        store_cloud(store, np.concatenate([transform_points(clouds[n], poses[n]) for n in (0, 1, 3, 4)]))
+        with PartialSurface(store, replace(SCAN_TARGET, voxel=0.4), context) as surface:
+            look_up = ScanLookUp(lambda: scan_places(store), "xy")
+            found = Localizer(surface, ScanTracker(tracker, context, None, look_up), None).locate(scan)
+    assert found.status is LocalizationStatus.FOUND, found.reason
+    moved, turned = separation(found.T_world_sensor, poses[2] @ turn)
+    assert moved < 0.05 and turned < 0.3
