@@ -50,6 +50,12 @@ def one_error(result: Result, *words: str) -> None:
     assert all(word in str(result.exception) for word in words), str(result.exception)
 
 
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results go to the working folder where `--out` says nothing."""
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture(scope="module")
 def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "room"
