@@ -22,6 +22,8 @@ EPILOG = """
 
   ggslam localize office.grid scans/tuesday --start-pose "12.5 3 1.3 0 0 0 1"
 
+  ggslam localize campus.pcd scans/tuesday --near "120 -40 15"
+
   ggslam localize campus.pcd scans/tuesday --start-pose given --full-map --out localized/full
 
   ggslam localize campus.pcd scans/tuesday --start-pose given --set scans.search.reach=4 --set scans.scan.farthest=100
@@ -47,8 +49,13 @@ StartPose = Annotated[
 ]  # fmt: skip
 NoStartPose = Annotated[
     bool,
-    typer.Option("--no-start-pose", help="Look the first frame up among the map's places (the default for images)."),
+    typer.Option("--no-start-pose", help="Look the first frame or scan up in the map (the default)."),
 ]
+Near = Annotated[
+    str | None,
+    typer.Option(metavar="PLACE", help='Roughly where the recording was made: "x y sigma" or "x y z sigma", metres in '
+                 "the map. Only places within 3 sigma are looked at."),
+]  # fmt: skip
 FullMap = Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")]
 Radius = Annotated[
@@ -67,6 +74,7 @@ def localize(
     sequence: RecordingPath,
     start_pose: StartPose = None,
     no_start_pose: NoStartPose = False,
+    near: Near = None,
     full_map: FullMap = False,
     out: Out = None,
     radius: Radius = None,
@@ -102,8 +110,8 @@ def localize(
             camera=camera, intrinsics=intrinsics, depth_camera=depth_camera, depth_kind=depth_kind,
             depth_delay=depth_delay, upright=upright,
         ),
-        start_pose=start_pose, no_start_pose=no_start_pose, full=full_map, out=out, radius=radius, voxel=voxel,
-        columns=columns, threads=threads, overrides=settings or [],
+        start_pose=start_pose, no_start_pose=no_start_pose, near=near, full=full_map, out=out, radius=radius,
+        voxel=voxel, columns=columns, threads=threads, overrides=settings or [],
     )  # fmt: skip
     with progress_bar() as bar:
         report = locate_all(request, ProgressObserver(bar))

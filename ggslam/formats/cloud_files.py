@@ -14,6 +14,16 @@ from ggslam.formats.raw_points import read_raw_points
 from ggslam.scene.arrays import read_array
 
 SUFFIXES = (".ply", ".pcd", ".npy", ".bin")
+NOT_READ = {
+    ".las": "LAS: convert it, e.g. `pdal translate cloud.las cloud.ply`",
+    ".laz": "LAZ: convert it, e.g. `pdal translate cloud.laz cloud.ply`",
+    ".e57": "E57: convert it, e.g. `pdal translate cloud.e57 cloud.ply`",
+    ".pcap": "packets of a LiDAR, which only its driver can read: write .pcd or .bin files, one a scan",
+    ".bag": "a bag of scans: write one .pcd file a scan, e.g. `rosrun pcl_ros bag_to_pcd cloud.bag /points folder`",
+    ".mcap": "a bag of scans: write one .pcd or .bin file a scan",
+    ".ot": "OctoMap with probabilities: write a .bt file, e.g. `convert_octree map.ot map.bt`",
+}
+"""Why files of other kinds are not read, and what to do."""
 
 
 def read_cloud_file(path: str | Path, columns: int | None = None, tell: bool = True) -> ColoredCloud:
@@ -28,6 +38,8 @@ def read_cloud_file(path: str | Path, columns: int | None = None, tell: bool = T
         FormatError: the file is missing or damaged, or has no points.
     """
     path = Path(path)
+    if path.suffix.lower() in NOT_READ:
+        raise FormatError(f"{path}: is not read: {NOT_READ[path.suffix.lower()]}")
     if path.suffix.lower() == ".bin":
         stored = read_raw_points(path, columns)
     elif path.suffix.lower() == ".npy":

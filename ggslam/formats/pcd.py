@@ -16,8 +16,9 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats import lzf
 from ggslam.formats.text_numbers import fit, parse_numbers
+from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.atomic import write_bytes
-from ggslam.system.foreign import read_foreign
+from ggslam.system.foreign import open_foreign, read_foreign
 
 _MAXIMUM_HEADER_BYTES = 1 << 16
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -57,6 +58,29 @@ def parse_pcd(data: bytes, path: str | Path) -> np.ndarray:
         rows = _compressed_rows(body, header, path)
     wanted = [name for name in rows.dtype.names or () if not name.startswith("_ ")]
     return rows[wanted]
+
+
+def read_viewpoint(path: str | Path) -> np.ndarray:
+    """The pose of the sensor in the header of a PCD file (VIEWPOINT), T_world_sensor float64 [4, 4]. The points are as
+    the sensor saw them.
+
+    Raises:
+        FormatError: the file is missing, no PCD file, or the pose is none; names file and reason.
+    """
+    path = Path(path)
+    with open_foreign(path) as file:
+        lines, _ = _header_lines(file.read(_MAXIMUM_HEADER_BYTES), path)
+    words = lines.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        numbers = np.zeros(0)
+    norm = float(np.linalg.norm(numbers[3:]))
+    if len(numbers) != 7 or not np.isfinite(numbers).all() or not 0.9 < norm < 1.1:
+        raise FormatError(f"{path}: VIEWPOINT is {' '.join(words)!r}, expected a position and a unit quaternion (wxyz)")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = quaternion_to_matrix(numbers[3:] / norm), numbers[:3]
+    return T
 
 
 def write_pcd(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:

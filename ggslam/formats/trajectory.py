@@ -1,7 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectory files: TUM (`timestamp tx ty tz qx qy qz qw`), and rows of matrices (KITTI 3x4, Replica 4x4).
+"""Trajectory files, of four kinds:
 
-Poses are camera to world. The quaternion order xyzw exists only in TUM files; in memory it is wxyz.
+    TUM         timestamp tx ty tz qx qy qz qw
+    matrices    a row each, KITTI's 3x4 or Replica's 4x4
+    EuRoC       timestamp[ns],px,py,pz,qw,qx,qy,qz, with or without what follows
+    g2o         pose graphs, VERTEX_SE3:QUAT number x y z qx qy qz qw
+
+Poses are camera to world. The quaternion order xyzw exists only in TUM and g2o files; in memory it is wxyz. Times since
+1970 in milli-, micro- or nanoseconds are told by their digits.
 """
 
 from __future__ import annotations
@@ -15,7 +21,11 @@ import numpy as np
 from ggslam.errors import FormatError, InputError
 from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalize, quaternion_to_matrix
 from ggslam.system.atomic import write_text
+from ggslam.system.clock_units import EPOCH_DIGITS, UNITS
 from ggslam.system.foreign import read_foreign_text
+
+_G2O_TAGS = ("VERTEX_", "EDGE_", "PARAMS_", "FIX")
+_VERTEX = "VERTEX_SE3:QUAT"
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw (camera to world, metres)\n"
 
@@ -76,10 +86,10 @@ def read_tum(path: str | Path) -> Trajectory:
     for where, numbers in _rows(Path(path), (8,)):
         _check_finite(where, numbers)
         times.append(numbers[0])
-        poses.append(_pose_of_tum_row(where, numbers))
+        poses.append(_pose(where, numbers[1:4], numbers[4:]))
     if not poses:
         raise FormatError(f"{path}: no poses in it")
-    return Trajectory(np.array(times), np.stack(poses))
+    return Trajectory(_seconds(np.array(times)), np.stack(poses))
 
 
 def read_matrices(path: str | Path, allow_missing: bool = False) -> Trajectory:
@@ -111,30 +121,91 @@ def read_matrices(path: str | Path, allow_missing: bool = False) -> Trajectory:
 
 
 def read_trajectory(path: str | Path) -> Trajectory:
-    """Reads a trajectory of any of the kinds above, told apart by the number of columns.
+    """Reads a trajectory of any of the kinds above, told apart by the first line with content.
 
     Raises:
         FormatError: as `read_tum` and `read_matrices`.
     """
-    for _, numbers in _rows(Path(path), (8, 12, 16)):
-        return read_tum(path) if len(numbers) == 8 else read_matrices(path)
+    path = Path(path)
+    for line in read_foreign_text(path).splitlines():
+        content = line.split("#", 1)[0].strip()
+        if not content:
+            continue
+        if content.split()[0].startswith(_G2O_TAGS):
+            return read_g2o(path)
+        if "," in content:
+            return read_euroc(path)
+        return read_tum(path) if len(content.split()) == 8 else read_matrices(path)
     raise FormatError(f"{path}: no poses in it")
 
 
-def _rows(path: Path, columns: tuple[int, ...]) -> Iterator[tuple[str, np.ndarray]]:
-    """("file, line n", numbers) of each line with content; the number of columns must be one of `columns`."""
+def read_euroc(path: str | Path) -> Trajectory:
+    """Reads a table of EuRoC's: nanoseconds, position, quaternion wxyz, and perhaps velocity and biases. The poses are
+    of the body (the IMU), in the order of the file.
+
+    Raises:
+        FormatError: as `read_tum`.
+    """
+    times, poses = [], []
+    for where, numbers in _rows(Path(path), (8, 11, 17), ","):
+        _check_finite(where, numbers[:8])
+        times.append(numbers[0])
+        poses.append(_pose(where, numbers[1:4], numbers[[5, 6, 7, 4]]))
+    if not poses:
+        raise FormatError(f"{path}: no poses in it")
+    return Trajectory(_seconds(np.array(times)), np.stack(poses))
+
+
+def read_g2o(path: str | Path) -> Trajectory:
+    """Reads the poses of a pose graph, by their numbers, which take the place of times; edges are passed over.
+
+    Raises:
+        FormatError: as `read_tum`, or two poses of one number.
+    """
+    found: dict[int, np.ndarray] = {}
     for number, line in enumerate(read_foreign_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
-        if not words:
+        if not words or words[0] != _VERTEX:
+            continue
+        where = f"{path}, line {number}"
+        if len(words) != 9:
+            raise FormatError(f"{where}: expected {_VERTEX} with 8 numbers, found {len(words) - 1}")
+        numbers = _numbers(where, words[1:])
+        _check_finite(where, numbers)
+        if not numbers[0].is_integer() or int(numbers[0]) in found:
+            raise FormatError(f"{where}: {words[1]} is no number of a pose, or there are two of it")
+        found[int(numbers[0])] = _pose(where, numbers[1:4], numbers[4:])
+    if not found:
+        raise FormatError(f"{path}: no poses in it (lines {_VERTEX})")
+    order = sorted(found)
+    return Trajectory(np.array(order, float), np.stack([found[number] for number in order]))
+
+
+def _rows(path: Path, columns: tuple[int, ...], between: str | None = None) -> Iterator[tuple[str, np.ndarray]]:
+    """("file, line n", numbers) of each line with content; the number of columns must be one of `columns`; `between`:
+    what stands between them, None: space."""
+    for number, line in enumerate(read_foreign_text(path).splitlines(), start=1):
+        words = line.split("#", 1)[0].split(between)
+        if not "".join(words).strip():
             continue
         where = f"{path}, line {number}"
         if len(words) not in columns:
             expected = " or ".join(map(str, columns))
             raise FormatError(f"{where}: expected {expected} columns, found {len(words)}")
-        try:
-            yield where, np.array([float(word) for word in words])
-        except ValueError as error:
-            raise FormatError(f"{where}: {error}") from None
+        yield where, _numbers(where, words)
+
+
+def _numbers(where: str, words: list[str]) -> np.ndarray:
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError as error:
+        raise FormatError(f"{where}: {error}") from None
+
+
+def _seconds(times: np.ndarray) -> np.ndarray:
+    """Times of a file in seconds."""
+    digits = {len(f"{abs(time):.0f}") for time in times.tolist()}
+    return times * UNITS[EPOCH_DIGITS.get(digits.pop(), "s") if len(digits) == 1 else "s"]
 
 
 def _check_finite(where: str, numbers: np.ndarray) -> None:
@@ -143,12 +214,13 @@ def _check_finite(where: str, numbers: np.ndarray) -> None:
         raise FormatError(f"{where}: column {column} is {numbers[column - 1]}, expected a finite number")
 
 
-def _pose_of_tum_row(where: str, numbers: np.ndarray) -> np.ndarray:
-    x, y, z, w = numbers[4:]
-    norm = float(np.linalg.norm(numbers[4:]))
+def _pose(where: str, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """T [4, 4] of a position and a quaternion xyzw."""
+    x, y, z, w = quaternion
+    norm = float(np.linalg.norm(quaternion))
     if not 0.9 < norm < 1.1:
         raise FormatError(f"{where}: the quaternion {x:g} {y:g} {z:g} {w:g} has length {norm:.3g}, expected 1")
     T = np.eye(4)
     T[:3, :3] = quaternion_to_matrix(np.array([w, x, y, z]))
-    T[:3, 3] = numbers[1:4]
+    T[:3, 3] = position
     return T

@@ -17,6 +17,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, FormatError
 from ggslam.features.orb import FeatureView
+from ggslam.localization.near import Near
 from ggslam.loops.places import Place, PlaceIndex, PlaceMatch
 from ggslam.loops.settings import PlaceSettings
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes
@@ -65,13 +66,16 @@ class StoredPlaces:
     Args:
         store: the map.
         camera: of the views that are looked up.
+        near: only views from near a position.
 
     Raises:
         ConfigError: the places were seen by another camera.
     """
 
-    def __init__(self, store: GridStore, camera: Camera, settings: PlaceSettings | None = None) -> None:
-        self.damaged: list[str] = []
+    def __init__(
+        self, store: GridStore, camera: Camera, settings: PlaceSettings | None = None, near: Near | None = None
+    ) -> None:
+        self.damage: list[str] = []
         """What is wrong with parts that were left out."""
         parts = []
         for key in store.cells():
@@ -79,9 +83,12 @@ class StoredPlaces:
                 try:
                     parts.append((key, _arrays(store, key)))
                 except FormatError as error:
-                    self.damaged.append(str(error))
+                    self.damage.append(str(error))
         for key, arrays in parts:
             _check_camera(store, key, arrays["camera"], camera)
+        if near is not None:
+            axes = store.settings.axes
+            parts = [(key, _choose(held, near.allows(held["poses"][:, :3, 3], axes))) for key, held in parts]
         merged = {name: np.concatenate([arrays[name] for _, arrays in parts]) for name in _NAMES[:5]} if parts else {}
         self.T_world_camera: np.ndarray = merged.pop("poses", np.zeros((0, 4, 4)))
         """Of each view, float64 [k, 4, 4]."""
@@ -129,6 +136,13 @@ def _arrays(store: GridStore, key: CellKey) -> Mapping[str, np.ndarray]:
     if int(arrays["counts"].astype(np.int64).sum()) != len(arrays["points"]):
         raise FormatError(f"{where}: damaged: its landmarks do not fit their numbers")
     return arrays
+
+
+def _choose(arrays: Mapping[str, np.ndarray], views: np.ndarray) -> Mapping[str, np.ndarray]:
+    """The arrays of a cell with these views alone, bool [k]."""
+    landmarks = np.repeat(views, arrays["counts"])
+    rows = {"poses": views, "counts": views, "codes": views, "descriptors": landmarks, "points": landmarks}
+    return {name: arrays[name][kept] for name, kept in rows.items()}
 
 
 def _check_camera(store: GridStore, key: CellKey, found: np.ndarray, camera: Camera) -> None:

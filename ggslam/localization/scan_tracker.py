@@ -9,13 +9,17 @@ import numpy as np
 
 from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
 from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, SearchSettings
+from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.settings import setting, settings_class
-from ggslam.tracking.gicp import AlignmentStatus, GicpTarget
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget
 from ggslam.tracking.scan_points import ScanSettings
 from ggslam.tracking.settings import AlignSettings
+
+MOST_PASSED = 7
+"""Lost scans between two that are looked up, at most."""
 
 
 @settings_class(frozen=True)
@@ -37,20 +41,25 @@ class ScanTrackerSettings:
 
 
 class ScanTracker:
-    """Locates laser scans, float [n, 3] in metres in the sensor's frame. They show no places to look up.
+    """Locates laser scans, float [n, 3] in metres in the sensor's frame.
 
     Args:
         settings: see `ScanTrackerSettings`.
         context: threads.
-        T_world_sensor: pose of the first scan.
+        T_world_sensor: pose of the first scan; None: it is looked up.
+        places: where lost scans are looked up; None: they are not.
     """
 
-    def __init__(self, settings: ScanTrackerSettings, context: NativeContext, T_world_sensor: np.ndarray) -> None:
+    def __init__(
+        self, settings: ScanTrackerSettings, context: NativeContext, T_world_sensor: np.ndarray | None,
+        places: ScanLookUp | None = None,
+    ) -> None:  # fmt: skip
         self.settings = settings
         self.aligner = ScanAligner(settings.scan, settings.align, settings.search, settings.sigma, context)
-        self._pose = np.array(T_world_sensor, float)
+        self._places = places
+        self._pose = np.full((4, 4), np.nan) if T_world_sensor is None else np.array(T_world_sensor, float)
         self._velocity = np.eye(4)
-        self._located = 0
+        self._located = self._passes = self._wait = 0
 
     @property
     def _sure(self) -> bool:
@@ -74,8 +83,29 @@ class ScanTracker:
         return self._outcome(found or best)
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
-        """See `FrontEnd`."""
-        return None
+        """See `FrontEnd`. After a scan was not found, ever more are passed over, `MOST_PASSED` at most."""
+        if self._places is None:
+            return None
+        if self._passes:
+            self._passes -= 1
+            return None
+        source = self.aligner.source(item)
+
+        def align_at(guess: np.ndarray) -> AlignmentResult:
+            assert surface.target is not None
+            match = self.aligner.fine(source, surface, surface.target, guess)
+            return self.aligner.settle(source, surface, surface.target, match).found
+
+        found, reason = self._places.find(item, surface, align_at)
+        if found is None:
+            self._passes = self._wait
+            self._wait = min(2 * self._wait + 1, MOST_PASSED)
+            return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, 0.0, 0.0, reason)
+        self._passes = self._wait = 0
+        self._velocity, self._located = np.eye(4), 1
+        self._pose = orthonormalize(found.alignment.T_world_camera)
+        alignment = found.alignment
+        return FrontEndResult(self._pose.copy(), LocalizationStatus.FOUND, alignment.overlap, alignment.rmse, reason)
 
     def _is_right(self, match: ScanMatch) -> bool:
         return match.counted >= self.settings.min_counted and self.aligner.is_right(match, self.settings.min_overlap)

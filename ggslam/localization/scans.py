@@ -3,7 +3,8 @@
 
     scans/000000.bin ...    or the files in the folder itself: .bin (float32), .npy [n, 3 or more], .pcd
     trajectory.txt          TUM (timestamp tx ty tz qx qy qz qw) or one matrix a line (KITTI, Replica), a row a scan;
-                            or groundtruth.txt, or poses.txt; sensor to world; may be absent
+                            or groundtruth.txt, poses.txt, trajectory.csv (EuRoC), poses.g2o; sensor to world; may be
+                            absent: then the VIEWPOINT lines of .pcd files are the poses, where one is no identity
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.formats.cloud_files import read_cloud_file
+from ggslam.formats.pcd import read_viewpoint
 from ggslam.formats.trajectory import read_trajectory
 
 _SUFFIXES = (".bin", ".npy", ".pcd")
-_POSES = ("trajectory.txt", "groundtruth.txt", "poses.txt")
+_POSES = ("trajectory.txt", "groundtruth.txt", "poses.txt", "trajectory.csv", "poses.g2o")
 _RATE = 10.0
 """Scans per second where nothing tells times."""
 
@@ -57,7 +59,7 @@ class ScanSequence:
         files = scan_files(self.path)
         if not files:
             raise SequenceError(f"{path}: no scans ({', '.join(_SUFFIXES)})")
-        times, poses = _poses(self.path, len(files))
+        times, poses = _poses(self.path, files)
         chosen = np.arange(len(files))[start:stop:stride]
         if not len(chosen):
             raise SequenceError(f"{path}: no scan of {len(files)} is selected")
@@ -93,7 +95,8 @@ def scan_files(path: Path) -> list[Path]:
     return []
 
 
-def _poses(folder: Path, count: int) -> tuple[np.ndarray, np.ndarray | None]:
+def _poses(folder: Path, files: list[Path]) -> tuple[np.ndarray, np.ndarray | None]:
+    count = len(files)
     for name in _POSES:
         if (folder / name).is_file():
             found = read_trajectory(folder / name)
@@ -101,4 +104,12 @@ def _poses(folder: Path, count: int) -> tuple[np.ndarray, np.ndarray | None]:
                 raise SequenceError(f"{folder / name}: {len(found)} poses, but there are {count} scans")
             by_row = np.array_equal(found.timestamps, np.arange(count))
             return found.timestamps / (_RATE if by_row else 1.0), found.T_world_camera
-    return np.arange(count) / _RATE, None
+    return np.arange(count) / _RATE, _viewpoints(files)
+
+
+def _viewpoints(files: list[Path]) -> np.ndarray | None:
+    """Poses that the scans' own files tell, [n, 4, 4]; None where they tell nothing."""
+    if any(file.suffix.lower() != ".pcd" for file in files):
+        return None
+    poses = np.array([read_viewpoint(file) for file in files])
+    return None if (poses == np.eye(4)).all() else poses

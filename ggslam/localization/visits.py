@@ -16,6 +16,13 @@ import numpy as np
 
 from ggslam.features.orb import FeatureView
 from ggslam.localization.places import PLACES, StoredView, stored_places_to_bytes, stored_views
+from ggslam.localization.scan_places import (
+    SCAN_PLACES,
+    ScanPlace,
+    load_scan_places,
+    place_of,
+    scan_places_to_bytes,
+)
 from ggslam.localization.scans import LaserScan
 from ggslam.localization.surface import NORMAL, packed_normals, surface_normals
 from ggslam.loops.places import PlaceIndex
@@ -27,6 +34,7 @@ from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import POINTS
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import SubmapRecorder, load_points
+from ggslam.submaps.settings import GridAxes
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise, PointSettings
@@ -48,12 +56,14 @@ class Sight:
         looked_at: tells of world points [m, 3] whether the sensor looked at them: at whatever is there now, or through
             the place where they were.
         view: how a frame looks.
+        place: what a scan saw.
     """
 
     points: np.ndarray
     normals: np.ndarray
     looked_at: Callable[[np.ndarray], np.ndarray]
     view: StoredView | None = None
+    place: ScanPlace | None = None
 
 
 @dataclass
@@ -96,10 +106,17 @@ class FrameSights:
 
 
 class ScanSights:
-    """Points of laser scans, with normals estimated from neighbours."""
+    """Points of laser scans, with normals estimated from neighbours, and places.
+
+    Args:
+        axes: of the store's grid.
+    """
 
     apart_m, apart_deg = 0.3, 30.0
     camera: Camera | None = None
+
+    def __init__(self, axes: GridAxes = "xyz") -> None:
+        self._axes: GridAxes = axes
 
     def of(self, item: LaserScan, T_world_sensor: np.ndarray) -> Sight:
         """What a scan adds."""
@@ -108,7 +125,8 @@ class ScanSights:
         normals = surface_normals(points)
         away = ((points - T_world_sensor[:3, 3]) * normals).sum(1) > 0
         normals[away] *= -1
-        return Sight(points, normals, lambda others: np.ones(len(others), bool))
+        place = place_of(seen, T_world_sensor, self._axes)
+        return Sight(points, normals, lambda others: np.ones(len(others), bool), place=place)
 
 
 def _in_view(depth: np.ndarray, camera: Camera, T_camera_world: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -168,10 +186,17 @@ class VisitRecorder:
         normals = packed_normals(np.concatenate([sight.normals for sight in gathered.sights]))
         left, left_normals = self._not_looked_at(gathered)
         views = [sight.view for sight in gathered.sights if sight.view is not None]
-        camera, parts, counts = self._sights.camera, {}, {}
+        camera = self._sights.camera
+        parts: dict[str, bytes] = {}
+        counts: dict[str, int] = {}
         if views and camera is not None:
             views = [*self._earlier_views(gathered.key, camera), *views][-_MOST_VIEWS:]
             parts, counts = {PLACES: stored_places_to_bytes(views, camera)}, {PLACES: len(views)}
+        places = [sight.place for sight in gathered.sights if sight.place is not None]
+        if places:
+            earlier = load_scan_places(self._store, gathered.key) if self._has(gathered.key, SCAN_PLACES) else []
+            places = [*earlier, *places][-_MOST_VIEWS:]
+            parts[SCAN_PLACES], counts[SCAN_PLACES] = scan_places_to_bytes(places), len(places)
         # The cell's time is that of the last sight: T counts from then on.
         key = self._recorder.record(
             gathered.T_world_sensor, np.concatenate([points, left]), gathered.timestamp,

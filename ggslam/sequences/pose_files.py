@@ -15,7 +15,8 @@ from ggslam.scene.poses import is_valid_pose, quaternion_to_matrix
 from ggslam.sequences.association import TOLERANCE, poses_at, span
 from ggslam.sequences.camera_files.matrices import intrinsics_of_matrix
 from ggslam.sequences.recording import Calibration, Recording, image_numbers, read_text
-from ggslam.sequences.stamps import UNITS, unit_of_stamps
+from ggslam.sequences.stamps import unit_of_stamps
+from ggslam.system.clock_units import UNITS
 
 
 def data_lines(path: Path) -> list[tuple[int, str]]:

@@ -8,11 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from ggslam.sequences.recording import ImageFile
+from ggslam.system.clock_units import EPOCH_DIGITS, UNITS
 
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Unit -> seconds."""
-EPOCH_DIGITS = {10: "s", 13: "ms", 16: "us", 19: "ns"}
-"""Digits of a whole number that counts since 1970 (from 2001 to 2286) -> its unit."""
 LONGEST_STEP = 10.0
 """Seconds from one pose to the next, at most, where nothing else tells the unit."""
 

@@ -154,7 +154,7 @@ def slice_field(
 
 
 def _thin_octants(octants: np.ndarray, field: DistanceField) -> np.ndarray:
-    """Which octants [N, 3] (from the field's origin) lie in voxels that are surface for their points alone, bool [N]."""
+    """Which octants [N, 3] (from the field's origin) lie in voxels that are surface for their points alone."""
     points, normals = field.surface()
     lone = points[~normals.any(1)].astype(float) - field.origin
     voxels = [np.floor(p / field.voxel).astype(np.int64) for p in (lone, octants)]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -18,10 +19,13 @@ from ggslam.formats.trajectory import read_tum, write_tum
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
 from ggslam.runs.folder import RunFolder
 from ggslam.submaps.grid import GridStore
+from ggslam.submaps.recorder import load_points
 from ggslam.synthetic.world_cloud import cloud_tiles
 from ggslam.synthetic.world_plan import make_world
 from ggslam.synthetic.world_scanner import Scanner
 from ggslam.synthetic.world_walk import walk
+from ggslam.volumes.occupancy import OccupancyMap
+from ggslam.volumes.octomap_files import write_octomap
 
 ORIGIN = "0 0 0 0 0 0 1"
 
@@ -44,6 +48,12 @@ def summary(out: Path) -> dict[str, Any]:
 def one_error(result: Result, *words: str) -> None:
     assert isinstance(result.exception, GgslamError) and result.exception.exit_code == 2, result
     assert all(word in str(result.exception) for word in words), str(result.exception)
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results go to the working folder where `--out` says nothing."""
+    monkeypatch.chdir(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +80,15 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def contents(folder: Path) -> dict[str, str]:
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "folder"
+        for path in sorted(folder.rglob("*"))
+    }
+
+
 def test_a_recording_is_located_in_a_run(run: Path, room: Path, tmp_path: Path) -> None:
+    before = contents(run)
     output = done("localize", run, room, "--out", tmp_path / "out")
     found = summary(tmp_path / "out")
     assert found["located_share"] == 1 and found["frames"] == 24 and found["rmse_aligned_m"] < 0.01
@@ -79,7 +97,8 @@ def test_a_recording_is_located_in_a_run(run: Path, room: Path, tmp_path: Path) 
     own = read_tum(run / "trajectory.txt")  # the map's world is the run's
     apart = np.linalg.norm(poses.T_world_camera[:12, :3, 3] - own.T_world_camera[:, :3, 3], axis=1)
     assert len(poses) == 24 and apart.max() < 0.02
-    with GridStore.open(run / "cells") as store:
+    (cells,) = tmp_path.glob("*.grid")
+    with GridStore.open(cells) as store:
         cells = [store.cell(key) for key in store.cells()]
     gaussians = sum(c.parts[GAUSSIANS].count for c in cells if GAUSSIANS in c.parts)
     assert gaussians == len(RunFolder.open(run).gaussians())
@@ -87,6 +106,16 @@ def test_a_recording_is_located_in_a_run(run: Path, room: Path, tmp_path: Path) 
     full = ["--full-map", "--start-pose", ORIGIN, "--stop", 6]
     done("localize", run, room, *full, "--out", tmp_path / "full")
     assert summary(tmp_path / "full")["full_map"] and summary(tmp_path / "full")["located_share"] == 1
+    assert contents(run) == before and sorted(path.name for path in tmp_path.glob(".*")) == []
+    done("verify", run)
+
+
+def test_results_in_the_folder_of_a_run_do_not_bring_cells_there(run: Path, room: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    before = contents(copy)
+    done("localize", copy, room, "--stop", 2, "--out", copy / "again")
+    added = set(contents(copy)) - set(before)
+    assert added and all(name.startswith("again") for name in added)
 
 
 def test_scans_are_located_in_a_cloud(scans: Path, tmp_path: Path) -> None:
@@ -109,6 +138,49 @@ def test_scans_are_located_in_a_cloud(scans: Path, tmp_path: Path) -> None:
     assert summary(tmp_path / "torn")["located_share"] == 1 and "left out" in output and "points.pcd" in output
 
 
+def test_scans_are_found_without_a_start_pose(scans: Path, tmp_path: Path) -> None:
+    cloud = scans.parent / "cloud.npy"
+    truth = read_tum(scans / "trajectory.txt").T_world_camera
+    done("localize", cloud, scans, "--out", tmp_path / "cloud")
+    done("submaps", scans, "--out", tmp_path / "map.grid", "--axes", "xy", "--radius", 1.5)
+    assert "scan_places.npz" in done("submaps", tmp_path / "map.grid")
+    x, y = truth[0, :2, 3]
+    near = ["--near", f"{x + 1:.1f} {y:.1f} 2", "--no-start-pose"]
+    done("localize", tmp_path / "map.grid", scans, *near, "--out", tmp_path / "store")
+    for out in ("cloud", "store"):
+        found = summary(tmp_path / out)
+        assert found["located_share"] == 1 and found["rmse_m"] < 0.03 and found["statuses"]["found"] == 1
+    far = ["--near", f"{x + 100:.1f} {y:.1f} 2", "--stop", 2, "--out", tmp_path / "far"]
+    done("localize", tmp_path / "map.grid", scans, *far)
+    assert summary(tmp_path / "far")["located_share"] == 0
+
+
+def test_scans_are_located_in_an_octomap(scans: Path, tmp_path: Path) -> None:
+    points = np.load(scans.parent / "cloud.npy")
+    occupancy = OccupancyMap(0.1)
+    centre = read_tum(scans / "trajectory.txt").T_world_camera[0, :3, 3]
+    occupancy.insert(points.astype(np.float32), centre)
+    write_octomap(occupancy, tmp_path / "map.bt")
+    done("localize", tmp_path / "map.bt", scans, "--start-pose", "given", "--stop", 6, "--out", tmp_path / "out")
+    found = summary(tmp_path / "out")
+    assert found["located_share"] == 1 and found["rmse_m"] < 0.07  # a wall is anywhere in its voxels of 10 cm
+    done("submaps", tmp_path / "map.bt", "--out", tmp_path / "map.grid")
+    with GridStore.open(tmp_path / "map.grid") as store:
+        held = np.concatenate([load_points(store, key)["points"] for key in store.cells()])
+    centres, sizes = occupancy.occupied_centers()
+    assert len(held) >= len(centres)
+    inside = (np.abs(held[:, None, :3] - centres[None, :200]).max(2) <= sizes[None, :200] / 2 + 1e-4).any(0)
+    assert inside.all()
+
+
+@pytest.mark.parametrize("suffix", [".las", ".e57", ".pcap", ".ot", ".bag"])
+def test_kinds_that_are_not_read_are_named(scans: Path, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"map{suffix}"
+    path.write_bytes(b"anything")
+    one_error(ggslam("localize", path, scans, "--out", tmp_path / "o"), suffix, "is not read")
+    one_error(ggslam("submaps", path, "--out", tmp_path / "m.grid"), suffix, "is not read")
+
+
 def test_a_visit_is_recorded_with_poses_from_localisation(room: Path, run: Path, tmp_path: Path) -> None:
     store = tmp_path / "room.grid"
     done("submaps", run, "--out", store, "--visit", "first", "--at", 0)
@@ -127,7 +199,8 @@ def test_what_cannot_be_done_is_one_error(run: Path, room: Path, scans: Path, tm
     one_error(ggslam("localize", tmp_path / "none", room), "none", "no such folder")
     one_error(ggslam("localize", room, room), str(room), "neither a grid store")
     one_error(ggslam("localize", tmp_path / "no.pcd", room, "--start-pose", ORIGIN), "no.pcd")
-    one_error(ggslam("localize", cloud, scans), "laser scans", "--start-pose given")
+    one_error(ggslam("localize", cloud, scans, "--near", "1 2"), "--near", "'1 2'")
+    one_error(ggslam("localize", run, room, "--near", "500 500 1"), "no places to look up within 3 m of (500, 500)")
     one_error(ggslam("localize", cloud, room), "no places")
     one_error(ggslam("localize", run, room, "--scale", 0.5), "camera", "--scale")
     one_error(ggslam("localize", run, room, "--start-pose", "1 2 3"), "--start-pose", "'1 2 3'")

@@ -84,8 +84,11 @@ def test_what_is_set_wins_and_a_map_that_is_too_small_is_warned_of(ride: Path, t
     assert found["located_share"] == 1 and errors(tmp_path / "out", ride).max() < 0.03
     assert found["beyond_map_median"] > 0.5 and "beyond the map in memory (R' 10 m)" in found["warnings"][0]
     assert "lie beyond the map in memory" in output
-    stricter = ["--set", "scans.min_overlap=0.9", "--set", "scans.min_counted=1000000", "--out", tmp_path / "strict"]
-    done("localize", tmp_path / "small.grid", ride, "--start-pose", "given", *stricter)
+    strict = [word for one in ("scans.min_overlap=0.9", "scans.min_counted=1000000") for word in ("--set", one)]
+    strict += ["--out", tmp_path / "strict"]
+    done("localize", tmp_path / "small.grid", ride, "--start-pose", "given", *strict)
+    assert set(summary(tmp_path / "strict")["statuses"]) <= {"found", "lost"}
+    done("localize", tmp_path / "small.grid", ride, "--start-pose", "given", *strict, "--set", "look_up.min_fit=1")
     assert summary(tmp_path / "strict")["statuses"] == {"lost": 9}
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from ggslam.errors import FormatError
 from ggslam.formats.trajectory import read_matrices, read_trajectory, read_tum, write_tum
-from ggslam.scene.poses import se3_exp
+from ggslam.scene.poses import matrix_to_quaternion, se3_exp
 
 
 def poses(count: int = 20) -> np.ndarray:
@@ -102,3 +102,52 @@ def test_shared_recordings(shared_data: Path) -> None:
         pytest.skip("no livingroom")
     assert len(read_trajectory(path)) == 200
     assert len(read_trajectory(shared_data / "rgbd_dataset_freiburg3_cabinet" / "groundtruth.txt")) > 50
+
+
+def euroc_lines(times: list[int], rest: str = "") -> list[str]:
+    rows = []
+    for time, T in zip(times, poses(len(times)), strict=True):
+        numbers = [*T[:3, 3], *matrix_to_quaternion(T[:3, :3])]
+        rows.append(f"{time}," + ",".join(f"{number:.9f}" for number in numbers) + rest)
+    return rows
+
+
+@pytest.mark.parametrize("rest", ["", ",0.1,0.2,0.3", ",0.1,0.2,0.3,1,2,3,4,5,6"])
+def test_euroc_tables_are_wxyz_in_nanoseconds(tmp_path: Path, rest: str) -> None:
+    times = [1403636579763555584 + 50_000_000 * n for n in range(5)]
+    header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+    (tmp_path / "data.csv").write_text("\n".join([header, *euroc_lines(times, rest)]) + "\n")
+    found = read_trajectory(tmp_path / "data.csv")
+    np.testing.assert_allclose(found.timestamps, np.array(times) * 1e-9, atol=3e-7)
+    np.testing.assert_allclose(found.T_world_camera, poses(5), atol=1e-8)
+    (tmp_path / "short.csv").write_text("1403636579763555584,1,2,3\n")
+    with pytest.raises(FormatError, match=r"short\.csv, line 1: expected 8 or 11 or 17 columns, found 4"):
+        read_trajectory(tmp_path / "short.csv")
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ns", 10**9), ("us", 10**6), ("ms", 1000), ("s", 1)])
+def test_times_of_tum_files_may_be_in_nanoseconds(tmp_path: Path, unit: str, factor: int) -> None:
+    rows = [f"{(1700000000 + n) * factor} 0 0 {n} 0 0 0 1" for n in range(4)]
+    (tmp_path / f"{unit}.txt").write_text("\n".join(rows))
+    found = read_trajectory(tmp_path / f"{unit}.txt")
+    np.testing.assert_allclose(found.timestamps, 1700000000 + np.arange(4), atol=1e-6)
+    assert found.T_world_camera[:, 2, 3].tolist() == [0, 1, 2, 3]
+
+
+def test_pose_graphs_of_g2o(tmp_path: Path) -> None:
+    lines = []
+    for number, T in reversed(list(enumerate(poses(6)))):
+        w, x, y, z = matrix_to_quaternion(T[:3, :3])
+        numbers = " ".join(f"{value:.9f}" for value in (*T[:3, 3], x, y, z, w))
+        lines.append(f"VERTEX_SE3:QUAT {number} {numbers}")
+    edge = "EDGE_SE3:QUAT 0 1 " + " ".join(["0"] * 6 + ["1"] * 22)
+    (tmp_path / "graph.g2o").write_text("\n".join(["FIX 0", *lines, edge]))
+    found = read_trajectory(tmp_path / "graph.g2o")
+    assert found.timestamps.tolist() == [0, 1, 2, 3, 4, 5]
+    np.testing.assert_allclose(found.T_world_camera, poses(6), atol=1e-8)
+    (tmp_path / "twice.g2o").write_text("\n".join([lines[0], lines[0]]))
+    with pytest.raises(FormatError, match=r"twice\.g2o, line 2"):
+        read_trajectory(tmp_path / "twice.g2o")
+    (tmp_path / "edges.g2o").write_text(edge)
+    with pytest.raises(FormatError, match="no poses"):
+        read_trajectory(tmp_path / "edges.g2o")

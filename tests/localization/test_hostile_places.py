@@ -41,7 +41,7 @@ def store_with(path: Path, arrays: Arrays) -> Path:
 def test_places_are_read(tmp_path: Path) -> None:
     with GridStore.open(store_with(tmp_path / "map.grid", some_places())) as store:
         places = StoredPlaces(store, CAMERA)
-        assert len(places) == 2 and not places.damaged
+        assert len(places) == 2 and not places.damage
         assert [len(view.place.landmarks) for view in stored_views(store, (0, 0, 0), CAMERA)] == [3, 4]
 
 
@@ -70,7 +70,7 @@ def test_places_that_cannot_be_are_left_out_and_told(
     arrays[name] = change(arrays[name])
     with GridStore.open(store_with(tmp_path / "map.grid", arrays)) as store:
         places = StoredPlaces(store, CAMERA)
-        assert len(places) == 0 and len(places.damaged) == 1
+        assert len(places) == 0 and len(places.damage) == 1
         with pytest.raises(FormatError, match=message):
             stored_views(store, (0, 0, 0), CAMERA)
 

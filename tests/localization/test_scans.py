@@ -8,7 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ggslam.errors import FormatError
+from ggslam.formats.pcd import pcd_bytes
 from ggslam.localization.scans import ScanSequence
+from ggslam.scene.poses import matrix_to_quaternion, se3_exp
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".npy"])
@@ -27,3 +30,28 @@ def test_points_without_a_position_are_left_out_and_told_of_once(
         assert scan.points.dtype == np.float32 and np.array_equal(scan.points, stored[gone:, :3])
     told = [record.getMessage() for record in caplog.records]
     assert len(told) == 1 and f"000001{suffix}: left out 30 of 400 points" in told[0]
+
+
+def test_poses_of_scans_may_stand_in_their_own_headers(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    poses = [se3_exp(rng.normal(size=6)) for _ in range(4)]
+    points = rng.normal(size=(50, 3)).astype(np.float32)
+    data = pcd_bytes({name: points[:, axis] for axis, name in enumerate("xyz")})
+    own = b"VIEWPOINT 0 0 0 1 0 0 0"
+    assert own in data
+    for number in range(len(poses)):
+        (tmp_path / f"{number}.pcd").write_bytes(data)
+    assert ScanSequence(tmp_path).ground_truth is None
+    for number, T in enumerate(poses):
+        numbers = [*T[:3, 3], *matrix_to_quaternion(T[:3, :3])]
+        line = "VIEWPOINT " + " ".join(f"{value:.9f}" for value in numbers)
+        (tmp_path / f"{number}.pcd").write_bytes(data.replace(own, line.encode()))
+    scans = ScanSequence(tmp_path, start=1)
+    np.testing.assert_allclose(scans.ground_truth, poses[1:], atol=1e-8)
+    np.testing.assert_array_equal(scans.scan(0).points, points)
+    (tmp_path / "trajectory.txt").write_text("".join(f"{n} 0 0 {n} 0 0 0 1\n" for n in range(4)))
+    assert ScanSequence(tmp_path).ground_truth[3][2, 3] == 3
+    (tmp_path / "trajectory.txt").unlink()
+    (tmp_path / "2.pcd").write_bytes(data.replace(own, b"VIEWPOINT 0 0 0 0 0 0 0"))
+    with pytest.raises(FormatError, match=r"2\.pcd: VIEWPOINT"):
+        ScanSequence(tmp_path)

@@ -19,10 +19,13 @@ from ggslam.jobs.localize.report import LocalizationReport, write_localization
 from ggslam.jobs.localize.settings import LocalizeSettings, localize_settings
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.sensor_settings import settings_of_scans, with_chosen
-from ggslam.jobs.submaps.stores import INDOORS, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
+from ggslam.jobs.submaps.stores import INDOORS, cloud_voxel, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
 from ggslam.localization.frames import FrameTracker
 from ggslam.localization.localizer import Localization, Localizer
+from ggslam.localization.near import Near, parse_near
 from ggslam.localization.places import StoredPlaces
+from ggslam.localization.scan_look_up import ScanLookUp
+from ggslam.localization.scan_maps import scan_places
 from ggslam.localization.scan_tracker import ScanTracker
 from ggslam.localization.scans import ScanSequence, scan_files
 from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface, point_spacing
@@ -34,13 +37,15 @@ from ggslam.sequences.rig import one_camera
 from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
-from ggslam.system.links import refuse_links_below, remove_folder
 from ggslam.tracking.settings import TargetSettings
 
 GIVEN = "given"
 """As a start pose: the recording's own first pose."""
 _CELLS = "cells"
+_SHORT = 8
+"""Letters of a run's fingerprint in the name of the store of its map."""
 _FARTHEST = 1e7
 """Metres from the origin of the map that a start pose may be."""
 _FINEST = 1.5
@@ -56,9 +61,11 @@ class LocalizeRequest:
         map: folder of a grid store or a run, or a cloud.
         sequence: the recording.
         start_pose: pose of the first frame or scan: 7 numbers (position, quaternion xyzw), or `GIVEN`, or None.
-        no_start_pose: the first frame is looked up among the map's places.
+        no_start_pose: the first frame is looked up among the map's places, as it is without a start pose.
+        near: roughly where the recording was made: "x y sigma" or "x y z sigma", metres in the map's world; only
+            places within three sigma are looked at; None: all.
         full: against the whole map.
-        out: folder for the results; None: localized/NAME.
+        out: folder for the results; None: localized/NAME. The cells of a run's map are kept beside it.
         radius: R' in metres; None: the store's.
         voxel: edge of the target's voxels in metres; None: 0.03 for images, 0.15 for scans, or what the map allows.
         columns: numbers of a point in .bin scans; None: as they tell themselves.
@@ -70,6 +77,7 @@ class LocalizeRequest:
     sequence: SequenceRequest
     start_pose: str | None = None
     no_start_pose: bool = False
+    near: str | None = None
     full: bool = False
     out: Path | None = None
     radius: float | None = None
@@ -93,13 +101,10 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     with ExitStack() as opened:
         recording = _open_recording(request)
         start = _start(request, recording.ground_truth)
-        if start is None and isinstance(recording, ScanSequence):
-            raise ConfigError(
-                f"{recording.path}: laser scans have no images to look the place of the first one up by: give its "
-                f'pose with `start_pose` "x y z qx qy qz qw", or `start_pose` {GIVEN} where the recording has poses'
-            )
+        near = None if request.near is None else parse_near(request.near)
         scans = recording if isinstance(recording, ScanSequence) else None
-        store = open_map(request.map, opened, observer, partial(_of_cloud, scans, chosen.submaps, observer))
+        of_cloud = partial(_of_cloud, request.map, scans, chosen.submaps, observer)
+        store = open_map(request.map, out.parent, opened, observer, of_cloud)
         context = NativeContext(request.threads)
         submaps = replace(store.settings, **chosen.submaps)
         submaps = submaps if request.radius is None else replace(submaps, partial_radius=request.radius)
@@ -109,12 +114,16 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
             FullSurface(store, target, context) if request.full else PartialSurface(store, target, context, submaps)
         )
         opened.callback(surface.close)
-        places = None if isinstance(recording, ScanSequence) else _places(request, recording, store, start, observer)
+        places: StoredPlaces | ScanLookUp | None
+        if isinstance(recording, ScanSequence):
+            places = ScanLookUp(partial(scan_places, store, near), store.settings.axes, chosen.settings.look_up)
+        else:
+            places = _places(request, recording, store, start, near, observer)
         localizer = _localizer(chosen.settings, recording, places, surface, context, start)
         results, error = _run(localizer, recording, observer)
         if error is not None and not results:
             raise error
-        damaged = sorted([*surface.damage, *(places.damaged if places is not None else [])])
+        damaged = sorted({*surface.damage, *(places.damage if places is not None else [])})
         report = LocalizationReport(
             str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
@@ -131,10 +140,11 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
 
 
 def open_map(
-    path: Path, opened: ExitStack, observer: Observer, of_cloud: Callable[[], SubmapSettings] | None = None
+    path: Path, results: Path, opened: ExitStack, observer: Observer, of_cloud: Callable[[], SubmapSettings]
 ) -> GridStore:
-    """The store of a folder, of a run (made in RUN/cells if it is not there or not of this run), or of a cloud (made in
-    a temporary folder). `opened` closes and removes what is to be; `of_cloud` gives the settings for a cloud.
+    """The store of a folder, of a run (made in `results` if it is not there, for the next time, too), or of a cloud
+    (made in a temporary folder, with the settings that `of_cloud` gives). `opened` closes and removes what is to be. A
+    run stays as it is.
 
     Raises:
         FormatError, RunFolderError: it is none of them, or damaged.
@@ -145,39 +155,44 @@ def open_map(
     if is_cloud(path):
         observer.note(f"{path} is cut into cells; `ggslam submaps` keeps them for the next time")
         folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="ggslam-")))
-        settings = replace(INDOORS, voxel=0.0) if of_cloud is None else of_cloud()
-        store = opened.enter_context(GridStore.create(folder / _CELLS, settings))
+        store = opened.enter_context(GridStore.create(folder / _CELLS, of_cloud()))
         store_of_cloud(path, store)
         return store
-    return opened.enter_context(_store_in_run(path, observer))
+    return opened.enter_context(_store_beside(path, results, opened, observer))
 
 
-def _of_cloud(scans: ScanSequence | None, chosen: Mapping[str, Any], observer: Observer) -> SubmapSettings:
+def _of_cloud(
+    path: Path, scans: ScanSequence | None, chosen: Mapping[str, Any], observer: Observer
+) -> SubmapSettings:
     """Settings of the cells that a cloud is cut into: all points, lengths that suit the scanner."""
     base = INDOORS if scans is None else settings_of_scans(scans, cut=True)
-    settings = with_chosen(replace(base, voxel=0.0), chosen)
+    settings = with_chosen(replace(base, voxel=cloud_voxel(path)), chosen)
     if base != INDOORS:
         observer.note(f"R' {settings.partial_radius:g} m and cells of {settings.spacing:g} m suit the scanner")
     return settings
 
 
-def _store_in_run(path: Path, observer: Observer) -> GridStore:
+def _store_beside(path: Path, results: Path, opened: ExitStack, observer: Observer) -> GridStore:
     if path.is_dir() and not (path / MARKER).is_file():
         raise ConfigError(f"{path}: neither a grid store (no index.sqlite) nor a run (no {MARKER})")
     folder = RunFolder.open(path)
-    cells, making = folder.path / _CELLS, folder.path / (_CELLS + ".new")
-    refuse_links_below(folder.path, [cells.name, making.name])
+    visit = visit_of(folder)
+    if folder.path.resolve() in (results.resolve(), *results.resolve().parents):  # nothing is written into a run
+        results = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="ggslam-")))
+    cells = results / f"{folder.path.resolve().name}-{visit[-_SHORT:]}.grid"
     if is_store(cells):
         store = GridStore.open(cells)
-        if store.visits()[-1:] == [visit_of(folder)]:
+        if store.visits()[-1:] == [visit]:
             return store
         store.close()
-        remove_folder(cells)
-    observer.note(f"the map of {path} is cut into cells: {cells}")
-    remove_folder(making)
+        raise ConfigError(f"{cells}: is not the map of {path} that its name tells: remove it, or choose another `out`")
+    observer.note(f"the map of {path} is cut into cells: {cells}, which the next time uses")
+    make_folder(results)
+    making = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix=f".{cells.name}-", dir=results))) / _CELLS
     with GridStore.create(making, INDOORS) as store:
         store_of_run(path, store)
-    making.rename(cells)  # a store that was not finished has another name
+    if not is_store(cells):  # another process may have been faster
+        making.rename(cells)  # a store that was not finished has another name
     return GridStore.open(cells)
 
 
@@ -221,29 +236,32 @@ def _target(request: LocalizeRequest, submaps: SubmapSettings, own: TargetSettin
 
 
 def _places(
-    request: LocalizeRequest, recording: Sequence, store: GridStore, start: np.ndarray | None, observer: Observer
-) -> StoredPlaces | None:
+    request: LocalizeRequest, recording: Sequence, store: GridStore, start: np.ndarray | None, near: Near | None,
+    observer: Observer,
+) -> StoredPlaces | None:  # fmt: skip
     """The places of the map; None if they cannot be used and are not needed for the start."""
     try:
-        places = StoredPlaces(store, recording.camera)
+        places = StoredPlaces(store, recording.camera, near=near)
     except ConfigError as error:
         if start is None:
             raise
         observer.note(f"lost frames are not looked up: {error}")
         return None
     if start is None and not len(places):
-        reason = f"; left out: {places.damaged[0]}" if places.damaged else ""
-        raise ConfigError(f"{request.map}: has no places to look up: `start_pose` is needed{reason}")
+        reason = f"; left out: {places.damage[0]}" if places.damage else ""
+        where = "" if near is None else f" {near}"
+        raise ConfigError(f"{request.map}: has no places to look up{where}: `start_pose` is needed{reason}")
     return places
 
 
 def _localizer(
-    settings: LocalizeSettings, recording: Sequence | ScanSequence, places: StoredPlaces | None, surface: Surface,
-    context: NativeContext, start: np.ndarray | None,
+    settings: LocalizeSettings, recording: Sequence | ScanSequence, places: StoredPlaces | ScanLookUp | None,
+    surface: Surface, context: NativeContext, start: np.ndarray | None,
 ) -> Localizer[Any]:  # fmt: skip
     if isinstance(recording, ScanSequence):
-        assert start is not None
-        return Localizer(surface, ScanTracker(settings.scans, context, start), start)
+        assert isinstance(places, ScanLookUp)
+        return Localizer(surface, ScanTracker(settings.scans, context, start, places), start)
+    assert not isinstance(places, ScanLookUp)
     front_end = FrameTracker(recording.camera, settings.tracking, context, start, places)
     return Localizer(surface, front_end, start)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from ggslam.errors import ConfigError
+from ggslam.localization.scan_look_up import ScanLookUpSettings
 from ggslam.localization.scan_tracker import ScanTrackerSettings
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.overrides import with_overrides
@@ -23,6 +24,8 @@ class LocalizeSettings:
     """Errors name settings by their path from here."""
     scans: ScanTrackerSettings = field(default_factory=ScanTrackerSettings)
     """Of laser scans."""
+    look_up: ScanLookUpSettings = field(default_factory=ScanLookUpSettings)
+    """Of laser scans whose place is not known."""
     tracking: TrackerSettings = field(default_factory=TrackerSettings)
     """Of images, as for a run."""
     submaps: SubmapSettings = field(default_factory=SubmapSettings)

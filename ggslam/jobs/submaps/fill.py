@@ -132,8 +132,9 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
     if is_cloud(source) and not source.is_file():
         raise FormatError(f"cannot read {source}: no such file")
     cloud = read_cloud(source, request.columns) if is_cloud(source) else None
-    recording = None if cloud is not None or (source / MARKER).is_file() else _open(request)
-    with open_or_create(request.store, _settings(request, cloud, observer)) as store:
+    settings = _settings(request, cloud, observer)
+    recording = None if cloud is not None or (source / MARKER).is_file() else _open(request, settings)
+    with open_or_create(request.store, settings) as store:
         if recording is not None:
             items, poses, sights = recording
             observer.begin("record", len(poses))
@@ -214,13 +215,13 @@ def _scans(request: SubmapsRequest) -> ScanSequence:
 
 
 def _open(
-    request: SubmapsRequest,
+    request: SubmapsRequest, settings: SubmapSettings
 ) -> tuple[Iterator[Frame | LaserScan], np.ndarray, FrameSights | ScanSights]:
     """Items, their poses and what takes sights from them."""
     wanted = request.sequence
     if scan_files(request.source):
         scans = _scans(request)
-        return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights()
+        return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights(settings.axes)
     frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())
     poses = _poses(request, frames.timestamps, frames.ground_truth, frames.pose_problem)

@@ -90,12 +90,19 @@ def _of_reach(reach: float, farthest: float, cut: bool) -> SubmapSettings:
     if reach <= INDOORS.partial_radius:
         return INDOORS
     radius = min(_FARTHEST, _round_up(reach))
-    spacing = max(INDOORS.spacing, round(radius / (_CUT_CELLS if cut else _CELLS)))
+    spacing = max(INDOORS.spacing, _handy(radius / (_CUT_CELLS if cut else _CELLS)))
     return replace(
         INDOORS, partial_radius=radius, spacing=spacing, radius=_NEAR_CENTRE * spacing,
-        sensor_range=min(_FARTHEST, max(radius, _round_up(farthest))), voxel=round(radius / _VOXELS, 2),
+        sensor_range=min(_FARTHEST, max(radius, _round_up(farthest))), voxel=_handy(radius / _VOXELS),
         change_distance=max(INDOORS.change_distance, 2 * radius / _VOXELS), lookahead=max(INDOORS.lookahead, spacing),
     )  # fmt: skip
+
+
+def _handy(metres: float) -> float:
+    """The next 1, 2 or 5 times a power of ten up to 5 % above: maps of the same place, of which one is moved by whole
+    kilometres, then have the same cells and voxels."""
+    power = 10.0 ** math.floor(math.log10(1.05 * metres))
+    return round(max(digit for digit in (1, 2, 5) if digit * power <= 1.05 * metres) * power, 9)
 
 
 def _round_up(metres: float) -> float:

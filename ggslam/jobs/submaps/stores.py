@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import FormatError, RunFolderError
-from ggslam.formats.cloud_files import SUFFIXES, read_cloud_file
+from ggslam.formats.cloud_files import NOT_READ, SUFFIXES, read_cloud_file
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, arrays_of_map, gaussians_to_bytes
 from ggslam.jobs.submaps.visit_records import remember_run
 from ggslam.localization.places import PLACES, StoredView, stored_places_to_bytes
@@ -33,9 +33,12 @@ from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.array_forms import PoseForm, check_arrays
 from ggslam.tracking.surface import check_surface_arrays
+from ggslam.volumes.octomap_files import read_octomap
 
 INDOORS = SubmapSettings(voxel=0.02)
 """For maps of depth cameras."""
+OCTOMAP = ".bt"
+_MOST_VOXELS = 5e7
 _CELLS_AT_ONCE = 64
 
 
@@ -45,8 +48,17 @@ def is_store(path: Path) -> bool:
 
 
 def is_cloud(path: Path) -> bool:
-    """Whether a path names a cloud, by its suffix."""
-    return path.suffix.lower() in SUFFIXES and not path.is_dir()
+    """Whether a path names a cloud, by its suffix; one of a kind that is not read included."""
+    return path.suffix.lower() in (*SUFFIXES, *NOT_READ, OCTOMAP) and not path.is_dir()
+
+
+def cloud_voxel(path: Path) -> float:
+    """How far apart the points of a cloud are by its own word, metres: the voxels of an OctoMap; 0: nothing is told.
+
+    Raises:
+        FormatError: the file is missing or damaged.
+    """
+    return read_octomap(path).resolution if path.suffix.lower() == OCTOMAP else 0.0
 
 
 def open_or_create(path: Path, settings: SubmapSettings) -> GridStore:
@@ -176,8 +188,29 @@ def read_cloud(path: Path, columns: int | None = None) -> Cloud:
     Raises:
         FormatError: the file is missing or damaged.
     """
+    if path.suffix.lower() == OCTOMAP:
+        return _octomap(path), {}
     cloud = read_cloud_file(path, columns)
     return cloud.points, {} if cloud.colors is None else {"color": cloud.colors}
+
+
+def _octomap(path: Path) -> np.ndarray:
+    """Centres [n, 3] of the occupied voxels, leaves of several voxels cut into them."""
+    occupancy = read_octomap(path)
+    centres, sizes = occupancy.occupied_centers()
+    if not len(centres):
+        raise FormatError(f"{path}: no voxel of it is occupied")
+    edge = occupancy.resolution
+    found = []
+    voxels = float((np.rint(sizes.astype(np.float64) / edge) ** 3).sum())
+    if voxels > _MOST_VOXELS:
+        raise FormatError(f"{path}: {voxels:.3g} voxels are occupied, {_MOST_VOXELS:g} are taken")
+    for size in np.unique(sizes):
+        across = max(1, round(float(size) / edge))
+        steps = (np.arange(across) - (across - 1) / 2) * edge
+        cube = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+        found.append((centres[sizes == size].astype(np.float64)[:, None] + cube).reshape(-1, 3))
+    return np.concatenate(found)
 
 
 def _surface(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:

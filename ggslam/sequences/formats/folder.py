@@ -39,7 +39,8 @@ from ggslam.sequences.recording import (
     missing_depth_problems,
     nominal_timestamps,
 )
-from ggslam.sequences.stamps import UNITS, are_counted, unit_of_stamps
+from ggslam.sequences.stamps import are_counted, unit_of_stamps
+from ggslam.system.clock_units import UNITS
 
 GENERATOR_KEY = "generator"
 """Entry of camera.yaml that marks a recording as written by `ggslam.synthetic`."""
