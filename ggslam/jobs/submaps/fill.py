@@ -13,7 +13,7 @@ import numpy as np
 from ggslam.errors import ConfigError, FormatError, SequenceError
 from ggslam.formats.trajectory import read_trajectory
 from ggslam.jobs.progress import Observer
-from ggslam.jobs.submaps.sensor_settings import settings_of_cloud, settings_of_scans, in_words, with_chosen
+from ggslam.jobs.submaps.sensor_settings import in_words, settings_of_cloud, settings_of_scans, with_chosen
 from ggslam.jobs.submaps.stores import (
     INDOORS,
     Cloud,
@@ -203,7 +203,8 @@ def _settings(request: SubmapsRequest, cloud: Cloud | None, observer: Observer) 
         base = settings_of_scans(_scans(request))
     settings = with_chosen(base, request.settings)
     if base != INDOORS:
-        observer.note(f"the store's settings suit the {'cloud' if cloud is not None else 'scanner'}: {in_words(settings)}")
+        what = "scanner" if cloud is None else "cloud"
+        observer.note(f"the store's settings suit the {what}: {in_words(settings)}")
     return settings
 
 

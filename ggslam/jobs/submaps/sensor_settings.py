@@ -71,9 +71,10 @@ def settings_of_cloud(points: np.ndarray) -> SubmapSettings:
 
 def with_chosen(settings: SubmapSettings, chosen: Mapping[str, Any]) -> SubmapSettings:
     """Settings with fields that were set on purpose; R goes with an edge of a cell that was."""
-    edge = chosen.get("spacing")
-    follows = edge is not None and "radius" not in chosen and settings.spacing != INDOORS.spacing
-    return replace(settings, **({"radius": _NEAR_CENTRE * edge} if follows else {}), **chosen)
+    fields = dict(chosen)
+    if "spacing" in fields and "radius" not in fields and settings.spacing != INDOORS.spacing:
+        fields["radius"] = _NEAR_CENTRE * fields["spacing"]
+    return replace(settings, **fields)
 
 
 def in_words(settings: SubmapSettings) -> str:
