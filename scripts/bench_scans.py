@@ -146,8 +146,10 @@ class Bench:
             found = runs[0]
             located.append(found.status.is_located)
             moved, turned = separation(found.T_world_sensor, T)
-            errors.append(moved), turns.append(turned), points.append(found.map_points), beyond.append(found.beyond)
-            made.append(min(r.map_seconds for r in runs)), align.append(min(r.align_seconds for r in runs))
+            for values, value in ((errors, moved), (turns, turned), (points, found.map_points), (beyond, found.beyond)):
+                values.append(value)
+            made.append(min(r.map_seconds for r in runs))
+            align.append(min(r.align_seconds for r in runs))
         rmse, turn = (float(np.sqrt(np.mean(np.square(values)))) for values in (errors, turns))
         return (float(np.mean(points)), 1e3 * float(np.mean(made)), 1e3 * float(np.mean(align)), 1e3 * rmse, turn,
                 float(np.mean(located)), float(np.mean(beyond)))  # fmt: skip
