@@ -115,41 +115,47 @@ Float cleared(const VoxelUpdate& t, const Group& g, Mask through, Float weight) 
   return select(through, rounded(weight * (1 - t.clearing)), weight);
 }
 
-// Whether kLanes bytes are all the same as one that is repeated in a word.
-bool all_are(const std::uint8_t* bytes, std::uint64_t repeated) {
-  static_assert(kLanes == 4 || kLanes % 8 == 0);
-  std::uint64_t other = 0, word = 0;
-  constexpr int kStep = kLanes < 8 ? kLanes : 8;
-  for (int lane = 0; lane < kLanes; lane += kStep) {
-    std::memcpy(&word, bytes + lane, kStep);
-    other |= word ^ (kStep < 8 ? repeated & 0xffffffffu : repeated);
-  }
-  return other == 0;
+typedef std::uint8_t Bytes __attribute__((vector_size(4 * kLanes), aligned(1), may_alias));
+constexpr int kBytes = 4 * kLanes;
+
+static inline Bytes every(std::uint8_t byte) { return byte - Bytes{}; }
+static inline Bytes& bytes_at(std::uint8_t* p) { return *reinterpret_cast<Bytes*>(p); }
+static inline Bytes choose(Bytes mask, Bytes a, Bytes b) { return (a & mask) | (b & ~mask); }
+static inline bool any_byte(const Bytes& v) {
+  std::uint64_t words[kBytes / 8], all = 0;
+  std::memcpy(words, &v, kBytes);
+  for (std::uint64_t word : words) all |= word;
+  return all != 0;
 }
 
-constexpr std::uint64_t kAllEmpty = 0x0101010101010101u * volumes::kLeastHits;
-
-// Counts hits and misses of the voxels from `first` on. Returns whether there are hits.
-bool count_points(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block, Mask& changed) {
-  const bool none = all_are(t.octants + first, 0);
-  if (none && (all_are(block.hits + first, kAllEmpty) || !any(greater_equal(g.distance, broadcast(t.voxel)))))
-    return false;
-  const Int old = load_widened(block.hits + first), octants = load_widened(block.octants + first);
-  const Int now = load_widened(t.octants + first);
-  const Float before = to_float(old), start = select(greater(before, Float{}), before, broadcast(volumes::kOccupied));
-  const Mask hit = greater(to_float(now), Float{});
-  const Mask miss = neither_of(greater_equal(g.distance, broadcast(t.voxel)), hit);
-  const Float up = minimum(start + broadcast(volumes::kHit), broadcast(volumes::kMostHits));
-  const Float down = maximum(start - broadcast(volumes::kMiss), broadcast(volumes::kLeastHits));
-  const Float after = select(hit, up, select(miss, down, before));
-  const Mask was = greater_equal(before, broadcast(volumes::kOccupied));
-  const Mask is = greater_equal(after, broadcast(volumes::kOccupied));
-  const Float kept = select(either(hit, is), to_float(octants | now), Float{});
-  const Mask grown = both(is, greater(kept, to_float(octants)));
-  changed = either(changed, either(grown, either(neither_of(is, was), neither_of(was, is))));
-  store_narrowed(block.hits + first, truncate(after));
-  store_narrowed(block.octants + first, truncate(kept));
-  return !none;
+// Counts hits and misses of the voxels. Returns whether what is occupied changed.
+bool count_points(const VoxelUpdate& t, const Work& w, VoxelBlock& block) {
+  const Bytes least = every(volumes::kLeastHits), most = every(volumes::kMostHits), occupied = every(volumes::kOccupied);
+  if (t.octants == nullptr) {
+    Bytes other{};
+    for (int k = 0; k < kVoxels; k += kBytes) other |= bytes_at(block.hits + k) ^ least;
+    if (!any_byte(other)) return false;  // misses have nothing to take away
+  }
+  alignas(64) std::uint8_t missed[kVoxels];
+  const Float far = broadcast(t.voxel), one = broadcast(1.0f);
+  for (int n = 0; n < kGroups; ++n)
+    store_narrowed(missed + n * kLanes, truncate(zero_unless(greater_equal(w.groups[n].distance, far), one)));
+  Bytes changed{};
+  for (int k = 0; k < kVoxels; k += kBytes) {
+    const Bytes before = bytes_at(block.hits + k), octants = bytes_at(block.octants + k);
+    const Bytes now = t.octants == nullptr ? Bytes{} : bytes_at(t.octants + k);
+    const Bytes hit = (Bytes)(now != 0), miss = (Bytes)(bytes_at(missed + k) != 0);
+    const Bytes start = choose((Bytes)(before == volumes::kNeverSeen), occupied, before);
+    const Bytes up = start + std::uint8_t{volumes::kHit}, down = start - std::uint8_t{volumes::kMiss};
+    const Bytes after = choose(hit, choose((Bytes)(up < most), up, most),
+                               choose(miss, choose((Bytes)(down > least), down, least), before));
+    const Bytes is = (Bytes)(after >= occupied), was = (Bytes)(before >= occupied);
+    const Bytes kept = (now | octants) & (hit | is);
+    changed |= (is ^ was) | (is & kept & ~octants);
+    bytes_at(block.hits + k) = after, bytes_at(block.octants + k) = kept;
+  }
+  if (t.octants != nullptr) std::memset(t.octants, 0, kVoxels);
+  return any_byte(changed);
 }
 
 // Averages values and weights.
@@ -237,11 +243,14 @@ bool vote(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block) {
 unsigned summary(const VoxelBlock& block) {
   int weights = 0, unseen = 0, occupied = 0;
   for (int k = 0; k < kVoxels; ++k) {
-    const int hit = block.hits[k] >= volumes::kOccupied;
-    weights |= block.weight[k] | hit;
+    weights |= block.weight[k];
     unseen |= block.weight[k] == 0;
-    occupied |= (block.value[k] != kFreeValue) | hit;
+    occupied |= block.value[k] != kFreeValue;
   }
+  std::uint8_t hits = 0;
+  for (int k = 0; k < kVoxels; ++k) hits |= block.hits[k];
+  static_assert(volumes::kOccupied == 128 && volumes::kMostHits < 256);  // the highest bit
+  if (hits & volumes::kOccupied) return 0;
   return (weights == 0 ? volumes::kNoneSeen : 0u) | (unseen == 0 && occupied == 0 ? volumes::kAllFree : 0u);
 }
 
@@ -254,9 +263,8 @@ unsigned tsdf_fuse_block(const VoxelUpdate& t, VoxelBlock& block) {
   for (int n = 0; n < w.near.count; ++n) interpolate(t, w.groups[w.near.group[n]]);
   Mask changed{};
   for (int n = 0; n < w.seen.count; ++n) average(t, w, w.seen.group[n], block, changed);
-  bool points = false;
-  for (int n = 0; n < kGroups; ++n) points |= count_points(t, w.groups[n], n * kLanes, block, changed);
-  bool relabelled = false;
+  const bool points = t.octants != nullptr;
+  bool relabelled = t.points && count_points(t, w, block);
   for (int n = 0; n < w.band.count; ++n) {
     const int first = w.band.group[n] * kLanes;
     if (t.color != nullptr) paint(t, w.groups[w.band.group[n]], first, block);
