@@ -18,6 +18,7 @@ from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.torch_candidates import NEAR, BlockCandidates, DeviceView, find_candidates
 from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, OCCUPIED_HITS, SIDE, VOXELS, TsdfMap
 
+_DOUBT, _DOUBTFUL_SHARE = 0.03, 0.05
 _SURPRISE = 0.5
 _FREE_FROM = 0.98 * FREE_VALUE
 _EROSION = 2
@@ -224,8 +225,10 @@ def _fuse(
     scaled = FREE_VALUE / s.truncation * distance
     if s.clearing > 0:
         through = behind & (weight > 0) & (value < _FREE_FROM) & (scaled - value > _SURPRISE * FREE_VALUE)
-        through &= _erode(view.depth).flatten()[pixel] >= z + s.truncation
-        weight = torch.where(through, _round(weight * (1 - s.clearing)), weight)
+        sure = through & (_erode(view.depth).flatten()[pixel] >= z * (1 + _DOUBT) + s.truncation)
+        little = torch.minimum(measured, _round(weight * _DOUBTFUL_SHARE).clamp(min=1))
+        measured = torch.where(through & ~sure, little, measured)
+        weight = torch.where(sure, _round(weight * (1 - s.clearing)), weight)
     total = weight + measured
     share = measured / total
     mean = value + share * (scaled.clamp(max=FREE_VALUE) - value)

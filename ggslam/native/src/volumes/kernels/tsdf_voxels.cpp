@@ -17,6 +17,8 @@ using volumes::VoxelBlock;
 using volumes::VoxelUpdate;
 
 constexpr float kSurprise = 0.5f;           // of the truncation: how far depth must contradict a voxel to clear it
+constexpr float kDoubt = 0.03f;             // of a voxel's depth: passing it by so little more proves nothing
+constexpr float kDoubtfulShare = 0.05f;     // of the voxel's weight that what proves nothing counts at most
 constexpr float kFreeFrom = 0.98f * kFreeValue;  // a voxel seen as free counts as free from this value on
 constexpr float kRangeSlack = 1.00001f;     // of the range: rounding when depth is added up again
 constexpr float kLabelVoxels = 2.0f;        // labels are told to voxels this near to the surface
@@ -109,10 +111,14 @@ void interpolate(const VoxelUpdate& t, Group& g) {
   g.distance = select(smooth, top + y * (bottom - top) - g.z, g.distance);
 }
 
-// Weights after clearing: voxels that the view looks through, with all pixels around, lose a share.
-Float cleared(const VoxelUpdate& t, const Group& g, Mask through, Float weight) {
-  through = both(through, greater_equal(gather(t.eroded, g.pixel), g.z + t.truncation));
-  return select(through, rounded(weight * (1 - t.clearing)), weight);
+// Clears voxels that the view surely looks through, with all pixels around and by more than the depth is wrong: they lose a
+// share of their weight. At edges and by less, poses and depth may be at fault as well: the measurement counts little.
+void clear(const VoxelUpdate& t, const Group& g, Mask through, Float& weight, Float& measured) {
+  const Float needed = g.z * (1 + kDoubt) + t.truncation;
+  const Mask sure = both(through, greater_equal(gather(t.eroded, g.pixel), needed));
+  const Float little = minimum(measured, maximum(broadcast(1.0f), rounded(weight * kDoubtfulShare)));
+  measured = select(neither_of(through, sure), little, measured);
+  weight = select(sure, rounded(weight * (1 - t.clearing)), weight);
 }
 
 typedef std::uint8_t Bytes __attribute__((vector_size(4 * kLanes), aligned(1), may_alias));
@@ -165,7 +171,7 @@ void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& chan
   const Float truncation = broadcast(t.truncation), one = broadcast(1.0f), full = broadcast(kFreeValue);
   const Float distance = g.distance;
   const Float drop = minimum((distance + t.truncation) * (1.0f / (t.truncation - t.voxel)), one);
-  const Float measured = minimum(rounded(t.weight_scale * g.inverse * g.inverse * drop), broadcast(kFullWeight));
+  Float measured = minimum(rounded(t.weight_scale * g.inverse * g.inverse * drop), broadcast(kFullWeight));
   const Int old_value = load_widened(block.value + first), old_weight = load_widened(block.weight + first);
   const Float value = to_float(old_value);
   Float weight = to_float(old_weight);
@@ -180,7 +186,7 @@ void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& chan
   const Float scaled = (kFreeValue / t.truncation) * distance;
   const Mask surface = both(greater(weight, Float{}), greater(broadcast(kFreeFrom), value));
   const Mask through = both(both(behind, surface), greater(scaled - value, full * kSurprise));
-  if (t.eroded != nullptr && any(through)) weight = cleared(t, g, through, weight);
+  if (t.eroded != nullptr && any(through)) clear(t, g, through, weight, measured);
 
   const Float total = weight + measured, share = measured / total;
   Float mean = value + share * (minimum(scaled, full) - value);
