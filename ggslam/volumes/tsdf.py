@@ -115,7 +115,7 @@ class TsdfMap:
         context: threads to work on.
         origin: where in the world blocks are counted from, [3] metres; None: as goes with the first view.
         points: whether measured points are counted, of which a distance field and ROS maps have what is thinner than a
-            voxel; a mesh does not need them.
+            voxel; a mesh does not need them. They are in any case where some were written.
     """
 
     def __init__(

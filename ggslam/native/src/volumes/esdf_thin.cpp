@@ -40,11 +40,11 @@ Site site_of(int voxel, uint8_t octants) {
 void Esdf::add_thin(int32_t row, BlockSites& found) const {
   const BlockCoordinates at = table_.at(row);
   const int64_t held = tsdf_.find(at);
-  const VoxelBlock* voxels = held < 0 ? nullptr : tsdf_.voxels(tsdf_.block(held));
-  if (voxels == nullptr) return;
+  const PointBlock* points = held < 0 ? nullptr : tsdf_.points(tsdf_.block(held));
+  if (points == nullptr) return;
   uint64_t hit[kSide] = {};
   for (int row = 0; row < kSide * kSide; ++row)
-    hit[row / kSide] |= occupied_bits(voxels->hits + row * kSide) << row % kSide * kSide;
+    hit[row / kSide] |= occupied_bits(points->hits + row * kSide) << row % kSide * kSide;
   if (std::all_of(hit, hit + kSide, [](uint64_t word) { return word == 0; })) return;
   static constexpr uint64_t kNone[kSide] = {};
   const auto crossed = [&](int x, int y, int z) {
@@ -63,7 +63,7 @@ void Esdf::add_thin(int32_t row, BlockSites& found) const {
     found.known[k] |= hit[k];
     for (uint64_t thin = hit[k] & ~near; thin != 0; thin &= thin - 1) {
       const int voxel = k * kSide * kSide + __builtin_ctzll(thin);
-      found.sites.push_back(site_of(voxel, voxels->octants[voxel]));
+      found.sites.push_back(site_of(voxel, points->octants[voxel]));
     }
   }
   std::inplace_merge(found.sites.begin(), found.sites.begin() + static_cast<std::ptrdiff_t>(crossings),

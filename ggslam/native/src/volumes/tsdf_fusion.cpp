@@ -16,7 +16,8 @@ GGSLAM_DECLARE_KERNEL(void tsdf_erode_column(const float* rows, int width, int h
 GGSLAM_DECLARE_KERNEL(void tsdf_pack_color(const uint8_t* color, std::size_t begin, std::size_t end, int32_t* out))
 GGSLAM_DECLARE_KERNEL(unsigned tsdf_fuse_block(const volumes::VoxelUpdate& update, volumes::VoxelBlock& block))
 GGSLAM_DECLARE_KERNEL(void tsdf_octants_of_row(const volumes::OctantRow& row))
-GGSLAM_DECLARE_KERNEL(unsigned tsdf_decay_block(volumes::VoxelBlock& block, float factor, int least))
+GGSLAM_DECLARE_KERNEL(unsigned tsdf_decay_block(volumes::VoxelBlock& block, volumes::PointBlock* points, float factor,
+                                                int least))
 
 namespace ggslam::volumes {
 namespace {
@@ -272,7 +273,6 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
   view.width = in.width, view.height = in.height;
   view.fx = in.fx, view.fy = in.fy, view.cx = in.cx, view.cy = in.cy;
   view.truncation = map.truncation, view.voxel = map.voxel, view.edge = settings.edge;
-  view.points = settings.points != 0;
   view.clearing = settings.clearing, view.max_depth = settings.max_depth;
   view.weight_scale = kFullWeight / map.max_weight;
   view.max_free_weight = settings.max_free_weight * view.weight_scale;
@@ -285,7 +285,8 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
       FusionScratch::Update& update = scratch.updates[n];
       const Vec3d p = map.voxel * (kSide * cast<double>(vector_of(update.at)) + Vec3d::all(0.5));
       cast<float>(rotation * p + Vec3d::from(in.translation)).to(own.origin);
-      own.octants = own.points && scratch.marked[n] ? scratch.octants.data() + n * kVoxels : nullptr;
+      own.points = map.points(map.block(update.row));
+      own.octants = own.points != nullptr && scratch.marked[n] ? scratch.octants.data() + n * kVoxels : nullptr;
       update.flags = kernel(own, *update.voxels);
     }
   });
@@ -320,10 +321,11 @@ void finish_blocks(Tsdf& map, FusionScratch& scratch, FusionStats& stats) {
 // voxels serve those that follow.
 void fuse(Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context, FusionScratch& scratch,
           FusionStats& stats) {
+  if (settings.points) map.count_points();
   scratch.gone.clear();
   for (std::size_t first = 0; first < scratch.candidates.size();) {
     first = make_blocks(map, settings, scratch, stats, first);
-    if (settings.points) mark_points(map, in, settings, context, scratch);
+    if (map.counts_points()) mark_points(map, in, settings, context, scratch);
     update_blocks(map, in, settings, context, scratch);
     finish_blocks(map, scratch, stats);
     stats.updated += scratch.updates.size();
@@ -363,7 +365,7 @@ int64_t decay(Tsdf& map, FusionScratch& scratch, Context& context, float factor,
         scratch.emptied[row] = block.free_weight == 0;
         continue;
       }
-      const unsigned flags = kernel(*map.voxels(block), factor, least);
+      const unsigned flags = kernel(*map.voxels(block), map.points(block), factor, least);
       if (flags & kChanged) block.revision = map.revision;
       scratch.emptied[row] = (flags & kNoneSeen) != 0;
     }

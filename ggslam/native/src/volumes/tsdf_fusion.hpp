@@ -144,7 +144,7 @@ struct VoxelUpdate {
   float max_depth;         // depth beyond it tells of free space alone
   float weight_scale;      // 65535 / largest weight
   float max_free_weight;   // in 65535ths of the largest
-  bool points;             // whether to count them
+  PointBlock* points;      // of the block; null: not counted
   uint8_t* octants;        // [kVoxels], those of the block that the view has points in, which are cleared; null: none
 };
 

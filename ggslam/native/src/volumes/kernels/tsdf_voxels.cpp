@@ -135,7 +135,8 @@ static inline bool any_byte(const Bytes& v) {
 }
 
 // Counts hits and misses of the voxels. Returns whether what is occupied changed.
-bool count_points(const VoxelUpdate& t, const Work& w, VoxelBlock& block) {
+bool count_points(const VoxelUpdate& t, const Work& w) {
+  volumes::PointBlock& block = *t.points;
   const Bytes least = every(volumes::kLeastHits), most = every(volumes::kMostHits), occupied = every(volumes::kOccupied);
   if (t.octants == nullptr) {
     Bytes other{};
@@ -246,7 +247,7 @@ bool vote(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block) {
   return changed;
 }
 
-unsigned summary(const VoxelBlock& block) {
+unsigned summary(const VoxelBlock& block, const volumes::PointBlock* points) {
   int weights = 0, unseen = 0, occupied = 0;
   for (int k = 0; k < kVoxels; ++k) {
     weights |= block.weight[k];
@@ -254,7 +255,7 @@ unsigned summary(const VoxelBlock& block) {
     occupied |= block.value[k] != kFreeValue;
   }
   std::uint8_t hits = 0;
-  for (int k = 0; k < kVoxels; ++k) hits |= block.hits[k];
+  for (int k = 0; points != nullptr && k < kVoxels; ++k) hits |= points->hits[k];
   static_assert(volumes::kOccupied == 128 && volumes::kMostHits < 256);  // the highest bit
   if (hits & volumes::kOccupied) return 0;
   return (weights == 0 ? volumes::kNoneSeen : 0u) | (unseen == 0 && occupied == 0 ? volumes::kAllFree : 0u);
@@ -264,39 +265,41 @@ unsigned summary(const VoxelBlock& block) {
 
 // Returns what happened, in bits.
 unsigned tsdf_fuse_block(const VoxelUpdate& t, VoxelBlock& block) {
+  if (t.points != nullptr)  // lie elsewhere, and are needed last
+    for (std::size_t at = 0; at < sizeof *t.points; at += 64) __builtin_prefetch(reinterpret_cast<const char*>(t.points) + at, 1);
   Work w;
   project(t, w);
   for (int n = 0; n < w.near.count; ++n) interpolate(t, w.groups[w.near.group[n]]);
   Mask changed{};
   for (int n = 0; n < w.seen.count; ++n) average(t, w, w.seen.group[n], block, changed);
   const bool points = t.octants != nullptr;
-  bool relabelled = t.points && count_points(t, w, block);
+  bool relabelled = t.points != nullptr && count_points(t, w);
   for (int n = 0; n < w.band.count; ++n) {
     const int first = w.band.group[n] * kLanes;
     if (t.color != nullptr) paint(t, w.groups[w.band.group[n]], first, block);
     if (t.labels != nullptr) relabelled |= vote(t, w.groups[w.band.group[n]], first, block);
   }
   return (relabelled || any(changed) ? volumes::kChanged : 0u) | (w.band.count > 0 || points ? volumes::kInBand : 0u) |
-         summary(block);
+         summary(block, t.points);
 }
 
 // Multiplies the weights; voxels whose weight falls below `least` are forgotten. Returns what happened, in bits.
-unsigned tsdf_decay_block(VoxelBlock& block, float factor, int least) {
+unsigned tsdf_decay_block(VoxelBlock& block, volumes::PointBlock* points, float factor, int least) {
   unsigned flags = 0;
   for (int k = 0; k < kVoxels; ++k) {
     const int weight = static_cast<int>(block.weight[k] * factor + 0.5f);
     const bool forgotten = weight < least && block.weight[k] > 0;
     block.weight[k] = weight < least ? 0 : static_cast<std::uint16_t>(weight);
-    if (block.weight[k] == 0) {
-      flags |= block.hits[k] >= volumes::kOccupied ? volumes::kChanged : 0u;
-      block.hits[k] = block.octants[k] = 0;
+    if (block.weight[k] == 0 && points != nullptr) {
+      flags |= points->hits[k] >= volumes::kOccupied ? volumes::kChanged : 0u;
+      points->hits[k] = points->octants[k] = 0;
     }
     if (!forgotten) continue;
     block.value[k] = kFreeValue, block.label[k] = 0, block.votes[k] = 0;
     block.red[k] = block.green[k] = block.blue[k] = 0;
     flags |= volumes::kChanged;
   }
-  return flags | summary(block);
+  return flags | summary(block, points);
 }
 
 }  // namespace ggslam::GGSLAM_ISA
