@@ -65,10 +65,8 @@ def test_no_return_goes_through_the_registration_of_depth(tmp_path: Path) -> Non
     T = "T_color_depth: [1, 0, 0, -0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
     calibration = tmp_path / "depth.yaml"
     calibration.write_text(size + T + "color: {width: 32, height: 24, fx: 30, fy: 30, cx: 15.5, cy: 11.5}\n")
-    told, bare = (
-        open_sequence(recording(tmp_path / str(fill), fill), depth_camera=calibration, intrinsics="30 30 15.5 11.5", depth_scale=1)
-        for fill in (np.inf, np.nan)
-    )
+    options = {"depth_camera": calibration, "intrinsics": "30 30 15.5 11.5", "depth_scale": 1}
+    told, bare = (open_sequence(recording(tmp_path / str(fill), fill), **options) for fill in (np.inf, np.nan))
     for a, b in zip(told, bare, strict=True):
         assert np.array_equal(a.depth, b.depth)
     assert told.frame(0).no_return is None

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What later views look past goes; what they may miss by an error of pose or depth, or at an edge, is not lost to one of
-them."""
+"""What later views look past goes; what they may miss by an error of pose or depth is not lost to one of them."""
 
 from __future__ import annotations
 
