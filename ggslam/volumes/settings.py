@@ -38,7 +38,7 @@ class TsdfSettings:
     """A voxel that depth now passes by more than the truncation, and by more than half of it farther than the voxel's
     distance tells, loses this share of its weight first, so that what was taken away goes in a few frames. Where not
     all pixels around pass it by 3 % of the depth more, depth and pose may be at fault instead: the measurement counts
-    a twentieth of the voxel's weight at most. 0: it is outvoted frame by frame."""
+    3 % of the voxel's weight at most. 0: it is outvoted frame by frame."""
     decay: float = setting(0.95, 0.01, 1)
     """Weights are multiplied by this at every call of `TsdfMap.decay`."""
 

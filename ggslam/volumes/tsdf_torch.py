@@ -18,7 +18,7 @@ from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.torch_candidates import NEAR, BlockCandidates, DeviceView, find_candidates
 from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, OCCUPIED_HITS, SIDE, VOXELS, TsdfMap
 
-_DOUBT, _DOUBTFUL_SHARE = 0.03, 0.05
+_DOUBT, _DOUBTFUL_SHARE = 0.03, 0.03
 _SURPRISE = 0.5
 _FREE_FROM = 0.98 * FREE_VALUE
 _EROSION = 2

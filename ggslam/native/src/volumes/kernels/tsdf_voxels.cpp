@@ -18,7 +18,7 @@ using volumes::VoxelUpdate;
 
 constexpr float kSurprise = 0.5f;           // of the truncation: how far depth must contradict a voxel to clear it
 constexpr float kDoubt = 0.03f;             // of a voxel's depth: passing it by so little more proves nothing
-constexpr float kDoubtfulShare = 0.05f;     // of the voxel's weight that what proves nothing counts at most
+constexpr float kDoubtfulShare = 0.03f;     // of the voxel's weight that what proves nothing counts at most
 constexpr float kFreeFrom = 0.98f * kFreeValue;  // a voxel seen as free counts as free from this value on
 constexpr float kRangeSlack = 1.00001f;     // of the range: rounding when depth is added up again
 constexpr float kLabelVoxels = 2.0f;        // labels are told to voxels this near to the surface
