@@ -38,8 +38,8 @@ class Fusion(Protocol):
 class Ours:
     """The compiled fusion, carving and clearing."""
 
-    def __init__(self, settings: TsdfSettings) -> None:
-        self.tsdf = TsdfMap(settings)
+    def __init__(self, settings: TsdfSettings, points: bool = False) -> None:
+        self.tsdf = TsdfMap(settings, points=points)
 
     def prepared(self, frame: Frame) -> Frame:
         return frame

@@ -93,8 +93,8 @@ class VolumeMaps:
     ) -> None:  # fmt: skip
         self.settings = settings
         self._goes_on = onto is not None
-        self._on_device = None if device is None else _fusion_on(device, settings, onto)
-        self.tsdf = TsdfMap(settings.tsdf) if onto is None else onto
+        self._on_device = None if device is None else _fusion_on(device, settings, onto, points=esdf)
+        self.tsdf = TsdfMap(settings.tsdf, points=esdf) if onto is None else onto
         self.context = self.tsdf.context
         self.field = DistanceField(self.tsdf, settings.esdf) if esdf else None
         self.occupancy = None if occupancy is None else self._occupancy(occupancy)
@@ -113,8 +113,8 @@ class VolumeMaps:
             return
         self.settings = replace(self.settings, tsdf=tsdf)
         if self._on_device is not None:
-            self._on_device = TorchTsdf(tsdf, self._on_device.device)
-        self.tsdf = TsdfMap(tsdf, self.context)
+            self._on_device = TorchTsdf(tsdf, self._on_device.device, self._on_device.points)
+        self.tsdf = TsdfMap(tsdf, self.context, points=self.tsdf.points)
         self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
 
     def mesh(self, min_triangles: int = 0) -> Mesh:
@@ -174,7 +174,7 @@ class VolumeMaps:
         start = time.perf_counter()
         self.tsdf.clear()
         if self._on_device is not None:
-            self._on_device = TorchTsdf(self.settings.tsdf, self._on_device.device)
+            self._on_device = TorchTsdf(self.settings.tsdf, self._on_device.device, self._on_device.points)
         if self.occupancy is not None:
             self.occupancy = self._occupancy(self.occupancy.resolution)
         for view in views:
@@ -208,11 +208,11 @@ class VolumeMaps:
             self.tsdf.write(at[changed], label=table[old[changed]])
 
 
-def _fusion_on(device: str, settings: VolumeSettings, onto: TsdfMap | None) -> TorchTsdf:
+def _fusion_on(device: str, settings: VolumeSettings, onto: TsdfMap | None, points: bool) -> TorchTsdf:
     if onto is not None or settings.decay_every:
         raise ConfigError("`device`: on a device a TSDF neither decays nor is one gone on with")
     try:
         torch.zeros(1, device=device).cpu()
-        return TorchTsdf(settings.tsdf, device)
+        return TorchTsdf(settings.tsdf, device, points)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         raise ConfigError(f"`device` {device}: {str(error).splitlines()[0]}") from None

@@ -16,7 +16,7 @@ class PosedView:
     """What a camera sees of a surface.
 
     Attributes:
-        depth: float32 [H, W], metres; 0: none.
+        depth: float32 [H, W], metres; 0: none; +inf: the sensor found nothing.
         camera: of the images.
         T_world_camera: float64 [4, 4].
         color: uint8 [H, W, 3], or None.
@@ -31,5 +31,5 @@ class PosedView:
 
     def points(self) -> np.ndarray:
         """Where its pixels with depth lie, float64 [n, 3], world frame."""
-        seen = self.camera.back_project(self.depth)[self.depth > 0]
+        seen = self.camera.back_project(self.depth)[(self.depth > 0) & np.isfinite(self.depth)]
         return transform_points(seen.astype(np.float64), self.T_world_camera)

@@ -36,8 +36,9 @@ class TsdfSettings:
     nearest of them is taken instead of interpolating across the edge."""
     clearing: float = setting(0.5, 0, 0.99)
     """A voxel that depth now passes by more than the truncation, and by more than half of it farther than the voxel's
-    distance tells, loses this share of its weight first, so that what was taken away goes in a few frames. 0: it is
-    outvoted frame by frame."""
+    distance tells, loses this share of its weight first, so that what was taken away goes in a few frames. Where not
+    all pixels around pass it by 3 % of the depth more, depth and pose may be at fault instead: the measurement counts
+    3 % of the voxel's weight at most. 0: it is outvoted frame by frame."""
     decay: float = setting(0.95, 0.01, 1)
     """Weights are multiplied by this at every call of `TsdfMap.decay`."""
 

@@ -23,8 +23,6 @@ from ggslam.volumes.tsdf import SIDE
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205
 """Grey values of a ROS map."""
 _MOST_CELLS = 50_000_000
-_ROUGH = 0.4
-"""Voxels that the field's distance may be off at edges and between the heights that are looked at."""
 _BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
@@ -60,8 +58,8 @@ class FieldSlice:
         distance: float32 [H, W], metres, at the cells' centres; of a band, the least over the heights. NaN: not known.
         known: bool [H, W].
         occupied: bool [H, W], whether a cell has a surface in it.
-        behind: bool [H, W], whether a cell is behind a surface (at one of the heights), or at one that no point was
-            measured near: not free, whatever is known.
+        behind: bool [H, W], whether a cell is behind a surface (at one of the heights), at one that no point was
+            measured near, or may have a measured point in it: not free, whatever is known.
     """
 
     plane: SlicePlane
@@ -104,11 +102,11 @@ def slice_field(
     """Slices the field.
 
     A cell is occupied if its centre is from half a cell before a surface (or half a voxel, if that is more) to a cell
-    behind it, or if a point was measured in it: in an eighth of a voxel that overlaps it, where the field agrees that a
-    surface may go through the cell, or has the point as a thin thing. With a band, heights from `low` to `high` are
-    looked at, a voxel apart: a cell is occupied if it is at any of them, and free if it is known at one at least, and
-    occupied or behind a surface at none. A robot as high as the band may therefore drive over a cell that was seen at
-    some of its heights only.
+    behind it, or if a point was measured in it: the middle of an eighth of a voxel that has points lies in it, or any
+    part of one that is a thin thing. No cell that overlaps an eighth with points is free. With a band, heights from
+    `low` to `high` are looked at, a voxel apart: a cell is occupied if it is at any of them, and free if it is known at
+    one at least, and occupied or behind a surface at none. A robot as high as the band may therefore drive over a cell
+    that was seen at some of its heights only.
 
     Args:
         field: to slice.
@@ -130,24 +128,21 @@ def slice_field(
     low, high = band or (0.0, 0.0)
     offsets = np.linspace(low, high, int(np.ceil((high - low) / field.voxel - 1e-6)) + 1)
     least = np.full(len(centres), np.nan, np.float32)
-    (hit, through), cell = np.zeros((2, len(centres)), bool), max(resolution, field.voxel)
+    hit, cell = np.zeros(len(centres), bool), max(resolution, field.voxel)
     for offset in offsets:
-        values = field.query(centres + offset * plane.normal)
-        found, along = values.distance, np.abs(values.gradient @ np.stack([plane.x_axis, plane.y_axis], 1)).sum(1)
+        found = field.query(centres + offset * plane.normal).distance
         least = np.fmin(least, found)
         hit |= (found <= cell / 2) & (found >= -cell)
-        through |= np.abs(found) <= along * resolution / 2 + _ROUGH * field.voxel
     distance, occupied = least.reshape(height, width), hit.reshape(height, width)
-    octants, local = measured_octants(field.tsdf), replace(plane, origin=plane.origin - field.origin)
-    points = _cells_with_points(octants, field.voxel, local, resolution, (low, high), occupied.shape)
-    lone = octants[_thin_octants(octants, field)]
-    points &= through.reshape(height, width) | _cells_with_points(
-        lone, field.voxel, local, resolution, (low, high), occupied.shape
-    )
+    local = replace(plane, origin=plane.origin - field.origin)
+    octants, grid = measured_octants(field.tsdf), (local, resolution, (low, high), occupied.shape)
+    touched = _cells_with_points(octants, field.voxel / 4, *grid)
+    points = _cells_with_points(octants, 0.0, *grid)
+    points |= _cells_with_points(octants[_thin_octants(octants, field)], field.voxel / 4, *grid)
     # Where what is behind one side of a thing meets space seen free from another, the field has a surface that nobody
     # saw.
-    doubtful = occupied & (cv2.dilate(points.astype(np.uint8), _BESIDE) == 0) & points.any()
-    occupied, behind = (occupied & ~doubtful) | points, (distance < 0) | doubtful
+    doubtful = occupied & (cv2.dilate(touched.astype(np.uint8), _BESIDE) == 0) & touched.any()
+    occupied, behind = (occupied & ~doubtful) | points, (distance < 0) | doubtful | touched
     top_right = (plane.low[0] + width * resolution, plane.low[1] + height * resolution)
     whole = SlicePlane(plane.origin, plane.x_axis, plane.y_axis, plane.low, top_right)
     return FieldSlice(whole, resolution, distance, ~np.isnan(distance), occupied, behind)
@@ -163,12 +158,13 @@ def _thin_octants(octants: np.ndarray, field: DistanceField) -> np.ndarray:
 
 
 def _cells_with_points(
-    octants: np.ndarray, voxel: float, plane: SlicePlane, resolution: float, band: tuple[float, float],
+    octants: np.ndarray, half: float, plane: SlicePlane, resolution: float, band: tuple[float, float],
     shape: tuple[int, int],
 ) -> np.ndarray:  # fmt: skip
-    """Cells that octants [N, 3] overlap at the heights of a band, bool [H, W]."""
+    """Cells that cubes around points [N, 3], with edges of twice `half`, overlap at the heights of a band, bool
+    [H, W]."""
     axes = np.stack([plane.x_axis, plane.y_axis, plane.normal])
-    reach = 0.25 * voxel * np.abs(axes).sum(1)
+    reach = half * np.abs(axes).sum(1)
     points = (octants - plane.origin) @ axes.T
     points = points[(points[:, 2] >= band[0] - reach[2]) & (points[:, 2] <= band[1] + reach[2])]
     first, last = (

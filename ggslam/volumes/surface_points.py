@@ -68,7 +68,7 @@ def surface_points(
     """
     settings = surface_settings(voxel_size, times, _TRUNCATION)
     of_view = [_cubes(look(k, True), voxel_size, settings.max_depth) for k in range(count)]
-    sweep = _Sweep(TsdfMap(settings, context), of_view, LEAST_WEIGHT / times**2)
+    sweep = _Sweep(TsdfMap(settings, context, points=False), of_view, LEAST_WEIGHT / times**2)
     limit = most_blocks
     for number in range(count):
         sweep.add(number, look(number, False))

@@ -114,13 +114,15 @@ class TsdfMap:
         settings: of the fusion.
         context: threads to work on.
         origin: where in the world blocks are counted from, [3] metres; None: as goes with the first view.
+        points: whether measured points are counted, of which a distance field and ROS maps have what is thinner than a
+            voxel; a mesh does not need them. They are in any case where some were written.
     """
 
     def __init__(
         self, settings: TsdfSettings | None = None, context: NativeContext | None = None,
-        origin: np.ndarray | None = None,
+        origin: np.ndarray | None = None, points: bool = True,
     ) -> None:  # fmt: skip
-        self.settings = settings or TsdfSettings()
+        self.settings, self.points = settings or TsdfSettings(), points
         self.origin = np.zeros(3) if origin is None else np.array(origin, np.float64)
         self._has_origin = origin is not None
         self.context = context or NativeContext()
@@ -200,8 +202,9 @@ class TsdfMap:
         if within is None and _has_beyond(view.depth, s.max_depth) and (unit := wrong_unit(view.depth)):
             raise InputError(unit)
         numbers = FusionSettings(
-            s.min_depth, s.max_depth, s.free_share, s.edge_voxels * s.voxel, s.clearing, s.max_free_weight
-        )
+            s.min_depth, s.max_depth, s.free_share, s.edge_voxels * s.voxel, s.clearing, s.max_free_weight,
+            int(self.points),
+        )  # fmt: skip
         if within is not None:
             low, high = (np.asarray(ends).astype(int).tolist() for ends in within)
             numbers.bounded, numbers.low[:], numbers.high[:] = 1, low, [end + 1 for end in high]
@@ -234,7 +237,7 @@ class TsdfMap:
             return error
 
         def blocks_of(edge: float) -> int:
-            other = TsdfMap(replace(self.settings, voxel=edge), self.context)
+            other = TsdfMap(replace(self.settings, voxel=edge), self.context, points=False)
             other.integrate(depth, camera, T_world_camera)
             return other.dense_blocks
 

@@ -18,6 +18,7 @@ from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.torch_candidates import NEAR, BlockCandidates, DeviceView, find_candidates
 from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, OCCUPIED_HITS, SIDE, VOXELS, TsdfMap
 
+_DOUBT, _DOUBTFUL_SHARE = 0.03, 0.03
 _SURPRISE = 0.5
 _FREE_FROM = 0.98 * FREE_VALUE
 _EROSION = 2
@@ -74,10 +75,13 @@ class TorchTsdf:
     Args:
         settings: of the fusion.
         device: to work on.
+        points: whether measured points are counted, as of a `TsdfMap`.
     """
 
-    def __init__(self, settings: TsdfSettings | None = None, device: str | torch.device = "cpu") -> None:
-        self.settings = settings or TsdfSettings()
+    def __init__(
+        self, settings: TsdfSettings | None = None, device: str | torch.device = "cpu", points: bool = True
+    ) -> None:
+        self.settings, self.points = settings or TsdfSettings(), points
         self.origin: np.ndarray | None = None
         """Where in the world blocks are counted from, as of a `TsdfMap`; None until the first view."""
         self.device = torch.device(device)
@@ -131,6 +135,8 @@ class TorchTsdf:
         label_image = None if checked.labels is None else torch.from_numpy(checked.labels.astype(np.int32))
         at = torch.cat([found.coordinates[old], found.coordinates[new]])
         in_band = _fuse(voxels, at, view, s, color_image, None if label_image is None else label_image.to(self.device))
+        if self.points:
+            in_band |= _count_points(voxels, at, view, s)
         seen = ((voxels.weight > 0) | (voxels.hits >= OCCUPIED_HITS)).any(1)
         told = torch.where(free_row[new] < 0, seen[int(old.sum()) :], in_band[int(old.sum()) :])
         self._keep(voxels, dense_row[old], keys[new], told)
@@ -172,7 +178,7 @@ class TorchTsdf:
 
     def to_native(self, context: NativeContext | None = None) -> TsdfMap:
         """The same map for mesh, distance field and files."""
-        tsdf = TsdfMap(self.settings, context, self.origin)
+        tsdf = TsdfMap(self.settings, context, self.origin, self.points)
         arrays = {name: array.cpu().numpy() for name, array in vars(self._voxels).items()}
         tsdf.write(_coordinates(self._dense), **arrays)
         tsdf.write_free(_coordinates(self._free), self._free_weight.cpu().numpy())
@@ -219,8 +225,10 @@ def _fuse(
     scaled = FREE_VALUE / s.truncation * distance
     if s.clearing > 0:
         through = behind & (weight > 0) & (value < _FREE_FROM) & (scaled - value > _SURPRISE * FREE_VALUE)
-        through &= _erode(view.depth).flatten()[pixel] >= z + s.truncation
-        weight = torch.where(through, _round(weight * (1 - s.clearing)), weight)
+        sure = through & (_erode(view.depth).flatten()[pixel] >= z * (1 + _DOUBT) + s.truncation)
+        little = torch.minimum(measured, _round(weight * _DOUBTFUL_SHARE).clamp(min=1))
+        measured = torch.where(through & ~sure, little, measured)
+        weight = torch.where(sure, _round(weight * (1 - s.clearing)), weight)
     total = weight + measured
     share = measured / total
     mean = value + share * (scaled.clamp(max=FREE_VALUE) - value)
@@ -238,9 +246,7 @@ def _fuse(
         voxels.color = torch.where(band[..., None], (after + 0.5).to(torch.uint8), voxels.color)
     if labels is not None:
         _vote(voxels, band & (distance.abs() <= _LABEL_VOXELS * s.voxel), labels.flatten()[pixel])
-    octants = _octants(at, view, s)
-    _count_points(voxels, octants, distance >= s.voxel)
-    return (band | (octants > 0)).any(1)
+    return band.any(1)
 
 
 def _octants(at: Tensor, view: DeviceView, s: TsdfSettings) -> Tensor:
@@ -258,13 +264,15 @@ def _octants(at: Tensor, view: DeviceView, s: TsdfSettings) -> Tensor:
     return (marks.view(len(at), VOXELS, 8) << torch.arange(8, device=device, dtype=torch.int32)).sum(2).int()
 
 
-def _count_points(voxels: Voxels, octants: Tensor, missed: Tensor) -> None:
-    before = voxels.hits
+def _count_points(voxels: Voxels, at: Tensor, view: DeviceView, s: TsdfSettings) -> Tensor:
+    """Counts hits and misses; returns whether the view has points in blocks at coordinates [n, 3], [n]."""
+    octants, missed, before = _octants(at, view, s), _distances(at, view, s)[0] >= s.voxel, voxels.hits
     start = torch.where(before > 0, before, OCCUPIED_HITS)
     down = torch.where(missed, (start - _MISS).clamp(min=_LEAST_HITS), before)
     voxels.hits = torch.where(octants > 0, (start + _HIT).clamp(max=_MOST_HITS), down).int()
     kept = (octants > 0) | (voxels.hits >= OCCUPIED_HITS)
     voxels.octants = torch.where(kept, voxels.octants | octants, 0)
+    return (octants > 0).any(1)
 
 
 def _round(values: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ import pytest
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.volumes.live import LiveVolumes
+from ggslam.jobs.volumes.no_returns import NoReturns
 from ggslam.mapping.keyframe import make_keyframe
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import se3_exp
@@ -179,3 +180,29 @@ def test_what_the_sensor_no_longer_finds_goes(frames: list[Frame]) -> None:
     assert not inner.any()
     centres = maps.occupancy.occupied_centers()[0]
     assert not (centres[:, 2] < 3.9).any()
+
+
+def test_what_keyframes_found_nothing_of_stays_free_after_a_correction(frames: list[Frame]) -> None:
+    """Frames that say "nothing within range" on their left half, after one that saw a room there: the same, made anew
+    of the keyframes. Of many frames only masks of keyframes and of the newest are kept."""
+    seen, T = frames[0], np.eye(4)
+    half = np.zeros(seen.depth.shape, bool)
+    half[:, : half.shape[1] // 2] = True
+    nothing = replace(seen, index=1, depth=np.where(half, 0, seen.depth).astype(np.float32), no_return=half)
+    maps, slam = VolumeMaps(SETTINGS, esdf=True, occupancy=0.06), Played()
+    live = LiveVolumes(maps, lambda frame, T: None, objects=False)
+    slam.play(live, seen, T)
+    before = len(maps.field.surface()[0])
+    for k in range(1, 9):
+        slam.play(live, replace(nothing, index=k), T)
+    surface, occupied = len(maps.field.surface()[0]), maps.occupancy.summary().occupied
+    assert 0.2 * before < surface < 0.8 * before
+    slam.corrections = 1
+    slam.play(live, replace(nothing, index=9), T)
+    assert len(maps.times.rebuilds) == 1
+    assert len(maps.field.surface()[0]) == pytest.approx(surface, rel=0.02)
+    assert maps.occupancy.summary().occupied == pytest.approx(occupied, rel=0.02)
+    kept = NoReturns()
+    for k in range(1000):
+        kept.note(replace(nothing, index=k), slam.mapper.keyframes)
+    assert set(range(1, 10)) | set(range(936, 1000)) <= set(kept._packed) and len(kept._packed) < 250

@@ -59,6 +59,24 @@ def test_no_return_goes_with_the_kind_of_depth(tmp_path: Path, kind: str, place:
     assert np.array_equal(found, expected)
 
 
+def test_no_return_goes_through_the_registration_of_depth(tmp_path: Path) -> None:
+    """Colour stands 10 cm beside depth: the wall at 1.5 m moves by 2 pixels, what lies beyond all ranges by none."""
+    size = "width: 32\nheight: 24\nfx: 30\nfy: 30\ncx: 15.5\ncy: 11.5\n"
+    T = "T_color_depth: [1, 0, 0, -0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
+    calibration = tmp_path / "depth.yaml"
+    calibration.write_text(size + T + "color: {width: 32, height: 24, fx: 30, fy: 30, cx: 15.5, cy: 11.5}\n")
+    options = {"depth_camera": calibration, "intrinsics": "30 30 15.5 11.5", "depth_scale": 1}
+    told, bare = (open_sequence(recording(tmp_path / str(fill), fill), **options) for fill in (np.inf, np.nan))
+    for a, b in zip(told, bare, strict=True):
+        assert np.array_equal(a.depth, b.depth)
+    assert told.frame(0).no_return is None
+    found, (rows, columns) = told.frame(1).no_return, BOX
+    assert found[rows, columns.start : columns.stop - 2].mean() > 0.95  # the wall on its right moves over the rest
+    outside = found.copy()
+    outside[rows.start - 1 : rows.stop + 1, columns.start - 1 : columns.stop + 1] = False
+    assert not outside.any()
+
+
 def test_whole_numbers_have_no_infinity() -> None:
     assert no_returns(np.full((2, 3), 65535, np.uint16)) is None
     assert no_returns(np.full((2, 3), np.inf, np.float32)).all()

@@ -4,6 +4,7 @@ wall."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from analytic_scenes import Box, Scene, Union, looking_at, render_depth, small_camera
@@ -59,6 +60,8 @@ def test_a_pole_is_an_obstacle_in_all_maps(voxel: float, z: float, shift: float)
     assert (occupancy.states(front + [0, 0, 1e-4]) == OCCUPIED).mean() > 0.9
     cut = slice_field(field, plane_at_height(field, UP, 0.0), voxel, (-0.3, 0.3))
     assert not cut.free[cells_of(cut, front)].any()
+    beside = cv2.dilate(cut.occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert beside[cells_of(cut, front)].all()
 
 
 def cells_of(cut, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]

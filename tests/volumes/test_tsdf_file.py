@@ -11,6 +11,7 @@ from analytic_scenes import Plane, render_depth, small_camera
 
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.scene.arrays import arrays_to_bytes
+from ggslam.volumes.measured_points import measured_octants
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.tsdf_file import load_tsdf, save_tsdf
@@ -38,6 +39,23 @@ def test_a_map_comes_back_as_it_was(tmp_path: Path, wall: TsdfMap) -> None:
     assert not load_tsdf(tmp_path / "map.npz", frozen=False).blocks().frozen.any()
     save_tsdf(tmp_path / "again.npz", back)
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "map.npz").read_bytes()
+
+
+def test_files_of_version_1_are_read(tmp_path: Path, wall: TsdfMap) -> None:
+    """They hold no measured points: the surface is the same, and those of views from then on count."""
+    save_tsdf(tmp_path / "map.npz", wall)
+    with np.load(tmp_path / "map.npz") as file:
+        arrays = dict(file)
+    old = {name: array for name, array in arrays.items() if name not in ("hits", "octants", "sha256")}
+    (tmp_path / "old.npz").write_bytes(arrays_to_bytes(**{**old, "version": np.array(1)}))
+    back, at = load_tsdf(tmp_path / "old.npz"), wall.blocks().coordinates
+    voxels, same = wall.read(at), back.read(at)
+    for name in ("value", "weight", "color", "label", "votes"):
+        assert np.array_equal(getattr(voxels, name), getattr(same, name))
+    assert measured_octants(back).size == 0 and len(measured_octants(wall)) > 1000
+    camera = small_camera(80, 60)
+    back.integrate(render_depth(Plane((0, 0, -1), -2), camera, np.eye(4)), camera, np.eye(4))
+    assert np.array_equal(*(np.unique(measured_octants(m), axis=0) for m in (wall, back)))
 
 
 def test_damaged_files_are_refused(tmp_path: Path, wall: TsdfMap) -> None:

@@ -20,7 +20,7 @@ from ctypes import (
 from typing import Any
 
 HEADER = "core/volumes.hpp"
-HEADER_SHA256 = "b2167029b78bb879d942033b0f220fd1df458e5ce63198db33e6340bdc5bc03e"
+HEADER_SHA256 = "a675622d766e51ab50f4db551b8939d9bd773526dac60bb0cb2362f8ab395f68"
 
 
 class VoxelArrays(Structure):
@@ -37,8 +37,8 @@ class FusionSettings(Structure):
 
     _fields_ = [
         ("min_depth", c_float), ("max_depth", c_float), ("free_share", c_float), ("edge", c_float),
-        ("clearing", c_float), ("max_free_weight", c_float), ("bounded", c_int32), ("low", c_int32 * 3),
-        ("high", c_int32 * 3),
+        ("clearing", c_float), ("max_free_weight", c_float), ("points", c_int32),
+        ("bounded", c_int32), ("low", c_int32 * 3), ("high", c_int32 * 3),
     ]
 
 

@@ -44,7 +44,7 @@ class SurfaceScorer:
         self._points, self._voxel = cloud.points, cloud.voxel_size
         self._measured = np.zeros(len(self._points), bool)
         self._times = max(1.0, self._voxel / USUAL_VOXEL)
-        self._tsdf = TsdfMap(surface_settings(self._voxel, self._times))
+        self._tsdf = TsdfMap(surface_settings(self._voxel, self._times), points=False)
 
     def _cloud_of(self, folder: RunFolder) -> VoxelCloud | None:
         """The points of a run; None, and a reason, where they are not scored."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from ggslam.jobs.volumes.no_returns import NoReturns
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.frame import Frame
 from ggslam.slam.result import SlamResult, StepReport
@@ -34,6 +35,7 @@ class LiveVolumes:
         self.maps = maps
         self._saw, self._objects, self._fit_voxel = saw, objects, fit_voxel
         self._corrections = 0
+        self._no_returns = NoReturns()
         self._current: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __call__(self, slam: Slam, frame: Frame, report: StepReport) -> None:
@@ -43,7 +45,7 @@ class LiveVolumes:
         start = time.perf_counter()
         if slam.corrections > self._corrections:
             self._corrections = slam.corrections
-            self.maps.rebuild(_views(slam.mapper.keyframes, self._objects))
+            self.maps.rebuild(self._views(slam.mapper.keyframes))
         if report.frame.status == TrackingStatus.LOST.value:
             return
         if not self.maps.times.rows:
@@ -52,6 +54,7 @@ class LiveVolumes:
         newest = slam.mapper.keyframes[-len(slam.cameras) :] if self._objects else []
         labels = next((keyframe.mask for keyframe in newest if keyframe.frame_index == frame.index), None)
         self.maps.add(frame, T, labels, report.seconds + time.perf_counter() - start)
+        self._no_returns.note(frame, slam.mapper.keyframes)
         self._saw(frame, T)
 
     def follow_parts(self, result: SlamResult) -> bool:
@@ -59,7 +62,7 @@ class LiveVolumes:
         since the last frame. Returns whether there were several parts."""
         kinds = {event.kind for event in result.loop_events}
         if "left out" in kinds or any(e.kind == "joined" and e.frame < 0 for e in result.loop_events):
-            self.maps.rebuild(_views(result.keyframes, self._objects))
+            self.maps.rebuild(self._views(result.keyframes))
         return "new part" in kinds
 
     def settle(self, known_ids: list[int]) -> None:
@@ -71,8 +74,7 @@ class LiveVolumes:
         known[known_ids] = True
         self.maps.relabel(np.where(known[ids], ids, 0).astype(np.uint16))
 
-
-def _views(keyframes: list[Keyframe], objects: bool) -> Iterator[PosedView]:
-    for keyframe in list(keyframes):
-        labels = keyframe.mask if objects else None
-        yield PosedView(keyframe.depth_m(), keyframe.camera, keyframe.T_world_camera, keyframe.color, labels)
+    def _views(self, keyframes: list[Keyframe]) -> Iterator[PosedView]:
+        for keyframe in list(keyframes):
+            depth, labels = self._no_returns.depth_of(keyframe), keyframe.mask if self._objects else None
+            yield PosedView(depth, keyframe.camera, keyframe.T_world_camera, keyframe.color, labels)

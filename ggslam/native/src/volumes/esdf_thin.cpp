@@ -3,6 +3,7 @@
 // crossing there. Where points were measured in a voxel and neither it nor a voxel at its faces has a crossing (which a
 // surface through the voxel would have), the points are the surface.
 #include <algorithm>
+#include <cstring>
 
 #include "volumes/esdf.hpp"
 
@@ -10,6 +11,14 @@ namespace ggslam::volumes {
 namespace {
 
 constexpr uint64_t kFirstColumn = 0x0101010101010101ull, kLastColumn = kFirstColumn << 7;
+
+// Which of 8 voxels are occupied: the highest bits of their hits.
+uint64_t occupied_bits(const uint8_t* hits) {
+  static_assert(kOccupied == 128 && kSide == 8);
+  uint64_t eight;
+  std::memcpy(&eight, hits, sizeof eight);
+  return ((eight & 0x8080808080808080ull) >> 7) * 0x0102040810204080ull >> 56;
+}
 
 // The mean of the middles of octants, from the voxel's centre.
 Site site_of(int voxel, uint8_t octants) {
@@ -31,12 +40,11 @@ Site site_of(int voxel, uint8_t octants) {
 void Esdf::add_thin(int32_t row, BlockSites& found) const {
   const BlockCoordinates at = table_.at(row);
   const int64_t held = tsdf_.find(at);
-  const VoxelBlock* voxels = held < 0 ? nullptr : tsdf_.voxels(tsdf_.block(held));
-  if (voxels == nullptr) return;
+  const PointBlock* points = held < 0 ? nullptr : tsdf_.points(tsdf_.block(held));
+  if (points == nullptr) return;
   uint64_t hit[kSide] = {};
-  for (int k = 0; k < kSide; ++k)
-    for (int v = 0; v < kSide * kSide; ++v)
-      hit[k] |= static_cast<uint64_t>(voxels->hits[k * kSide * kSide + v] >= kOccupied) << v;
+  for (int row = 0; row < kSide * kSide; ++row)
+    hit[row / kSide] |= occupied_bits(points->hits + row * kSide) << row % kSide * kSide;
   if (std::all_of(hit, hit + kSide, [](uint64_t word) { return word == 0; })) return;
   static constexpr uint64_t kNone[kSide] = {};
   const auto crossed = [&](int x, int y, int z) {
@@ -55,7 +63,7 @@ void Esdf::add_thin(int32_t row, BlockSites& found) const {
     found.known[k] |= hit[k];
     for (uint64_t thin = hit[k] & ~near; thin != 0; thin &= thin - 1) {
       const int voxel = k * kSide * kSide + __builtin_ctzll(thin);
-      found.sites.push_back(site_of(voxel, voxels->octants[voxel]));
+      found.sites.push_back(site_of(voxel, points->octants[voxel]));
     }
   }
   std::inplace_merge(found.sites.begin(), found.sites.begin() + static_cast<std::ptrdiff_t>(crossings),

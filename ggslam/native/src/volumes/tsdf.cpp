@@ -11,7 +11,8 @@ Tsdf::Tsdf(float voxel_, float truncation_, float max_weight_)
 }
 
 std::size_t Tsdf::bytes() const {
-  return pool_.size() * kChunk * sizeof(VoxelBlock) + blocks_.capacity() * sizeof(Block) + table_.bytes() +
+  const std::size_t chunk = kChunk * sizeof(VoxelBlock), of_points = kChunk * sizeof(PointBlock);
+  return pool_.size() * chunk + points_.size() * of_points + blocks_.capacity() * sizeof(Block) + table_.bytes() +
          free_slots_.capacity() * sizeof(int32_t);
 }
 
@@ -29,7 +30,7 @@ std::size_t Tsdf::insert(BlockCoordinates at) {
 VoxelBlock* Tsdf::densify(Block& block) {
   if (block.slot >= 0) return voxels(block);
   if (free_slots_.empty()) {
-    if (slots_used_ == pool_.size() * kChunk) pool_.emplace_back(new VoxelBlock[kChunk]);
+    if (slots_used_ == pool_.size() * kChunk) add_chunk();
     block.slot = static_cast<int32_t>(slots_used_++);
   } else {
     block.slot = free_slots_.back();
@@ -39,8 +40,21 @@ VoxelBlock* Tsdf::densify(Block& block) {
   *v = VoxelBlock{};
   std::fill_n(v->value, kVoxels, kFreeValue);
   std::fill_n(v->weight, kVoxels, block.free_weight);
-  std::fill_n(v->hits, kVoxels, static_cast<uint8_t>(block.free_weight > 0 ? kLeastHits : kNeverSeen));
+  if (PointBlock* p = points(block)) {
+    *p = PointBlock{};
+    std::fill_n(p->hits, kVoxels, static_cast<uint8_t>(block.free_weight > 0 ? kLeastHits : kNeverSeen));
+  }
   return v;
+}
+
+void Tsdf::add_chunk() {
+  pool_.emplace_back(new VoxelBlock[kChunk]);
+  if (counts_points_) points_.emplace_back(new PointBlock[kChunk]);
+}
+
+void Tsdf::count_points() {
+  counts_points_ = true;
+  while (points_.size() < pool_.size()) points_.emplace_back(new PointBlock[kChunk]());
 }
 
 void Tsdf::collapse(Block& block, uint16_t weight) {
@@ -59,6 +73,7 @@ void Tsdf::erase(std::size_t row) {
 void Tsdf::clear() {
   blocks_.clear();
   pool_.clear();
+  points_.clear();
   free_slots_.clear();
   slots_used_ = 0;
   table_.clear();

@@ -23,6 +23,10 @@ struct alignas(64) VoxelBlock {
   uint16_t label[kVoxels];   // 0: none
   uint8_t red[kVoxels], green[kVoxels], blue[kVoxels];
   uint8_t votes[kVoxels];    // for `label`, less those against it
+};
+
+// The measured points of a block, of maps that count them.
+struct alignas(64) PointBlock {
   uint8_t hits[kVoxels];     // evidence of measured points in the voxel, see below
   uint8_t octants[kVoxels];  // where in the voxel they lie: octant (x, y, z) is bit x + 2 y + 4 z
 };
@@ -67,6 +71,14 @@ class Tsdf {
     return block.slot < 0 ? nullptr : &pool_[block.slot / kChunk][block.slot % kChunk];
   }
 
+  // The same of its measured points; null, too, if the map does not count them.
+  PointBlock* points(const Block& block) const {
+    return block.slot < 0 || points_.empty() ? nullptr : &points_[block.slot / kChunk][block.slot % kChunk];
+  }
+  bool counts_points() const { return counts_points_; }
+  // From then on the map does; of what it has so far none are known.
+  void count_points();
+
   // Row of a block; -1 if there is none. Rows change when blocks are erased.
   int64_t find(BlockCoordinates at) const;
   // Row of a block, made (free throughout, never seen) if there is none.
@@ -80,9 +92,12 @@ class Tsdf {
   void clear();
 
  private:
+  void add_chunk();
   static constexpr int kChunk = 256;
   std::vector<Block> blocks_;
   std::vector<std::unique_ptr<VoxelBlock[]>> pool_;
+  std::vector<std::unique_ptr<PointBlock[]>> points_;  // as pool_, or none
+  bool counts_points_ = false;
   std::vector<int32_t> free_slots_;
   std::size_t slots_used_ = 0;
   BlockTable table_;  // rows of blocks_

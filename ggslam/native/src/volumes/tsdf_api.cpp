@@ -12,6 +12,7 @@ using ggslam::volumes::Block;
 using ggslam::volumes::BlockCoordinates;
 using ggslam::volumes::kFarthestBlock;
 using ggslam::volumes::kVoxels;
+using ggslam::volumes::PointBlock;
 using ggslam::volumes::Tsdf;
 using ggslam::volumes::VoxelArrays;
 using ggslam::volumes::VoxelBlock;
@@ -92,22 +93,27 @@ GGSLAM_EXPORT int ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at, c
   check_blocks(n, at, false);
   ggslam::object_of<VoxelArrays>(out);
   VoxelBlock plain{};
+  PointBlock no_points{};
   std::fill_n(plain.value, kVoxels, ggslam::volumes::kFreeValue);
   for (int64_t i = 0; i < n; ++i) {
     const int64_t row = map.find({at[3 * i], at[3 * i + 1], at[3 * i + 2]});
     const VoxelBlock* v = row < 0 ? nullptr : map.voxels(map.block(row));
+    const PointBlock* p = row < 0 ? nullptr : map.points(map.block(row));
     if (v == nullptr) {
       std::fill_n(plain.weight, kVoxels, row < 0 ? uint16_t{0} : map.block(row).free_weight);
-      const bool known = row >= 0 && map.block(row).free_weight > 0;
-      std::fill_n(plain.hits, kVoxels, static_cast<uint8_t>(known ? ggslam::volumes::kLeastHits : 0));
       v = &plain;
+    }
+    if (p == nullptr) {
+      const bool known = row >= 0 && map.counts_points() && map.block(row).free_weight > 0 && map.block(row).slot < 0;
+      std::fill_n(no_points.hits, kVoxels, static_cast<uint8_t>(known ? ggslam::volumes::kLeastHits : 0));
+      p = &no_points;
     }
     copy_out(out->value, i, v->value);
     copy_out(out->weight, i, v->weight);
     copy_out(out->label, i, v->label);
     copy_out(out->votes, i, v->votes);
-    copy_out(out->hits, i, v->hits);
-    copy_out(out->octants, i, v->octants);
+    copy_out(out->hits, i, p->hits);
+    copy_out(out->octants, i, p->octants);
     if (out->color == nullptr) continue;
     uint8_t* color = out->color + 3 * i * kVoxels;
     for (int k = 0; k < kVoxels; ++k)
@@ -120,6 +126,8 @@ GGSLAM_EXPORT int ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at, 
   Tsdf& map = tsdf(handle);
   check_blocks(n, at, true);
   ggslam::object_of<VoxelArrays>(in);
+  if (in->hits != nullptr && std::any_of(in->hits, in->hits + n * kVoxels, [](uint8_t h) { return h > 0; }))
+    map.count_points();
   ++map.revision;
   for (int64_t i = 0; i < n; ++i) {
     Block& block = map.block(map.insert({at[3 * i], at[3 * i + 1], at[3 * i + 2]}));
@@ -129,8 +137,7 @@ GGSLAM_EXPORT int ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at, 
     copy_in(v->weight, i, in->weight);
     copy_in(v->label, i, in->label);
     copy_in(v->votes, i, in->votes);
-    copy_in(v->hits, i, in->hits);
-    copy_in(v->octants, i, in->octants);
+    if (PointBlock* p = map.points(block)) copy_in(p->hits, i, in->hits), copy_in(p->octants, i, in->octants);
     if (in->color == nullptr) continue;
     const uint8_t* color = in->color + 3 * i * kVoxels;
     for (int k = 0; k < kVoxels; ++k)

@@ -16,7 +16,8 @@ GGSLAM_DECLARE_KERNEL(void tsdf_erode_column(const float* rows, int width, int h
 GGSLAM_DECLARE_KERNEL(void tsdf_pack_color(const uint8_t* color, std::size_t begin, std::size_t end, int32_t* out))
 GGSLAM_DECLARE_KERNEL(unsigned tsdf_fuse_block(const volumes::VoxelUpdate& update, volumes::VoxelBlock& block))
 GGSLAM_DECLARE_KERNEL(void tsdf_octants_of_row(const volumes::OctantRow& row))
-GGSLAM_DECLARE_KERNEL(unsigned tsdf_decay_block(volumes::VoxelBlock& block, float factor, int least))
+GGSLAM_DECLARE_KERNEL(unsigned tsdf_decay_block(volumes::VoxelBlock& block, volumes::PointBlock* points, float factor,
+                                                int least))
 
 namespace ggslam::volumes {
 namespace {
@@ -67,7 +68,7 @@ void prepare(const FusionInput& in, const FusionSettings& settings, float trunca
   DepthPyramid::Level& base = pyramid.levels[0];
   base.width = columns, base.height = rows;
   base.tiles.resize(static_cast<std::size_t>(columns) * rows);
-  images.depth.resize(pixels + in.width + 1), images.eroded_rows.resize(pixels);
+  images.depth.resize(pixels + in.width + OctantRow::kSlack), images.eroded_rows.resize(pixels);
   if (in.color != nullptr) images.color.resize(pixels);
   const std::size_t stride = columns + 1;
   pyramid.valid.assign(stride * (rows + 1), 0);
@@ -156,39 +157,82 @@ std::size_t make_blocks(Tsdf& map, const FusionSettings& settings, FusionScratch
   return first;
 }
 
-// Marks the octants of a row's points in the listed blocks; `corner`: the block that they are counted from.
-void mark_row(const Tsdf& map, FusionScratch& scratch, const OctantRow& row, const Vec3i& corner) {
-  const int32_t *x = row.out[0], *y = row.out[1], *z = row.out[2];
-  const float *depth = row.depth, farthest = row.max_depth;
-  constexpr int32_t kNowhere = std::numeric_limits<int32_t>::max();
-  Vec3i block = Vec3i::all(kNowhere);
-  int32_t last_x = kNowhere, last_y = kNowhere, last_z = kNowhere;
-  uint8_t* octants = nullptr;
-  for (int u = 0, width = row.width; u < width; ++u) {
-    if (x[u] == last_x && y[u] == last_y && z[u] == last_z) continue;
-    if (!(depth[u] > 0 && depth[u] <= farthest)) continue;
-    last_x = x[u], last_y = y[u], last_z = z[u];
-    const Vec3i of{{last_x >> 4, last_y >> 4, last_z >> 4}};
-    if (!(of == block)) {
-      block = of;
-      const int64_t found = map.find({corner[0] + of[0], corner[1] + of[1], corner[2] + of[2]});
-      const int32_t n = found < 0 ? -1 : scratch.update_of_row[found];
-      octants = n < 0 ? nullptr : scratch.octants.data() + static_cast<std::size_t>(n) * kVoxels;
-    }
-    if (octants == nullptr) continue;
-    const int voxel = (last_x >> 1 & 7) + (last_y >> 1 & 7) * kSide + (last_z >> 1 & 7) * kSide * kSide;
-    const auto bit = static_cast<uint8_t>(1 << ((last_x & 1) + 2 * (last_y & 1) + 4 * (last_z & 1)));
-    if (!(__atomic_load_n(octants + voxel, __ATOMIC_RELAXED) & bit))
-      __atomic_fetch_or(octants + voxel, bit, __ATOMIC_RELAXED);
+// Where the octants of a block are marked; as long as one block follows another of a few, the table is not asked.
+class MarkedBlocks {
+ public:
+  MarkedBlocks(const Tsdf& map, FusionScratch& scratch, const Vec3i& corner)
+      : map_(map), scratch_(scratch), corner_(corner) {}
+
+  // Null: the block is not listed. `x`, `y`, `z`: blocks from the corner.
+  uint8_t* octants(int32_t x, int32_t y, int32_t z) {
+    Place& place = places_[(x + 3 * y + 5 * z) & (kPlaces - 1)];
+    if (place.known && place.x == x && place.y == y && place.z == z) return place.octants;
+    const int64_t found = map_.find({corner_[0] + x, corner_[1] + y, corner_[2] + z});
+    const int32_t n = found < 0 ? -1 : scratch_.update_of_row[found];
+    place = {true, x, y, z, n < 0 ? nullptr : scratch_.octants.data() + static_cast<std::size_t>(n) * kVoxels};
+    if (n >= 0) __atomic_store_n(&scratch_.marked[n], 1, __ATOMIC_RELAXED);
+    return place.octants;
   }
+
+ private:
+  static constexpr int kPlaces = 64;
+  struct Place {
+    bool known = false;
+    int32_t x, y, z;
+    uint8_t* octants;
+  };
+  const Tsdf& map_;
+  FusionScratch& scratch_;
+  const Vec3i corner_;
+  Place places_[kPlaces];
+};
+
+// Marks the octants of a row's points.
+void mark_row(const OctantRow& row, bool alone, MarkedBlocks& blocks) {
+  for (int begin = 0; begin < row.width; begin += 64)
+    for (uint64_t fresh = row.fresh[begin / 64]; fresh != 0; fresh &= fresh - 1) {
+      const int u = begin + __builtin_ctzll(fresh);
+      const int32_t x = row.out[0][u], y = row.out[1][u], z = row.out[2][u];
+      uint8_t* octants = blocks.octants(x >> 4, y >> 4, z >> 4);
+      if (octants == nullptr) continue;
+      octants += (x >> 1 & 7) + (y >> 1 & 7) * kSide + (z >> 1 & 7) * kSide * kSide;
+      const auto bit = static_cast<uint8_t>(1 << ((x & 1) + 2 * (y & 1) + 4 * (z & 1)));
+      if (alone)
+        *octants |= bit;
+      else if (!(__atomic_load_n(octants, __ATOMIC_RELAXED) & bit))
+        __atomic_fetch_or(octants, bit, __ATOMIC_RELAXED);
+    }
 }
+
+// Octants of two rows, one above the other, that take turns.
+class OctantRows {
+ public:
+  explicit OctantRows(int width)
+      : stride_(width + 1 + OctantRow::kSlack), values_(6 * stride_, OctantRow::kNone), fresh_((width + 63) / 64) {}
+
+  void next(OctantRow& row) {
+    turn_ ^= 1;
+    for (int a = 0; a < 3; ++a) {
+      row.out[a] = values_.data() + (3 * turn_ + a) * stride_ + 1;
+      row.above[a] = values_.data() + (3 * (turn_ ^ 1) + a) * stride_ + 1;
+    }
+    row.fresh = fresh_.data();
+  }
+
+ private:
+  std::size_t stride_;
+  std::vector<int32_t> values_;
+  std::vector<uint64_t> fresh_;
+  std::size_t turn_ = 0;
+};
 
 // Marks the octants of the listed blocks' voxels that the view has points in.
 void mark_points(const Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context,
                  FusionScratch& scratch) {
   constexpr int kOctants = 2 * kSide;  // along the edge of a block
-  scratch.octants.assign(scratch.updates.size() * kVoxels, 0);
-  scratch.update_of_row.assign(map.size(), -1);
+  scratch.octants.resize(std::max(scratch.octants.size(), scratch.updates.size() * kVoxels), 0);
+  scratch.marked.assign(scratch.updates.size(), 0);
+  scratch.update_of_row.resize(std::max(scratch.update_of_row.size(), map.size()), -1);
   for (std::size_t n = 0; n < scratch.updates.size(); ++n)
     scratch.update_of_row[scratch.updates[n].row] = static_cast<int32_t>(n);
   const Mat3d axes = Mat3d::from(in.rotation).transpose();
@@ -199,10 +243,11 @@ void mark_points(const Tsdf& map, const FusionInput& in, const FusionSettings& s
   common.width = in.width, common.max_depth = settings.max_depth;
   cast<float>(kOctants * (position - cast<double>(corner))).to(common.origin);
   const auto kernel = GGSLAM_DISPATCH(context.isa, tsdf_octants_of_row);
-  context.pool.parallel_for(in.height, 8, [&](std::size_t begin, std::size_t end, int) {
-    std::vector<int32_t> found(3 * static_cast<std::size_t>(in.width));
+  const bool alone = context.pool.size() == 1;
+  context.pool.parallel_for(in.height, 32, [&](std::size_t begin, std::size_t end, int) {
+    MarkedBlocks blocks(map, scratch, corner);
+    OctantRows rows(in.width);
     OctantRow row = common;
-    for (int a = 0; a < 3; ++a) row.out[a] = found.data() + static_cast<std::size_t>(a) * in.width;
     for (std::size_t v = begin; v < end; ++v) {
       row.depth = scratch.images.depth.data() + v * in.width;
       for (int a = 0; a < 3; ++a) {
@@ -210,10 +255,12 @@ void mark_points(const Tsdf& map, const FusionInput& in, const FusionSettings& s
         row.first[a] = static_cast<float>((axes(a, 0) * (-in.cx / in.fx) + axes(a, 1) * y + axes(a, 2)) / octant);
         row.step[a] = static_cast<float>(axes(a, 0) / in.fx / octant);
       }
+      rows.next(row);
       kernel(row);
-      mark_row(map, scratch, row, corner);
+      mark_row(row, alone, blocks);
     }
   });
+  for (const FusionScratch::Update& update : scratch.updates) scratch.update_of_row[update.row] = -1;
 }
 
 void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context,
@@ -238,7 +285,8 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
       FusionScratch::Update& update = scratch.updates[n];
       const Vec3d p = map.voxel * (kSide * cast<double>(vector_of(update.at)) + Vec3d::all(0.5));
       cast<float>(rotation * p + Vec3d::from(in.translation)).to(own.origin);
-      own.octants = scratch.octants.data() + n * kVoxels;
+      own.points = map.points(map.block(update.row));
+      own.octants = own.points != nullptr && scratch.marked[n] ? scratch.octants.data() + n * kVoxels : nullptr;
       update.flags = kernel(own, *update.voxels);
     }
   });
@@ -273,10 +321,11 @@ void finish_blocks(Tsdf& map, FusionScratch& scratch, FusionStats& stats) {
 // voxels serve those that follow.
 void fuse(Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context, FusionScratch& scratch,
           FusionStats& stats) {
+  if (settings.points) map.count_points();
   scratch.gone.clear();
   for (std::size_t first = 0; first < scratch.candidates.size();) {
     first = make_blocks(map, settings, scratch, stats, first);
-    mark_points(map, in, settings, context, scratch);
+    if (map.counts_points()) mark_points(map, in, settings, context, scratch);
     update_blocks(map, in, settings, context, scratch);
     finish_blocks(map, scratch, stats);
     stats.updated += scratch.updates.size();
@@ -316,7 +365,7 @@ int64_t decay(Tsdf& map, FusionScratch& scratch, Context& context, float factor,
         scratch.emptied[row] = block.free_weight == 0;
         continue;
       }
-      const unsigned flags = kernel(*map.voxels(block), factor, least);
+      const unsigned flags = kernel(*map.voxels(block), map.points(block), factor, least);
       if (flags & kChanged) block.revision = map.revision;
       scratch.emptied[row] = (flags & kNoneSeen) != 0;
     }

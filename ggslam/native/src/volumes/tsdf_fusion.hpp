@@ -144,17 +144,22 @@ struct VoxelUpdate {
   float max_depth;         // depth beyond it tells of free space alone
   float weight_scale;      // 65535 / largest weight
   float max_free_weight;   // in 65535ths of the largest
-  const uint8_t* octants;  // [kVoxels], those of the block that the view has points in
+  PointBlock* points;      // of the block; null: not counted
+  uint8_t* octants;        // [kVoxels], those of the block that the view has points in, which are cleared; null: none
 };
 
 // A row of the depth image as octants of voxels from a corner of blocks: at depth z of column u they are floor(origin + z
 // (first + u step)) along the map's axes.
 struct OctantRow {
+  static constexpr int32_t kNone = INT32_MIN;
+  static constexpr int kSlack = 16;  // so many elements after a row's may be read, and written in `out`
   const float* depth;
   int width;
   float max_depth;  // farther depth is none
   float origin[3], first[3], step[3];
-  int32_t* out[3];  // [width]; where there is no depth they may be anything
+  const int32_t* above[3];  // [width], octants of the row before
+  int32_t* out[3];          // [width], with kNone before the first; the first axis: kNone where there is no depth
+  uint64_t* fresh;          // bits: whether a pixel has an octant, which is not that of the pixel on its left or above it
 };
 
 FusionStats integrate(Tsdf& map, FusionScratch& scratch, Context& context, const FusionInput& input,

@@ -27,7 +27,8 @@ struct FusionScratch {
   std::vector<BlockCoordinates> gone;
   std::vector<uint8_t> emptied;
   std::vector<int32_t> update_of_row;  // number of a block's update; -1: none
-  std::vector<uint8_t> octants;        // [updates, kVoxels], those that the view has points in
+  std::vector<uint8_t> octants;        // [updates, kVoxels], those that the view has points in; else zero
+  std::vector<uint8_t> marked;         // [updates], whether there are any
 };
 
 }  // namespace ggslam::volumes

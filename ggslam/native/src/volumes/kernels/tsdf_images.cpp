@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <limits>
 
+#include "common/kernels/simd.hpp"
 #include "volumes/tsdf_fusion.hpp"
 
 namespace ggslam::GGSLAM_ISA {
@@ -68,18 +69,36 @@ void tsdf_erode_column(const float* rows, int width, int height, int v, float* o
 }
 
 void tsdf_octants_of_row(const volumes::OctantRow& row) {
-  const int width = row.width;
-  const float max_depth = row.max_depth;
-  const float* __restrict depth = row.depth;
-  for (int a = 0; a < 3; ++a) {
-    const float origin = row.origin[a], first = row.first[a], step = row.step[a];
-    int32_t* __restrict out = row.out[a];
-    for (int u = 0; u < width; ++u) {
-      const float z = std::min(depth[u], max_depth);
-      const float x = origin + z * (first + static_cast<float>(u) * step);
-      const int32_t whole = static_cast<int32_t>(x);
-      out[u] = whole - (x < static_cast<float>(whole) ? 1 : 0);  // std::floor is not vectorised
+  constexpr std::int32_t kNone = volumes::OctantRow::kNone;
+  static_assert(kLanes <= volumes::OctantRow::kSlack && 64 % kLanes == 0);
+  const Float max_depth = broadcast(row.max_depth), one = broadcast(1.0f);
+  for (int u = 0; u < row.width; u += kLanes) {
+    const Float depth = load(row.depth + u), column = lane_numbers() + static_cast<float>(u);
+    const Mask known = both(greater(depth, Float{}), greater_equal(max_depth, depth));
+    const Float z = zero_unless(known, depth);
+    for (int a = 0; a < 3; ++a) {
+      const Float x = row.origin[a] + z * (row.first[a] + column * row.step[a]);
+      const Float whole = to_float(truncate(x));
+      const Int octant = truncate(whole - zero_unless(greater(whole, x), one));
+      store_int(row.out[a] + u, a > 0 ? octant : select_int(known, octant, broadcast_int(kNone)));
     }
+  }
+  const Int minus = broadcast_int(-1);
+  for (int begin = 0; begin < row.width; begin += 64) {
+    std::uint64_t word = 0;
+    for (int u = begin; u < row.width && u < begin + 64; u += kLanes) {
+      Int left{}, above{};
+      for (int a = 0; a < 3; ++a) {
+        const Int octant = load_int(row.out[a] + u);
+        left |= octant ^ load_int(row.out[a] + u - 1), above |= octant ^ load_int(row.above[a] + u);
+      }
+      left |= -left, above |= -above;  // negative unless zero
+      const Mask known = greater_equal_int(load_int(row.out[0] + u), broadcast_int(kNone + 1));
+      const Mask differs = both(greater_equal_int(minus, left), greater_equal_int(minus, above));
+      word |= static_cast<std::uint64_t>(bits(both(known, differs))) << (u - begin);
+    }
+    const int rest = row.width - begin;
+    row.fresh[begin / 64] = rest < 64 ? word & ((std::uint64_t{1} << rest) - 1) : word;
   }
 }
 

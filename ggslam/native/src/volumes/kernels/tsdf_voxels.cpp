@@ -17,6 +17,8 @@ using volumes::VoxelBlock;
 using volumes::VoxelUpdate;
 
 constexpr float kSurprise = 0.5f;           // of the truncation: how far depth must contradict a voxel to clear it
+constexpr float kDoubt = 0.03f;             // of a voxel's depth: passing it by so little more proves nothing
+constexpr float kDoubtfulShare = 0.03f;     // of the voxel's weight that what proves nothing counts at most
 constexpr float kFreeFrom = 0.98f * kFreeValue;  // a voxel seen as free counts as free from this value on
 constexpr float kRangeSlack = 1.00001f;     // of the range: rounding when depth is added up again
 constexpr float kLabelVoxels = 2.0f;        // labels are told to voxels this near to the surface
@@ -109,47 +111,58 @@ void interpolate(const VoxelUpdate& t, Group& g) {
   g.distance = select(smooth, top + y * (bottom - top) - g.z, g.distance);
 }
 
-// Weights after clearing: voxels that the view looks through, with all pixels around, lose a share.
-Float cleared(const VoxelUpdate& t, const Group& g, Mask through, Float weight) {
-  through = both(through, greater_equal(gather(t.eroded, g.pixel), g.z + t.truncation));
-  return select(through, rounded(weight * (1 - t.clearing)), weight);
+// Clears voxels that the view surely looks through, with all pixels around and by more than the depth is wrong: they lose a
+// share of their weight. At edges and by less, poses and depth may be at fault as well: the measurement counts little.
+void clear(const VoxelUpdate& t, const Group& g, Mask through, Float& weight, Float& measured) {
+  const Float needed = g.z * (1 + kDoubt) + t.truncation;
+  const Mask sure = both(through, greater_equal(gather(t.eroded, g.pixel), needed));
+  const Float little = minimum(measured, maximum(broadcast(1.0f), rounded(weight * kDoubtfulShare)));
+  measured = select(neither_of(through, sure), little, measured);
+  weight = select(sure, rounded(weight * (1 - t.clearing)), weight);
 }
 
-// Whether kLanes bytes are all the same as one that is repeated in a word.
-bool all_are(const std::uint8_t* bytes, std::uint64_t repeated) {
-  static_assert(kLanes == 4 || kLanes % 8 == 0);
-  std::uint64_t other = 0, word = 0;
-  constexpr int kStep = kLanes < 8 ? kLanes : 8;
-  for (int lane = 0; lane < kLanes; lane += kStep) {
-    std::memcpy(&word, bytes + lane, kStep);
-    other |= word ^ (kStep < 8 ? repeated & 0xffffffffu : repeated);
+typedef std::uint8_t Bytes __attribute__((vector_size(4 * kLanes), aligned(1), may_alias));
+constexpr int kBytes = 4 * kLanes;
+
+static inline Bytes every(std::uint8_t byte) { return byte - Bytes{}; }
+static inline Bytes& bytes_at(std::uint8_t* p) { return *reinterpret_cast<Bytes*>(p); }
+static inline Bytes choose(Bytes mask, Bytes a, Bytes b) { return (a & mask) | (b & ~mask); }
+static inline bool any_byte(const Bytes& v) {
+  std::uint64_t words[kBytes / 8], all = 0;
+  std::memcpy(words, &v, kBytes);
+  for (std::uint64_t word : words) all |= word;
+  return all != 0;
+}
+
+// Counts hits and misses of the voxels. Returns whether what is occupied changed.
+bool count_points(const VoxelUpdate& t, const Work& w) {
+  volumes::PointBlock& block = *t.points;
+  const Bytes least = every(volumes::kLeastHits), most = every(volumes::kMostHits), occupied = every(volumes::kOccupied);
+  if (t.octants == nullptr) {
+    Bytes other{};
+    for (int k = 0; k < kVoxels; k += kBytes) other |= bytes_at(block.hits + k) ^ least;
+    if (!any_byte(other)) return false;  // misses have nothing to take away
   }
-  return other == 0;
-}
-
-constexpr std::uint64_t kAllEmpty = 0x0101010101010101u * volumes::kLeastHits;
-
-// Counts hits and misses of the voxels from `first` on. Returns whether there are hits.
-bool count_points(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block, Mask& changed) {
-  const bool none = all_are(t.octants + first, 0);
-  if (none && (all_are(block.hits + first, kAllEmpty) || !any(greater_equal(g.distance, broadcast(t.voxel)))))
-    return false;
-  const Int old = load_widened(block.hits + first), octants = load_widened(block.octants + first);
-  const Int now = load_widened(t.octants + first);
-  const Float before = to_float(old), start = select(greater(before, Float{}), before, broadcast(volumes::kOccupied));
-  const Mask hit = greater(to_float(now), Float{});
-  const Mask miss = neither_of(greater_equal(g.distance, broadcast(t.voxel)), hit);
-  const Float up = minimum(start + broadcast(volumes::kHit), broadcast(volumes::kMostHits));
-  const Float down = maximum(start - broadcast(volumes::kMiss), broadcast(volumes::kLeastHits));
-  const Float after = select(hit, up, select(miss, down, before));
-  const Mask was = greater_equal(before, broadcast(volumes::kOccupied));
-  const Mask is = greater_equal(after, broadcast(volumes::kOccupied));
-  const Float kept = select(either(hit, is), to_float(octants | now), Float{});
-  const Mask grown = both(is, greater(kept, to_float(octants)));
-  changed = either(changed, either(grown, either(neither_of(is, was), neither_of(was, is))));
-  store_narrowed(block.hits + first, truncate(after));
-  store_narrowed(block.octants + first, truncate(kept));
-  return !none;
+  alignas(64) std::uint8_t missed[kVoxels];
+  const Float far = broadcast(t.voxel), one = broadcast(1.0f);
+  for (int n = 0; n < kGroups; ++n)
+    store_narrowed(missed + n * kLanes, truncate(zero_unless(greater_equal(w.groups[n].distance, far), one)));
+  Bytes changed{};
+  for (int k = 0; k < kVoxels; k += kBytes) {
+    const Bytes before = bytes_at(block.hits + k), octants = bytes_at(block.octants + k);
+    const Bytes now = t.octants == nullptr ? Bytes{} : bytes_at(t.octants + k);
+    const Bytes hit = (Bytes)(now != 0), miss = (Bytes)(bytes_at(missed + k) != 0);
+    const Bytes start = choose((Bytes)(before == volumes::kNeverSeen), occupied, before);
+    const Bytes up = start + std::uint8_t{volumes::kHit}, down = start - std::uint8_t{volumes::kMiss};
+    const Bytes after = choose(hit, choose((Bytes)(up < most), up, most),
+                               choose(miss, choose((Bytes)(down > least), down, least), before));
+    const Bytes is = (Bytes)(after >= occupied), was = (Bytes)(before >= occupied);
+    const Bytes kept = (now | octants) & (hit | is);
+    changed |= (is ^ was) | (is & kept & ~octants);
+    bytes_at(block.hits + k) = after, bytes_at(block.octants + k) = kept;
+  }
+  if (t.octants != nullptr) std::memset(t.octants, 0, kVoxels);
+  return any_byte(changed);
 }
 
 // Averages values and weights.
@@ -159,7 +172,7 @@ void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& chan
   const Float truncation = broadcast(t.truncation), one = broadcast(1.0f), full = broadcast(kFreeValue);
   const Float distance = g.distance;
   const Float drop = minimum((distance + t.truncation) * (1.0f / (t.truncation - t.voxel)), one);
-  const Float measured = minimum(rounded(t.weight_scale * g.inverse * g.inverse * drop), broadcast(kFullWeight));
+  Float measured = minimum(rounded(t.weight_scale * g.inverse * g.inverse * drop), broadcast(kFullWeight));
   const Int old_value = load_widened(block.value + first), old_weight = load_widened(block.weight + first);
   const Float value = to_float(old_value);
   Float weight = to_float(old_weight);
@@ -174,7 +187,7 @@ void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& chan
   const Float scaled = (kFreeValue / t.truncation) * distance;
   const Mask surface = both(greater(weight, Float{}), greater(broadcast(kFreeFrom), value));
   const Mask through = both(both(behind, surface), greater(scaled - value, full * kSurprise));
-  if (t.eroded != nullptr && any(through)) weight = cleared(t, g, through, weight);
+  if (t.eroded != nullptr && any(through)) clear(t, g, through, weight, measured);
 
   const Float total = weight + measured, share = measured / total;
   Float mean = value + share * (minimum(scaled, full) - value);
@@ -234,14 +247,17 @@ bool vote(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block) {
   return changed;
 }
 
-unsigned summary(const VoxelBlock& block) {
+unsigned summary(const VoxelBlock& block, const volumes::PointBlock* points) {
   int weights = 0, unseen = 0, occupied = 0;
   for (int k = 0; k < kVoxels; ++k) {
-    const int hit = block.hits[k] >= volumes::kOccupied;
-    weights |= block.weight[k] | hit;
+    weights |= block.weight[k];
     unseen |= block.weight[k] == 0;
-    occupied |= (block.value[k] != kFreeValue) | hit;
+    occupied |= block.value[k] != kFreeValue;
   }
+  std::uint8_t hits = 0;
+  for (int k = 0; points != nullptr && k < kVoxels; ++k) hits |= points->hits[k];
+  static_assert(volumes::kOccupied == 128 && volumes::kMostHits < 256);  // the highest bit
+  if (hits & volumes::kOccupied) return 0;
   return (weights == 0 ? volumes::kNoneSeen : 0u) | (unseen == 0 && occupied == 0 ? volumes::kAllFree : 0u);
 }
 
@@ -249,40 +265,41 @@ unsigned summary(const VoxelBlock& block) {
 
 // Returns what happened, in bits.
 unsigned tsdf_fuse_block(const VoxelUpdate& t, VoxelBlock& block) {
+  if (t.points != nullptr)  // lie elsewhere, and are needed last
+    for (std::size_t at = 0; at < sizeof *t.points; at += 64) __builtin_prefetch(reinterpret_cast<const char*>(t.points) + at, 1);
   Work w;
   project(t, w);
   for (int n = 0; n < w.near.count; ++n) interpolate(t, w.groups[w.near.group[n]]);
   Mask changed{};
   for (int n = 0; n < w.seen.count; ++n) average(t, w, w.seen.group[n], block, changed);
-  bool points = false;
-  for (int n = 0; n < kGroups; ++n) points |= count_points(t, w.groups[n], n * kLanes, block, changed);
-  bool relabelled = false;
+  const bool points = t.octants != nullptr;
+  bool relabelled = t.points != nullptr && count_points(t, w);
   for (int n = 0; n < w.band.count; ++n) {
     const int first = w.band.group[n] * kLanes;
     if (t.color != nullptr) paint(t, w.groups[w.band.group[n]], first, block);
     if (t.labels != nullptr) relabelled |= vote(t, w.groups[w.band.group[n]], first, block);
   }
   return (relabelled || any(changed) ? volumes::kChanged : 0u) | (w.band.count > 0 || points ? volumes::kInBand : 0u) |
-         summary(block);
+         summary(block, t.points);
 }
 
 // Multiplies the weights; voxels whose weight falls below `least` are forgotten. Returns what happened, in bits.
-unsigned tsdf_decay_block(VoxelBlock& block, float factor, int least) {
+unsigned tsdf_decay_block(VoxelBlock& block, volumes::PointBlock* points, float factor, int least) {
   unsigned flags = 0;
   for (int k = 0; k < kVoxels; ++k) {
     const int weight = static_cast<int>(block.weight[k] * factor + 0.5f);
     const bool forgotten = weight < least && block.weight[k] > 0;
     block.weight[k] = weight < least ? 0 : static_cast<std::uint16_t>(weight);
-    if (block.weight[k] == 0) {
-      flags |= block.hits[k] >= volumes::kOccupied ? volumes::kChanged : 0u;
-      block.hits[k] = block.octants[k] = 0;
+    if (block.weight[k] == 0 && points != nullptr) {
+      flags |= points->hits[k] >= volumes::kOccupied ? volumes::kChanged : 0u;
+      points->hits[k] = points->octants[k] = 0;
     }
     if (!forgotten) continue;
     block.value[k] = kFreeValue, block.label[k] = 0, block.votes[k] = 0;
     block.red[k] = block.green[k] = block.blue[k] = 0;
     flags |= volumes::kChanged;
   }
-  return flags | summary(block);
+  return flags | summary(block, points);
 }
 
 }  // namespace ggslam::GGSLAM_ISA
