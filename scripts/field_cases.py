@@ -190,6 +190,10 @@ _POINTS = (
     "from ggslam.formats.point_cloud import read_point_cloud as r; import numpy as n; c = r('{file}'); "
     "print('read', int(n.isfinite(c.points).all(1).sum()))"
 )
+_SCAN = (
+    "from pathlib import Path; from ggslam.formats.cloud_files import read_cloud_file as r; "
+    "print('read', len(r(Path('{file}')).points))"
+)
 _SPLATS = (
     "g = ggslam.read_splats('{file}'); import torch as t; "
     "ok = all(bool(t.isfinite(a).all()) for a in (g.means, g.scales, g.opacities)); "
@@ -264,6 +268,9 @@ CASES = (
     _count("splat_bad_vertex", "nan_opacity.ply", _SPLATS, "read without the bad ones", 1, 10**6),
     _count("splat_bad_vertex", "zero_quat.ply", _SPLATS, "read without the bad ones", 1, 10**6),
     _count("splat_bad_vertex", "2dgs.ply", _SPLATS, "read, flat ones clamped", 1, 10**6),
+    _count("nuscenes_columns", "000000.pcd.bin", _SCAN, "16000 points of five columns", 16000, 16000),
+    Case("utm_map", ("-c", "exec(open('{case}/tsdf_mesh.py').read())"), "38 distinct y",
+         mended=(Between(rf"463000.*x lattice distinct {NUMBER}", 38, 38),), below="maps", label="mesh"),
     Case("sh_turn", ("-c", _TURN), "colours turn along: 0.00",
          mended=(Between(rf"drawn {NUMBER}", 0.1, 9), Between(rf"differs by {NUMBER}", 0, 0.01)), below="maps"),
     Case("ghost_beyond_max_depth", ("-c", "exec(open('{case}/ghost.py').read())"), "free at 1.2 and 1.4 m",
