@@ -60,9 +60,9 @@ def parse_pcd(data: bytes, path: str | Path) -> np.ndarray:
     return rows[wanted]
 
 
-def read_viewpoint(path: str | Path) -> np.ndarray:
-    """The pose of the sensor in the header of a PCD file (VIEWPOINT), T_world_sensor float64 [4, 4]. The points are as
-    the sensor saw them.
+def read_viewpoint(path: str | Path) -> np.ndarray | None:
+    """The pose of the sensor in the header of a PCD file (VIEWPOINT), T_world_sensor float64 [4, 4]; None: the header
+    has none. The points are as the sensor saw them.
 
     Raises:
         FormatError: the file is missing, no PCD file, or the pose is none; names file and reason.
@@ -70,7 +70,9 @@ def read_viewpoint(path: str | Path) -> np.ndarray:
     path = Path(path)
     with open_foreign(path) as file:
         lines, _ = _header_lines(file.read(_MAXIMUM_HEADER_BYTES), path)
-    words = lines.get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
+    words = lines.get("VIEWPOINT")
+    if words is None:
+        return None
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError:

@@ -3,7 +3,7 @@
 
     TUM         timestamp tx ty tz qx qy qz qw
     matrices    a row each, KITTI's 3x4 or Replica's 4x4
-    EuRoC       timestamp[ns],px,py,pz,qw,qx,qy,qz, with or without what follows
+    EuRoC       timestamp[ns],px,py,pz,qw,qx,qy,qz, with or without what follows; or as its header orders them
     g2o         pose graphs, VERTEX_SE3:QUAT number x y z qx qy qz qw
 
 Poses are camera to world. The quaternion order xyzw exists only in TUM and g2o files; in memory it is wxyz. Times since
@@ -147,13 +147,30 @@ def read_euroc(path: str | Path) -> Trajectory:
         FormatError: as `read_tum`.
     """
     times, poses = [], []
-    for where, numbers in _rows(Path(path), (8, 11, 17), ","):
+    order = _quaternion_order(Path(path))
+    for where, numbers in _rows(Path(path), None, ","):
+        if len(numbers) < 8:
+            raise FormatError(f"{where}: expected 8 columns or more, found {len(numbers)}")
         _check_finite(where, numbers[:8])
         times.append(numbers[0])
-        poses.append(_pose(where, numbers[1:4], numbers[[5, 6, 7, 4]]))
+        poses.append(_pose(where, numbers[1:4], numbers[order]))
     if not poses:
         raise FormatError(f"{path}: no poses in it")
     return Trajectory(_seconds(np.array(times)), np.stack(poses))
+
+
+def _quaternion_order(path: Path) -> list[int]:
+    """The columns of x, y, z and w as the table's header names them (q_RS_w [], qw); without a header w comes first."""
+    names = _head(path).split(",")
+    of = {n[-1]: column for column, name in enumerate(names) if (n := name.split("[")[0].strip().lower())[:1] == "q"}
+    told = set(of) == set("xyzw") and set(of.values()) == {4, 5, 6, 7}
+    return [of[axis] for axis in "xyzw"] if told else [5, 6, 7, 4]
+
+
+def _head(path: Path) -> str:
+    """The first line of a table if it has names, else nothing."""
+    first = read_foreign_text(path).lstrip().split("\n", 1)[0].lstrip("# ")
+    return "" if first[:1].isdigit() else first
 
 
 def read_g2o(path: str | Path) -> Trajectory:
@@ -181,15 +198,17 @@ def read_g2o(path: str | Path) -> Trajectory:
     return Trajectory(np.array(order, float), np.stack([found[number] for number in order]))
 
 
-def _rows(path: Path, columns: tuple[int, ...], between: str | None = None) -> Iterator[tuple[str, np.ndarray]]:
-    """("file, line n", numbers) of each line with content; the number of columns must be one of `columns`; `between`:
-    what stands between them, None: space."""
+def _rows(
+    path: Path, columns: tuple[int, ...] | None, between: str | None = None
+) -> Iterator[tuple[str, np.ndarray]]:
+    """("file, line n", numbers) of each line with content; the number of columns must be one of `columns` (None: any);
+    `between`: what stands between them, None: space. The names above a table are passed over."""
     for number, line in enumerate(read_foreign_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split(between)
-        if not "".join(words).strip():
+        if not "".join(words).strip() or (number == 1 and between == "," and words[0].strip()[:1].isalpha()):
             continue
         where = f"{path}, line {number}"
-        if len(words) not in columns:
+        if columns is not None and len(words) not in columns:
             expected = " or ".join(map(str, columns))
             raise FormatError(f"{where}: expected {expected} columns, found {len(words)}")
         yield where, _numbers(where, words)

@@ -111,5 +111,11 @@ def _viewpoints(files: list[Path]) -> np.ndarray | None:
     """Poses that the scans' own files tell, [n, 4, 4]; None where they tell nothing."""
     if any(file.suffix.lower() != ".pcd" for file in files):
         return None
-    poses = np.array([read_viewpoint(file) for file in files])
-    return None if (poses == np.eye(4)).all() else poses
+    found = [read_viewpoint(file) for file in files]
+    poses = np.array([np.eye(4) if T is None else T for T in found])
+    if (poses == np.eye(4)).all():
+        return None
+    for file, T in zip(files, found, strict=True):
+        if T is None:
+            raise SequenceError(f"{file}: has no VIEWPOINT, and other scans beside it have one: where was it made?")
+    return poses

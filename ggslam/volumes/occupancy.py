@@ -160,7 +160,8 @@ class OccupancyMap:
             depth: [H, W], metres along the optical axis; 0: none; +inf: the sensor found nothing (REP 117).
             T_world_camera: float64 [4, 4].
             max_range: metres from the camera; rays to farther points end there, without a hit.
-            min_depth, max_depth: pixels outside are left out, metres.
+            min_depth, max_depth: pixels outside are left out, metres: they free nothing, either. Where all that is
+                measured is to free space, `max_range` is the limit.
             free_depth: pixels of +inf free space up to this depth along the optical axis; None: up to `max_range`, and
                 nothing if that is None, too.
 
