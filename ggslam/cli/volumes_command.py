@@ -53,8 +53,8 @@ Occupancy = Annotated[
 ]
 MinWeight = Annotated[
     float | None,
-    typer.Option(min=0, max=1000, help="Least weight of voxels that the mesh is made of, in looks from 1 m; default: half "
-                 "a look from the farthest depth that is fused (0.01 at 7 m). More leaves out what was hardly seen."),
+    typer.Option(min=0, max=1000, help="Least weight of voxels that the mesh is made of, in looks from 1 m; default: "
+                 "half a look from the farthest depth fused (0.01 at 7 m). More leaves out what was hardly seen."),
 ]  # fmt: skip
 Mesh = Annotated[
     Path | None, typer.Option(help="Mesh file, .ply, .obj or .glb; default mesh.ply in the folder of the results.")

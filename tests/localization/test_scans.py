@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ggslam.errors import FormatError
+from ggslam.errors import FormatError, SequenceError
 from ggslam.formats.pcd import pcd_bytes
 from ggslam.localization.scans import ScanSequence
 from ggslam.scene.poses import matrix_to_quaternion, se3_exp
@@ -52,6 +52,9 @@ def test_poses_of_scans_may_stand_in_their_own_headers(tmp_path: Path) -> None:
     (tmp_path / "trajectory.txt").write_text("".join(f"{n} 0 0 {n} 0 0 0 1\n" for n in range(4)))
     assert ScanSequence(tmp_path).ground_truth[3][2, 3] == 3
     (tmp_path / "trajectory.txt").unlink()
+    (tmp_path / "2.pcd").write_bytes(data.replace(own + b"\n", b""))
+    with pytest.raises(SequenceError, match=r"2\.pcd: has no VIEWPOINT"):
+        ScanSequence(tmp_path)
     (tmp_path / "2.pcd").write_bytes(data.replace(own, b"VIEWPOINT 0 0 0 0 0 0 0"))
     with pytest.raises(FormatError, match=r"2\.pcd: VIEWPOINT"):
         ScanSequence(tmp_path)
