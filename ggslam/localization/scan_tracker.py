@@ -8,7 +8,8 @@ from dataclasses import field
 import numpy as np
 
 from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
-from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, SearchSettings
+from ggslam.localization.rivals import Rival, look_around
+from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, ScanSource, SearchSettings
 from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
@@ -20,6 +21,9 @@ from ggslam.tracking.settings import AlignSettings
 
 MOST_PASSED = 7
 """Lost scans between two that are looked up, at most."""
+_DOUBTFUL = 2.5
+"""While the motion is known, rivals are looked for only where a direction is seen by less than so many times the share
+of points under which it counts as not seen: the ends of voxels and noise tell that much along a plain corridor."""
 
 
 @settings_class(frozen=True)
@@ -76,11 +80,36 @@ class ScanTracker:
             if best is None or _is_better(match, best):
                 best = match
             if self._is_right(best):
-                return self._outcome(best if self._sure else self.aligner.settle(source, surface, target, best))
+                if not self._sure:
+                    best = self.aligner.settle(source, surface, target, best)
+                return self._outcome(*self._weighed(source, surface, target, best))
         assert best is not None
         guess, around = self._pose @ self._velocity, not self._convinces(best)
         found = self.aligner.search(source, surface, target, guess, self.settings.min_overlap, around)
-        return self._outcome(found or best)
+        if found is None:
+            return self._outcome(best)
+        return self._outcome(*self._weighed(source, surface, surface.target or target, found))
+
+    def _weighed(
+        self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch
+    ) -> tuple[ScanMatch, Rival | None]:
+        """A match that is right, or a better one beside it; and what rivals it. Once the motion is known, it says where
+        along the direction the sensor is; that nothing else does is told all the same."""
+        sure, centre = self._sure, (self._pose @ self._velocity)[:3, 3]
+        if sure and match.found.visibility[0] > _DOUBTFUL * self.settings.align.degenerate_below:
+            return match, None
+        best, rival = look_around(
+            match, lambda start: self.aligner.fine(source, surface, target, start),
+            lambda other: self.aligner.settle(source, surface, target, other),
+            match.pose[:3, 3] if sure else centre, 0.0 if sure else self.aligner.span, **({"rounds": 1} if sure else {}),
+        )  # fmt: skip
+        if best is not match:
+            if sure or not self._is_right(best):
+                return match, rival
+            best = self.aligner.at_place(source, surface, target, best.pose)
+        if rival is None and not self.aligner.is_told(best):
+            rival = Rival(best.weakest, 0.0, near=True)
+        return best, rival
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`. After a scan was not found, ever more are passed over, `MOST_PASSED` at most."""
@@ -116,7 +145,7 @@ class ScanTracker:
         enough = match.found.overlap >= self.settings.min_overlap
         return enough and match.found.status is not AlignmentStatus.LOST
 
-    def _outcome(self, match: ScanMatch) -> FrontEndResult:
+    def _outcome(self, match: ScanMatch, rival: Rival | None = None) -> FrontEndResult:
         found = match.found
         if not self._convinces(match):
             self._velocity, self._located = np.eye(4), 0
@@ -124,9 +153,11 @@ class ScanTracker:
             return FrontEndResult(pose, status, found.overlap, found.rmse, self._why_lost(match), match.beyond)
         T = orthonormalize(found.T_world_camera)
         self._velocity = inverse(self._pose) @ T if self._located else np.eye(4)
-        self._pose, self._located = T, self._located + 1
-        status = LocalizationStatus.DEGENERATE if found.degenerate else LocalizationStatus.OK
-        return FrontEndResult(T.copy(), status, found.overlap, found.rmse, "", match.beyond)
+        self._pose = T
+        if rival is None or self._located == 0:  # where along the direction the first one was says nothing of motion
+            self._located += 1
+        status = LocalizationStatus.DEGENERATE if found.degenerate or rival is not None else LocalizationStatus.OK
+        return FrontEndResult(T.copy(), status, found.overlap, found.rmse, str(rival or ""), match.beyond)
 
     def _why_lost(self, match: ScanMatch) -> str:
         overlap, needed = match.found.overlap, self.settings.min_overlap
