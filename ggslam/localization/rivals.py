@@ -22,6 +22,8 @@ _STEP = 2.5
 """Starts lie so many of the target's voxels apart: from half of that an alignment converges."""
 _MARGIN = 0.02
 """Shares of points that match which differ by less do not tell two places apart."""
+_FAR_MARGIN = 0.06
+"""The map in memory lies around the scan's place; around one some way off, so much more may match."""
 _ROUNDS = 4
 """A better place is looked around from, too, so many times at most."""
 _NEAR = 2.5
@@ -54,7 +56,13 @@ Settled = Callable[[ScanMatch], ScanMatch]
 
 
 def look_around(
-    match: ScanMatch, aligned: Aligned, settled: Settled, centre: np.ndarray, span: float, rounds: int = _ROUNDS
+    match: ScanMatch,
+    aligned: Aligned,
+    settled: Settled,
+    placed: Settled,
+    centre: np.ndarray,
+    span: float,
+    rounds: int = _ROUNDS,
 ) -> tuple[ScanMatch, Rival | None]:
     """The best match at or along a line through a place, and what rivals it.
 
@@ -62,13 +70,14 @@ def look_around(
         match: of the place.
         aligned: aligns from a pose.
         settled: aligns again from a match as long as that moves it.
+        placed: the same with the map around that place.
         centre: where the scan is believed to be, [3].
         span: metres from there within which places come into question.
         rounds: of going to a better place.
     """
     rival = None
     for _ in range(rounds):
-        better, rival = _one_round(match, aligned, settled, centre, span)
+        better, rival = _one_round(match, aligned, settled, placed, centre, span)
         if better is None:
             break
         match = better
@@ -76,19 +85,23 @@ def look_around(
 
 
 def _one_round(
-    match: ScanMatch, aligned: Aligned, settled: Settled, centre: np.ndarray, span: float
+    match: ScanMatch, aligned: Aligned, settled: Settled, placed: Settled, centre: np.ndarray, span: float
 ) -> tuple[ScanMatch | None, Rival | None]:
     step = _STEP * match.target.voxel
     better, rival = None, None
+    seen = [match.pose[:3, 3]]
     for shift in _shifts(match.pose[:3, 3] - centre, match.weakest, step, span):
         start = match.pose
         start[:3, 3] += shift * match.weakest
+        far = abs(shift) > _NEAR * step
         other = aligned(start)
-        if not _rivals(other, match, step):
+        if not _rivals(other, match, seen, step, _FAR_MARGIN if far else _MARGIN):
             continue
-        other = settled(other)
-        if not _rivals(other, match, step):
+        other = placed(other) if far else settled(other)
+        if not _rivals(other, match, seen, step, _MARGIN):
+            seen += [other.pose[:3, 3]] if far else []
             continue
+        seen.append(other.pose[:3, 3])
         if other.found.overlap > (better or match).found.overlap + (0.0 if better else _MARGIN):
             better = other
         elif rival is None:
@@ -98,11 +111,11 @@ def _one_round(
     return better, rival
 
 
-def _rivals(other: ScanMatch, match: ScanMatch, step: float) -> bool:
-    """Whether a match is as good as one some way off."""
-    if other.found.status is AlignmentStatus.LOST or other.found.overlap < match.found.overlap - _MARGIN:
+def _rivals(other: ScanMatch, match: ScanMatch, seen: list[np.ndarray], step: float, margin: float) -> bool:
+    """Whether a match is as good as one, at a place that has not been seen."""
+    if other.found.status is AlignmentStatus.LOST or other.found.overlap < match.found.overlap - margin:
         return False
-    return float(np.linalg.norm(other.pose[:3, 3] - match.pose[:3, 3])) > step / 2
+    return min(float(np.linalg.norm(other.pose[:3, 3] - place)) for place in seen) > step / 2
 
 
 def _shifts(offset: np.ndarray, direction: np.ndarray, step: float, span: float) -> list[float]:

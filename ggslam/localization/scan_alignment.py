@@ -64,7 +64,8 @@ class SearchSettings:
     """Of the points in a cube with this edge one is used, until the map's own voxels take over."""
     min_structure: float = setting(0.34, 0, 1)
     """Share that must match of the points that tell one place from another along the least seen direction of motion
-    (matched to surfaces across it, or not matched), unless nearly all points match; then the direction is reported as not seen."""
+    (matched to surfaces across it, or not matched), unless nearly all points match, which makes the pose
+    degenerate."""
 
 
 @dataclass(frozen=True)

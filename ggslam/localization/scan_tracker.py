@@ -80,8 +80,6 @@ class ScanTracker:
             if best is None or _is_better(match, best):
                 best = match
             if self._is_right(best):
-                if not self._sure:
-                    best = self.aligner.settle(source, surface, target, best)
                 return self._outcome(*self._weighed(source, surface, target, best))
         assert best is not None
         guess, around = self._pose @ self._velocity, not self._convinces(best)
@@ -98,13 +96,26 @@ class ScanTracker:
         sure, centre = self._sure, (self._pose @ self._velocity)[:3, 3]
         if sure and match.found.visibility[0] > _DOUBTFUL * self.settings.align.degenerate_below:
             return match, None
-        best, rival = look_around(
-            match, lambda start: self.aligner.fine(source, surface, target, start),
-            lambda other: self.aligner.settle(source, surface, target, other),
-            match.pose[:3, 3] if sure else centre, 0.0 if sure else self.aligner.span, **({"rounds": 1} if sure else {}),
-        )  # fmt: skip
+        if not sure:
+            match = self.aligner.at_place(source, surface, target, match.pose)
+        here = match.pose[:3, 3]
+
+        def aligned(start: np.ndarray) -> ScanMatch:
+            return self.aligner.fine(source, surface, surface.target or target, start)
+
+        def settled(other: ScanMatch) -> ScanMatch:
+            return self.aligner.settle(source, surface, surface.target or target, other)
+
+        def placed(other: ScanMatch) -> ScanMatch:
+            found = self.aligner.at_place(source, surface, target, other.pose)
+            surface.move_to(here)
+            return found
+
+        if sure:
+            return match, look_around(match, aligned, settled, placed, here, 0.0, 1)[1]
+        best, rival = look_around(match, aligned, settled, placed, centre, self.aligner.span)
         if best is not match:
-            if sure or not self._is_right(best):
+            if not self._is_right(best):
                 return match, rival
             best = self.aligner.at_place(source, surface, target, best.pose)
         if rival is None and not self.aligner.is_told(best):
