@@ -22,6 +22,8 @@ _STEP = 2.5
 """Starts lie so many of the target's voxels apart: from half of that an alignment converges."""
 _MARGIN = 0.02
 """Shares of points that match which differ by less do not tell two places apart."""
+_BETTER = 0.012
+"""A place where so many more match is the better one: more than chance makes of thousands of points."""
 _FAR_MARGIN = 0.06
 """The map in memory lies around the scan's place; around one some way off, so much more may match."""
 _ROUNDS = 4
@@ -102,7 +104,7 @@ def _one_round(
             seen += [other.pose[:3, 3]] if far else []
             continue
         seen.append(other.pose[:3, 3])
-        if other.found.overlap > (better or match).found.overlap + (0.0 if better else _MARGIN):
+        if other.found.overlap > (better or match).found.overlap + (0.0 if better else _BETTER):
             better = other
         elif rival is None:
             away = other.pose[:3, 3] - match.pose[:3, 3]
