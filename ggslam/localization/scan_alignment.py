@@ -62,7 +62,7 @@ class SearchSettings:
     """Starts turned by this either way about the ground's normal are tried, too."""
     voxel: float = setting(1.0, 1e-3, 100, "m")
     """Of the points in a cube with this edge one is used, until the map's own voxels take over."""
-    min_structure: float = setting(0.34, 0, 1)
+    min_structure: float = setting(0.42, 0, 1)
     """Share that must match of the points that tell one place from another along the least seen direction of motion
     (matched to surfaces across it, or not matched), unless nearly all points match, which makes the pose
     degenerate."""

@@ -106,14 +106,14 @@ class ScanTracker:
         def settled(other: ScanMatch) -> ScanMatch:
             return self.aligner.settle(source, surface, surface.target or target, other)
 
-        def placed(other: ScanMatch) -> ScanMatch:
+        def with_its_map(other: ScanMatch) -> ScanMatch:
             found = self.aligner.at_place(source, surface, target, other.pose)
             surface.move_to(here)
             return found
 
         if sure:
-            return match, look_around(match, aligned, settled, placed, here, 0.0, 1)[1]
-        best, rival = look_around(match, aligned, settled, placed, centre, self.aligner.span)
+            return match, look_around(match, aligned, settled, with_its_map, here, 0.0, 1)[1]
+        best, rival = look_around(match, aligned, settled, with_its_map, centre, self.aligner.span)
         if best is not match:
             if not self._is_right(best):
                 return match, rival
