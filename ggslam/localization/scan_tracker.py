@@ -100,20 +100,20 @@ class ScanTracker:
             match = self.aligner.at_place(source, surface, target, match.pose)
         here = match.pose[:3, 3]
 
-        def aligned(start: np.ndarray) -> ScanMatch:
+        def align_at(start: np.ndarray) -> ScanMatch:
             return self.aligner.fine(source, surface, surface.target or target, start)
 
-        def settled(other: ScanMatch) -> ScanMatch:
+        def settle(other: ScanMatch) -> ScanMatch:
             return self.aligner.settle(source, surface, surface.target or target, other)
 
-        def with_its_map(other: ScanMatch) -> ScanMatch:
+        def settle_there(other: ScanMatch) -> ScanMatch:
             found = self.aligner.at_place(source, surface, target, other.pose)
             surface.move_to(here)
             return found
 
         if sure:
-            return match, look_around(match, aligned, settled, with_its_map, here, 0.0, 1)[1]
-        best, rival = look_around(match, aligned, settled, with_its_map, centre, self.aligner.span)
+            return match, look_around(match, align_at, settle, settle_there, here, 0.0, 1)[1]
+        best, rival = look_around(match, align_at, settle, settle_there, centre, self.aligner.span)
         if best is not match:
             if not self._is_right(best):
                 return match, rival
