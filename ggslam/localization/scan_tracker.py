@@ -8,7 +8,7 @@ from dataclasses import field
 import numpy as np
 
 from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
-from ggslam.localization.rivals import Rival, look_around
+from ggslam.localization.rivals import Aligned, Rival, Settled, look_around
 from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, ScanSource, SearchSettings
 from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.surface import Surface
@@ -80,15 +80,15 @@ class ScanTracker:
             if best is None or _is_better(match, best):
                 best = match
             if self._is_right(best):
-                return self._outcome(*self._weighed(source, surface, target, best))
+                return self._outcome(*self._beside_rivals(source, surface, target, best))
         assert best is not None
         guess, around = self._pose @ self._velocity, not self._convinces(best)
         found = self.aligner.search(source, surface, target, guess, self.settings.min_overlap, around)
         if found is None:
             return self._outcome(best)
-        return self._outcome(*self._weighed(source, surface, surface.target or target, found))
+        return self._outcome(*self._beside_rivals(source, surface, surface.target or target, found))
 
-    def _weighed(
+    def _beside_rivals(
         self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch
     ) -> tuple[ScanMatch, Rival | None]:
         """A match that is right, or a better one beside it; and what rivals it. Once the motion is known, it says where
@@ -99,6 +99,22 @@ class ScanTracker:
         if not sure:
             match = self.aligner.at_place(source, surface, target, match.pose)
         here = match.pose[:3, 3]
+        steps = self._steps(source, surface, target, here)
+        if sure:
+            return match, look_around(match, *steps, here, 0.0, 1)[1]
+        best, rival = look_around(match, *steps, centre, self.aligner.span)
+        if best is not match:
+            if not self._is_right(best):
+                return match, rival
+            best = self.aligner.at_place(source, surface, target, best.pose)
+        if rival is None and not self.aligner.is_told(best):
+            rival = Rival(best.weakest, 0.0, near=True)
+        return best, rival
+
+    def _steps(
+        self, source: ScanSource, surface: Surface, target: GicpTarget, here: np.ndarray
+    ) -> tuple[Aligned, Settled, Settled]:
+        """What `look_around` aligns with; the surface stays at `here` [3]."""
 
         def align_at(start: np.ndarray) -> ScanMatch:
             return self.aligner.fine(source, surface, surface.target or target, start)
@@ -111,16 +127,7 @@ class ScanTracker:
             surface.move_to(here)
             return found
 
-        if sure:
-            return match, look_around(match, align_at, settle, settle_there, here, 0.0, 1)[1]
-        best, rival = look_around(match, align_at, settle, settle_there, centre, self.aligner.span)
-        if best is not match:
-            if not self._is_right(best):
-                return match, rival
-            best = self.aligner.at_place(source, surface, target, best.pose)
-        if rival is None and not self.aligner.is_told(best):
-            rival = Rival(best.weakest, 0.0, near=True)
-        return best, rival
+        return align_at, settle, settle_there
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`. After a scan was not found, ever more are passed over, `MOST_PASSED` at most."""
