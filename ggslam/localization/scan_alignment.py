@@ -41,7 +41,7 @@ _ACROSS = np.cos(np.radians(60))
 _VOXEL_SIGMAS = 8
 """Surfaces of a map are known to a voxel's edge over this at best, which counts where a map is sparse."""
 _PLAIN_OVERLAP = 0.9
-"""Where so much matches, it does not matter that all of it is one plane."""
+"""Where so much matches, a pose is believed though nothing tells of a direction of motion, which is then reported."""
 _PROMISING = 0.35
 """Share of what must match that sparse points must reach: more of them than of all points are far or seldom seen."""
 _REPEATS = 4
@@ -62,9 +62,10 @@ class SearchSettings:
     """Starts turned by this either way about the ground's normal are tried, too."""
     voxel: float = setting(1.0, 1e-3, 100, "m")
     """Of the points in a cube with this edge one is used, until the map's own voxels take over."""
-    min_structure: float = setting(0.34, 0, 1)
+    min_structure: float = setting(0.42, 0, 1)
     """Share that must match of the points that tell one place from another along the least seen direction of motion
-    (matched to surfaces across it, or not matched), unless nearly all points match."""
+    (matched to surfaces across it, or not matched), unless nearly all points match, which makes the pose
+    degenerate."""
 
 
 @dataclass(frozen=True)
@@ -93,13 +94,23 @@ class ScanMatch:
     @cached_property
     def structure(self) -> float:
         """Share that matches of the points that tell of the least seen direction of motion."""
-        matches = self.found.matches.read()
-        matched = matches.squared_distances < self.inlier**2  # infinite without a match
-        normals = self.target.normals(matches.voxels[matched])
+        normals = self._normals
         if not len(normals):
             return 0.0
-        across = int((np.abs(normals @ _directions(normals)[:, 0]) > _ACROSS).sum())
-        return across / max(1, across + int((~matched).sum()))
+        across = int((np.abs(normals @ self.weakest) > _ACROSS).sum())
+        return across / max(1, across + self.counted - len(normals))
+
+    @cached_property
+    def weakest(self) -> np.ndarray:
+        """The direction of motion that matches tell the least of, unit vector [3] in the world."""
+        return _directions(self._normals)[:, 0]
+
+    @cached_property
+    def _normals(self) -> np.ndarray:
+        """Of the surfaces that points match, [n, 3]."""
+        matches = self.found.matches.read()
+        matched = matches.squared_distances < self.inlier**2  # infinite without a match
+        return self.target.normals(matches.voxels[matched])
 
     @property
     def beyond(self) -> float:
@@ -146,6 +157,11 @@ class ScanAligner:
         self._sigma, self._context = sigma, context
         self._pyramid: tuple[GicpTarget, list[GicpTarget], np.ndarray] | None = None
 
+    @property
+    def span(self) -> float:
+        """Metres that a start may be off for the search to find the place."""
+        return self._search.reach * (1 + max(_AROUND))
+
     def source(self, points: np.ndarray) -> ScanSource:
         """The points of a scan [n, 3] as `fine` and `search` want them."""
         return ScanSource(points, self._scan, self._search.voxel)
@@ -172,8 +188,11 @@ class ScanAligner:
         """Whether a pose is believed that nothing but the match speaks for; `share`: of what must match."""
         if match.found.status is AlignmentStatus.LOST or match.found.overlap < share * min_overlap:
             return False
-        enough = share * self._search.min_structure
-        return match.structure >= enough or match.found.overlap >= max(_PLAIN_OVERLAP, min_overlap)
+        return self.is_told(match, share) or match.found.overlap >= max(_PLAIN_OVERLAP, min_overlap)
+
+    def is_told(self, match: ScanMatch, share: float = 1.0) -> bool:
+        """Whether enough of what tells one place from another matches, along all directions of motion."""
+        return match.structure >= share * self._search.min_structure
 
     def search(
         self, source: ScanSource, surface: Surface, target: GicpTarget, guess: np.ndarray, min_overlap: float,
@@ -190,15 +209,15 @@ class ScanAligner:
                 T = self._stage(source.sparse, surface, level, T)
             sparse = self._last_stage(source.sparse, surface, target, T)
             if self.is_right(sparse, min_overlap, _PROMISING):
-                found = self._around(source, surface, target, sparse.pose)
+                found = self.at_place(source, surface, target, sparse.pose)
                 if self.is_right(found, min_overlap):
                     return found
                 surface.move_to(guess[:3, 3])
                 target = surface.target or target
         return None
 
-    def _around(self, source: ScanSource, surface: Surface, target: GicpTarget, T: np.ndarray) -> ScanMatch:
-        """The match at a place, with the map around it."""
+    def at_place(self, source: ScanSource, surface: Surface, target: GicpTarget, T: np.ndarray) -> ScanMatch:
+        """The match at a place, with the map around it: the surface moves there."""
         if surface.move_to(T[:3, 3]) and surface.target is not None:
             target = surface.target
         return self.settle(source, surface, target, self.fine(source, surface, target, T))

@@ -8,7 +8,8 @@ from dataclasses import field
 import numpy as np
 
 from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
-from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, SearchSettings
+from ggslam.localization.rivals import Aligned, Rival, Settled, look_around
+from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, ScanSource, SearchSettings
 from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
@@ -20,6 +21,9 @@ from ggslam.tracking.settings import AlignSettings
 
 MOST_PASSED = 7
 """Lost scans between two that are looked up, at most."""
+_DOUBTFUL = 2.5
+"""While the motion is known, rivals are looked for only where a direction is seen by less than so many times the share
+of points under which it counts as not seen: the ends of voxels and noise tell that much along a plain corridor."""
 
 
 @settings_class(frozen=True)
@@ -76,11 +80,54 @@ class ScanTracker:
             if best is None or _is_better(match, best):
                 best = match
             if self._is_right(best):
-                return self._outcome(best if self._sure else self.aligner.settle(source, surface, target, best))
+                return self._outcome(*self._beside_rivals(source, surface, target, best))
         assert best is not None
         guess, around = self._pose @ self._velocity, not self._convinces(best)
         found = self.aligner.search(source, surface, target, guess, self.settings.min_overlap, around)
-        return self._outcome(found or best)
+        if found is None:
+            return self._outcome(best)
+        return self._outcome(*self._beside_rivals(source, surface, surface.target or target, found))
+
+    def _beside_rivals(
+        self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch
+    ) -> tuple[ScanMatch, Rival | None]:
+        """A match that is right, or a better one beside it; and what rivals it. Once the motion is known, it says where
+        along the direction the sensor is; that nothing else does is told all the same."""
+        sure, centre = self._sure, (self._pose @ self._velocity)[:3, 3]
+        if sure and match.found.visibility[0] > _DOUBTFUL * self.settings.align.degenerate_below:
+            return match, None
+        if not sure:
+            match = self.aligner.at_place(source, surface, target, match.pose)
+        here = match.pose[:3, 3]
+        steps = self._steps(source, surface, target, here)
+        if sure:
+            return match, look_around(match, *steps, here, 0.0, 1)[1]
+        best, rival = look_around(match, *steps, centre, self.aligner.span)
+        if best is not match:
+            if not self._is_right(best):
+                return match, rival
+            best = self.aligner.at_place(source, surface, target, best.pose)
+        if rival is None and not self.aligner.is_told(best):
+            rival = Rival(best.weakest, 0.0, near=True)
+        return best, rival
+
+    def _steps(
+        self, source: ScanSource, surface: Surface, target: GicpTarget, here: np.ndarray
+    ) -> tuple[Aligned, Settled, Settled]:
+        """What `look_around` aligns with; the surface stays at `here` [3]."""
+
+        def align_at(start: np.ndarray) -> ScanMatch:
+            return self.aligner.fine(source, surface, surface.target or target, start)
+
+        def settle(other: ScanMatch) -> ScanMatch:
+            return self.aligner.settle(source, surface, surface.target or target, other)
+
+        def settle_there(other: ScanMatch) -> ScanMatch:
+            found = self.aligner.at_place(source, surface, target, other.pose)
+            surface.move_to(here)
+            return found
+
+        return align_at, settle, settle_there
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`. After a scan was not found, ever more are passed over, `MOST_PASSED` at most."""
@@ -116,7 +163,7 @@ class ScanTracker:
         enough = match.found.overlap >= self.settings.min_overlap
         return enough and match.found.status is not AlignmentStatus.LOST
 
-    def _outcome(self, match: ScanMatch) -> FrontEndResult:
+    def _outcome(self, match: ScanMatch, rival: Rival | None = None) -> FrontEndResult:
         found = match.found
         if not self._convinces(match):
             self._velocity, self._located = np.eye(4), 0
@@ -124,9 +171,11 @@ class ScanTracker:
             return FrontEndResult(pose, status, found.overlap, found.rmse, self._why_lost(match), match.beyond)
         T = orthonormalize(found.T_world_camera)
         self._velocity = inverse(self._pose) @ T if self._located else np.eye(4)
-        self._pose, self._located = T, self._located + 1
-        status = LocalizationStatus.DEGENERATE if found.degenerate else LocalizationStatus.OK
-        return FrontEndResult(T.copy(), status, found.overlap, found.rmse, "", match.beyond)
+        self._pose = T
+        if rival is None or self._located == 0:  # where along the direction the first one was says nothing of motion
+            self._located += 1
+        status = LocalizationStatus.DEGENERATE if found.degenerate or rival is not None else LocalizationStatus.OK
+        return FrontEndResult(T.copy(), status, found.overlap, found.rmse, str(rival or ""), match.beyond)
 
     def _why_lost(self, match: ScanMatch) -> str:
         overlap, needed = match.found.overlap, self.settings.min_overlap
