@@ -3,8 +3,8 @@
 
 Most of a scan's points lie within R'; farther ones are few and add little. A scanner's sub-maps reach far beyond their
 cells, so cells of a third of R' are enough of them. Where a whole cloud is cut, a cell has only what lies in it, and
-smaller cells follow the ball of R' better. Depth cameras and rooms get `INDOORS`, scanners that see no farther than 10 m
-the same with a greater R: a walk need not come near the centres of its cells, which are metres above one another, too.
+smaller cells follow the ball of R' better. Depth cameras and rooms get `INDOORS`, scanners that see no farther than
+10 m the same with a greater R: a walk need not come near the centres of its cells, which lie one above another, too.
 """
 
 from __future__ import annotations
