@@ -55,7 +55,7 @@ def between(points: np.ndarray, floor: float) -> np.ndarray:
     return (points[:, 2] > floor + LOW) & (points[:, 2] < floor + HIGH)
 
 
-def levelling(points: np.ndarray) -> np.ndarray:
+def level_turn(points: np.ndarray) -> np.ndarray:
     """The turn R_level_sensor [3, 3] that makes the floor of a scan level, points [n, 3] about the sensor, z about up;
     the identity where the sensor stands upright, or there is no floor within its reach of 12 degrees."""
     near = points[np.hypot(points[:, 0], points[:, 1]) < _FLOOR_AROUND]

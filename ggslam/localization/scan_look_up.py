@@ -7,7 +7,7 @@
 3. G-ICP. Then the scan has to agree with the map both ways: what stands in the scan lies on surfaces of the map, and
    the scan looks through none of them. Where two different poses agree about equally well, neither is believed.
 
-A sensor that is tilted is levelled by the floor first (`levelling`).
+A sensor that is tilted is levelled by the floor first (`level_turn`).
 
 How much a match tells depends on what the scan sees: one that sees little, near or in a narrow view, finds it at many
 places; and where a map has few places nothing shows how much other ones would match. Both then want more.
@@ -22,7 +22,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.localization.level import about_z, between, floor_height, level_axes, levelling
+from ggslam.localization.level import about_z, between, floor_height, level_axes, level_turn
 from ggslam.localization.surface import Surface
 from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.submaps.settings import GridAxes
@@ -131,12 +131,12 @@ class _Scan:
         """Of points [n, 3] in the sensor's frame; None where they show no floor."""
         points = np.asarray(points, np.float64)[np.isfinite(points).all(1)]
         T = np.eye(4)
-        T[:3, :3] = levelling(points)
+        T[:3, :3] = level_turn(points)
         points = points @ T[:3, :3].T
         floor = floor_height(points)
         return None if floor is None else _Scan(points, floor, T)
 
-    def standing(self, voxel: float) -> np.ndarray:
+    def standing_points(self, voxel: float) -> np.ndarray:
         """What stands upright, one point in a voxel, [m, 3]."""
         standing = self.points[between(self.points, self.floor)]
         _, first = np.unique(np.floor(standing / voxel).astype(np.int64), axis=0, return_index=True)
@@ -266,7 +266,7 @@ class ScanLookUp:
         T_level_scan = alignment.T_world_camera @ inverse(scan.T_scan_sensor)
         T_level_scan[:3] = self._R_world_level.T @ T_level_scan[:3]
         upright = np.abs(normals[:, 2]) < _STEEP
-        standing = transform_points(scan.standing(surface.target.voxel), T_level_scan)
+        standing = transform_points(scan.standing_points(surface.target.voxel), T_level_scan)
         covered = standing[surface.covers(standing @ self._R_world_level.T)]
         fit = _fit(covered, voxels[upright], normals[upright], surface.target.voxel)
         through = _through(scan.points, transform_points(voxels, inverse(T_level_scan)))

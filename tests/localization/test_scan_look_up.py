@@ -11,7 +11,7 @@ import pytest
 
 from ggslam.errors import ConfigError
 from ggslam.formats.raw_points import read_pose_graph, read_raw_points
-from ggslam.localization.level import about_z, floor_height, levelling
+from ggslam.localization.level import about_z, floor_height, level_turn
 from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
 from ggslam.localization.map_picture import picture_of_store
 from ggslam.localization.near import Near, parse_near
@@ -137,7 +137,7 @@ def test_a_tilted_sensor_is_found(made: Made, recorded: Path, tilt_deg: float) -
         mount = se3_exp(np.array([0, 0, 0, *axis]))
         points = SCANNER.scan(made.world, T @ mount, 77).points.astype(float)
         up = (T @ mount)[2, :3]
-        assert np.degrees(np.arccos(levelling(points)[2] @ up)) < 1.0
+        assert np.degrees(np.arccos(level_turn(points)[2] @ up)) < 1.0
         (result,) = looked_up(recorded, [points])
         moved, turned = separation(result.T_world_sensor, T @ mount)
         assert result.status is LocalizationStatus.FOUND and moved < 0.03 and turned < 0.3
@@ -146,10 +146,10 @@ def test_a_tilted_sensor_is_found(made: Made, recorded: Path, tilt_deg: float) -
 def test_levelling_leaves_what_stands_upright() -> None:
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(-9, 9, (2000, 2)), np.full(2000, -1.5)])
-    assert np.array_equal(levelling(ground), np.eye(3))
-    assert np.array_equal(levelling(ground[:20]), np.eye(3)) and np.array_equal(levelling(ground[:0]), np.eye(3))
+    assert np.array_equal(level_turn(ground), np.eye(3))
+    assert np.array_equal(level_turn(ground[:20]), np.eye(3)) and np.array_equal(level_turn(ground[:0]), np.eye(3))
     tilted = ground @ se3_exp(np.array([0, 0, 0, np.radians(8), 0, 0]))[:3, :3]
-    assert np.abs((tilted @ levelling(tilted).T)[:, 2] + 1.5).max() < 1e-9
+    assert np.abs((tilted @ level_turn(tilted).T)[:, 2] + 1.5).max() < 1e-9
 
 
 def test_scans_that_see_too_little_are_refused(made: Made, recorded: Path) -> None:

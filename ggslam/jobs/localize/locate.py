@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Sequence as Several
@@ -34,6 +35,7 @@ from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
+from ggslam.scene.origin import GRID
 from ggslam.scene.poses import quaternion_to_matrix, separation
 from ggslam.sequences.rig import one_camera
 from ggslam.sequences.sequence import Sequence
@@ -50,6 +52,8 @@ _SHORT = 8
 """Letters of a run's fingerprint in the name of the store of its map."""
 _FARTHEST = 1e7
 """Metres from the origin of the map that a start pose may be."""
+_WHOLE = GRID / 4
+"""Metres that are a whole number of a scan's voxels: origins lie on the grid of coarse ones, four times as wide."""
 _FINEST = 1.5
 """A target's voxels are at least this many times as wide as those that the map was thinned with, and for scans as its
 points are apart."""
@@ -233,7 +237,11 @@ def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | N
 
 
 def _target(request: LocalizeRequest, submaps: SubmapSettings, own: TargetSettings, spacing: float) -> TargetSettings:
+    """Of images or (`own` is `SCAN_TARGET`) scans, whose map may lie anywhere in the world: a map moved by whole
+    hundreds of metres has the same voxels."""
     voxel = max(own.voxel, _FINEST * submaps.voxel, _FINEST * spacing)
+    if own is SCAN_TARGET and voxel < _WHOLE:
+        voxel = _WHOLE / math.floor(_WHOLE / voxel * (1 + 1e-9))
     return replace(own, voxel=voxel if request.voxel is None else request.voxel)
 
 

@@ -144,7 +144,7 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
             watched = _with_progress(items, observer, len(poses))
             written = record_visit(store, watched, poses, sights, request.visit or source.resolve().name, request.at)
             observer.note(f"{len(written)} cells written")
-            if missed := _missed(store, poses):
+            if missed := _words_of_missed(store, poses):
                 observer.note(missed)
         elif cloud is not None:
             store_of_cloud(source, store, request.visit, request.at, cloud=cloud)
@@ -259,7 +259,7 @@ def _poses(
     return poses
 
 
-def _missed(store: GridStore, poses: np.ndarray) -> str:
+def _words_of_missed(store: GridStore, poses: np.ndarray) -> str:
     """What to say of items, of poses [n, 4, 4], in cells that nothing is recorded of; empty if those are few."""
     known = poses[np.isfinite(poses).all((1, 2)), :3, 3]
     missed = sum(store.key_of(position) not in store for position in known)
