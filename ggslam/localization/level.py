@@ -20,8 +20,8 @@ _SLICE = 0.15
 """Metres that a tilted floor's points are off a plane at most."""
 _BELOW = 0.01
 """Share of the points that may lie below a floor."""
-_UPRIGHT_DEG = 1.0
-"""A sensor that is tilted less stands upright: so well a floor tells it."""
+_UPRIGHT_DEG = 4.0
+"""A sensor that is tilted less stands upright: streets slope as much."""
 
 
 def level_axes(axes: GridAxes) -> np.ndarray:

@@ -129,7 +129,7 @@ def test_scans_are_found_where_they_were_made(made: Made, kind: str, request: py
     assert all(reason for reason in lost)
 
 
-@pytest.mark.parametrize("tilt_deg", [4.0, 10.0])
+@pytest.mark.parametrize("tilt_deg", [6.0, 10.0])
 def test_a_tilted_sensor_is_found(made: Made, recorded: Path, tilt_deg: float) -> None:
     T = made.poses[20].copy()
     for turn in ([0, 1, 0], [1, -1, 0]):
