@@ -67,6 +67,10 @@ class FormatError(GgslamError):
     """A file (PLY, trajectory, run folder...) does not follow its format."""
 
 
+class NoPointsError(FormatError):
+    """A cloud is whole, but has no points, or none with a position."""
+
+
 class RunFolderError(GgslamError):
     """A run folder cannot be written or lacks a part that was asked for."""
 

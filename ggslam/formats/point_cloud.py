@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import FormatError, InputError
+from ggslam.errors import FormatError, InputError, NoPointsError
 from ggslam.formats.gaussian_ply import object_ids
 from ggslam.formats.pcd import read_pcd, write_pcd
 from ggslam.formats.ply import read_ply, write_ply
@@ -164,7 +164,7 @@ def _packed_rgb(colors: np.ndarray) -> np.ndarray:
 
 def _cloud(path: Path, rows: np.ndarray, comments: list[str], tell: bool) -> ColoredCloud:
     if not len(rows):
-        raise FormatError(f"{path}: no points")
+        raise NoPointsError(f"{path}: no points")
     axes = _position_names(path, rows)
     stored = len(rows)
     rows = rows[placed_rows(path, np.stack([rows[name] for name in axes], 1), tell)]

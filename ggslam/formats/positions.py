@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import FormatError
+from ggslam.errors import NoPointsError
 
 _log = logging.getLogger(__name__)
 COARSE = 1e-3
@@ -29,7 +29,7 @@ def placed_rows(path: str | Path, points: np.ndarray, tell: bool = True) -> np.n
         What to index the points and all that belongs to them with: bool [N], or a slice of everything.
 
     Raises:
-        FormatError: there are points, but none has a position.
+        NoPointsError: there are points, but none has a position.
     """
     finite = np.isfinite(points).all(1)
     kept = int(finite.sum())
@@ -38,7 +38,7 @@ def placed_rows(path: str | Path, points: np.ndarray, tell: bool = True) -> np.n
     if kept == len(points):
         return slice(None)
     if not kept:
-        raise FormatError(f"{path}: none of its {len(points)} points has a position: they are not finite numbers")
+        raise NoPointsError(f"{path}: none of its {len(points)} points has a position: they are not finite numbers")
     if tell:
         _log.warning("warning: %s: %s", path, left_out_words(len(points) - kept, len(points)))
     return np.asarray(finite)

@@ -13,6 +13,15 @@ _FLOOR_STEP, _FLOOR_AROUND, _FLOOR_SHARE = 0.1, 15.0, 0.25
 """The floor is the lowest slice of this height, of the points so near, with this share of the fullest one's."""
 _LEAST = 50
 """Points that tell where the floor is at least."""
+_TILTS_DEG = np.arange(-12.0, 13.0, 2.0)
+"""Of a sensor about its x and y axes, that are tried."""
+_TILT_POINTS = 3000
+_SLICE = 0.15
+"""Metres that a tilted floor's points are off a plane at most."""
+_BELOW = 0.01
+"""Share of the points that may lie below a floor."""
+_UPRIGHT_DEG = 4.0
+"""A sensor that is tilted less stands upright: streets slope as much."""
 
 
 def level_axes(axes: GridAxes) -> np.ndarray:
@@ -44,3 +53,51 @@ def floor_height(points: np.ndarray) -> float | None:
 def between(points: np.ndarray, floor: float) -> np.ndarray:
     """Which level points [n, 3] stand between knee and head height, bool [n]."""
     return (points[:, 2] > floor + LOW) & (points[:, 2] < floor + HIGH)
+
+
+def level_turn(points: np.ndarray) -> np.ndarray:
+    """The turn R_level_sensor [3, 3] that makes the floor of a scan level, points [n, 3] about the sensor, z about up;
+    the identity where the sensor stands upright, or there is no floor within its reach of 12 degrees."""
+    near = points[np.hypot(points[:, 0], points[:, 1]) < _FLOOR_AROUND]
+    near = near[np.isfinite(near).all(1)]
+    few = near[:: max(1, len(near) // _TILT_POINTS)]
+    if len(few) < _LEAST:
+        return np.eye(3)
+    ups = np.array([_up(*np.radians([x, y])) for x in _TILTS_DEG for y in _TILTS_DEG])
+    ups = ups[np.argsort(-ups[:, 2], kind="stable")]  # of equals the least tilted
+    counts, heights = zip(*(_fullest_below(few @ up) for up in ups), strict=True)
+    best = int(np.argmax(counts))
+    up, height = ups[best], heights[best]
+    for _ in range(4):
+        floor = near[np.abs(near @ up - height) < _SLICE]
+        if len(floor) < _LEAST:
+            return np.eye(3)
+        up = np.linalg.svd(floor - floor.mean(0), full_matrices=False)[2][2]
+        up = up if up[2] > 0 else -up
+        height = float(np.median(floor @ up))
+    tilt = np.degrees(np.arccos(np.clip(up[2], -1, 1)))
+    return np.eye(3) if not _UPRIGHT_DEG < tilt < 1.5 * _TILTS_DEG[-1] else _turn_to_z(up)
+
+
+def _up(x: float, y: float) -> np.ndarray:
+    up = np.array([np.tan(x), np.tan(y), 1.0])
+    return up / np.linalg.norm(up)
+
+
+def _fullest_below(heights: np.ndarray) -> tuple[int, float]:
+    """Points in the fullest slice below the sensor that has next to nothing below it, and its height."""
+    slices = np.floor(-heights[heights < -_SLICE] / _SLICE).astype(np.int64)
+    if not len(slices):
+        return 0, 0.0
+    counts = np.bincount(np.minimum(slices, 1000))
+    below = len(slices) - np.cumsum(counts) - np.append(counts[1:], 0)
+    counts[below > _BELOW * len(heights)] = 0
+    fullest = int(counts.argmax())
+    return int(counts[fullest]), -(fullest + 0.5) * _SLICE
+
+
+def _turn_to_z(up: np.ndarray) -> np.ndarray:
+    """The least turn that takes a unit vector, not -z, to z."""
+    x, y, z = up
+    k = 1 / (1 + z)
+    return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])

@@ -41,6 +41,8 @@ _HEADROOM, _LEVEL = 0.3, 1.0
 """Metres of free space above a sensor; floors nearer to each other in height are one."""
 _FLOORS = 3
 _COLUMN = 0.5
+_BESIDE = 10.0
+"""Metres beside all that a map holds within which a sensor may stand."""
 _AROUND = (0.75, 3.0, 8.0)
 """Metres within which floors are looked for: a scanner sees none below itself."""
 
@@ -149,6 +151,8 @@ def picture_of_store(store: GridStore, near: Near | None = None, reach: float = 
         if near is not None:
             points = points[near.allows(points, axes, reach)]
         chunks.append(_thin(points))
+    if near is not None and not any(near.allows(points, axes, _BESIDE).any() for points in chunks):
+        chunks = chunks[:1]
     return MapPicture(_thin(np.concatenate(chunks) @ level_axes(axes)), axes, damaged, near)
 
 

@@ -7,7 +7,10 @@
 3. G-ICP. Then the scan has to agree with the map both ways: what stands in the scan lies on surfaces of the map, and
    the scan looks through none of them. Where two different poses agree about equally well, neither is believed.
 
-The sensor is taken to stand upright, with its z axis up, within some degrees.
+A sensor that is tilted is levelled by the floor first (`level_turn`).
+
+How much a match tells depends on what the scan sees: one that sees little, near or in a narrow view, finds it at many
+places; and where a map has few places nothing shows how much other ones would match. Both then want more.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.localization.level import about_z, between, floor_height, level_axes
+from ggslam.localization.level import about_z, between, floor_height, level_axes, level_turn
 from ggslam.localization.surface import Surface
 from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.submaps.settings import GridAxes
@@ -40,6 +43,13 @@ _ON_SURFACE = 0.4
 _LEAST = 30
 """Points that tell whether a scan fits at least."""
 _DIRECTIONS, _ELEVATIONS = 180, 90
+_INSIDE = 0.5
+"""Share of what stands in the scan that is enough, of what the map can contain."""
+_SQUARE = 0.5
+_STRANGE = 0.2
+"""Where no more than this fits, the scan may have other axes."""
+_RING = np.radians(0.5)
+_NO_FLOOR = "the scan shows no floor (the sensor's z axis has to point up)"
 
 
 @settings_class(frozen=True)
@@ -60,6 +70,12 @@ class ScanLookUpSettings:
     """The score of a pose, its fit times what is not looked through, is this much above every other one's."""
     margin_missing: float = setting(0.4, 0, 10)
     """And this much times what the score is short of 1: what does not match here may be as it is elsewhere."""
+    min_structure: int = setting(40, 0, 10**6)
+    """Squares of half a metre, seen from above, that what stands upright in the scan takes up at least."""
+    few: int = setting(8, 0, 1000)
+    """With fewer places to compare with a map tells little of how much a scan matches elsewhere."""
+    few_fit: float = setting(0.75, 0, 1)
+    """Then this much of what stands upright must lie on surfaces of the map."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +85,13 @@ class FoundPose:
     Attributes:
         alignment: of the scan.
         fit, through: see `ScanLookUpSettings`.
+        inside: share of what stands upright in the scan that lies where the map can contain it.
     """
 
     alignment: AlignmentResult
     fit: float
     through: float
+    inside: float = 1.0
 
     @property
     def score(self) -> float:
@@ -94,6 +112,49 @@ class Guesser(Protocol):
         """See `MapPicture.guesses`."""
 
 
+@dataclass(frozen=True)
+class _Scan:
+    """A levelled scan.
+
+    Attributes:
+        points: [n, 3], about the sensor.
+        floor: its height.
+        T_scan_sensor: what levelled it.
+    """
+
+    points: np.ndarray
+    floor: float
+    T_scan_sensor: np.ndarray
+
+    @staticmethod
+    def of(points: np.ndarray) -> _Scan | None:
+        """Of points [n, 3] in the sensor's frame; None where they show no floor."""
+        points = np.asarray(points, np.float64)[np.isfinite(points).all(1)]
+        T = np.eye(4)
+        T[:3, :3] = level_turn(points)
+        points = points @ T[:3, :3].T
+        floor = floor_height(points)
+        return None if floor is None else _Scan(points, floor, T)
+
+    def standing_points(self, voxel: float) -> np.ndarray:
+        """What stands upright, one point in a voxel, [m, 3]."""
+        standing = self.points[between(self.points, self.floor)]
+        _, first = np.unique(np.floor(standing / voxel).astype(np.int64), axis=0, return_index=True)
+        return standing[first]
+
+    @property
+    def structure(self) -> int:
+        """Squares of half a metre that something stands in."""
+        standing = self.points[between(self.points, self.floor)][:, :2]
+        return len(np.unique(np.floor(standing / _SQUARE).astype(np.int64), axis=0))
+
+    @property
+    def is_ring(self) -> bool:
+        """Whether all points lie on one cone about the sensor's axis."""
+        elevation = np.arctan2(self.points[:, 2], np.hypot(self.points[:, 0], self.points[:, 1]))
+        return bool(np.ptp(np.percentile(elevation, [2, 98])) < _RING)
+
+
 Align = Callable[[np.ndarray], AlignmentResult]
 """Aligns the scan to the surface's target from a guess T_world_sensor."""
 
@@ -105,12 +166,14 @@ class ScanLookUp:
         make_places: gives the map's places; asked when the first scan is looked up.
         axes: of the map's grid.
         settings: see `ScanLookUpSettings`.
+        min_overlap: share of the points that must match.
     """
 
     def __init__(
-        self, make_places: Callable[[], Guesser], axes: GridAxes, settings: ScanLookUpSettings | None = None
-    ) -> None:
-        self.settings = settings or ScanLookUpSettings()
+        self, make_places: Callable[[], Guesser], axes: GridAxes, settings: ScanLookUpSettings | None = None,
+        min_overlap: float = 0.5,
+    ) -> None:  # fmt: skip
+        self.settings, self._min_overlap = settings or ScanLookUpSettings(), min_overlap
         self._make_places = make_places
         self._places: Guesser | None = None
         self._R_world_level = level_axes(axes)
@@ -131,66 +194,83 @@ class ScanLookUp:
         """
         if self._places is None:
             self._places = self._make_places()
-        points = np.asarray(points, np.float64)[np.isfinite(points).all(1)]
-        floor = floor_height(points)
-        if floor is None or not len(self._places):
-            return None, "the scan shows no floor" if floor is None else "there are no places to look it up among"
-        guesses = self._places.guesses(points, floor, self.settings.candidates, self.settings.apart)
+        scan = _Scan.of(points)
+        reason = self._why_not(scan)
+        if scan is None or reason:
+            return None, reason
+        found, tried = self._try_all(scan, surface, align)
+        if found:
+            best = max(found, key=lambda pose: pose.score).alignment.T_world_camera
+            turned = best @ scan.T_scan_sensor
+            turned[:3, :3] = turned[:3, :3] @ about_z(np.pi)
+            if (pose := self._try(scan, turned, surface, align)) is not None:
+                found.append(pose)
+        return self._judge(sorted(found, key=lambda pose: -pose.score), tried)
+
+    def _why_not(self, scan: _Scan | None) -> str:
+        if scan is None:
+            return _NO_FLOOR
+        if scan.is_ring:
+            return "a scan of a single ring cannot be looked up: it shows no heights"
+        if scan.structure < self.settings.min_structure:
+            return "the scan sees too little to tell one place from another"
+        return "" if self._places else "there are no places to look it up among"
+
+    def _try_all(self, scan: _Scan, surface: Surface, align: Align) -> tuple[list[FoundPose], int]:
+        """Poses that were found, and how many places were tried."""
+        assert self._places is not None
         found: list[FoundPose] = []
-        left = self.settings.candidates * _FLOORS
-        for guess in guesses:
-            if (pose := self._try(points, floor, guess, surface, align)) is not None:
+        tried, left = 0, self.settings.candidates * _FLOORS
+        for guess in self._places.guesses(scan.points, scan.floor, self.settings.candidates, self.settings.apart):
+            tried += 1
+            if (pose := self._try(scan, guess, surface, align)) is not None:
                 found.append(pose)
                 if pose.score > _GOOD:  # others as good look as likely, and come soon
                     left = min(left, self.settings.more + 1)
             left -= 1
             if not left:
-                break
-        return self._judge(sorted(found, key=lambda pose: -pose.score))
+                return found, max(tried, self.settings.few)
+        return found, tried
 
-    def _judge(self, ranked: list[FoundPose]) -> tuple[FoundPose | None, str]:
+    def _judge(self, ranked: list[FoundPose], tried: int) -> tuple[FoundPose | None, str]:
         limits = self.settings
         if not ranked or ranked[0].fit < limits.min_fit or ranked[0].through > limits.max_through:
             what = f"; at best {ranked[0].fit:.0%} match, {ranked[0].through:.0%} looked through" if ranked else ""
-            return None, f"no place of the map looks like the scan{what}"
+            axes = "" if ranked and ranked[0].fit > _STRANGE else " (the sensor's z axis has to point up)"
+            return None, f"no place of the map looks like the scan{what}{axes}"
         best = ranked[0]
-        margin = limits.margin + limits.margin_missing * (1 - best.score)
+        here = _position_text(best.alignment.T_world_camera)
+        if best.alignment.overlap < self._min_overlap:
+            overlap = f"{best.alignment.overlap:.0%} of the points match"
+            return None, f"the scan looks like {here}, but only {overlap}, {self._min_overlap:.0%} needed"
+        if tried < limits.few and best.fit < limits.few_fit:
+            fit = f"{best.fit:.0%} match, {limits.few_fit:.0%} needed"
+            return None, f"the map has few places to compare {here} with: {fit}"
+        margin = limits.margin + limits.margin_missing * (1 - best.score * min(1.0, best.inside / _INSIDE))
         for other in ranked[1:]:
             moved, turned = separation(best.alignment.T_world_camera, other.alignment.T_world_camera)
             if (moved > 0.5 or turned > 5) and other.score > best.score - margin:
-                here, there = (_position_text(pose.alignment.T_world_camera) for pose in (best, other))
+                there = _position_text(other.alignment.T_world_camera)
                 return None, f"the scan matches {here} little better than {there}, so neither is believed"
-        return best, f"looks like the map at {_position_text(best.alignment.T_world_camera)}"
+        return best, f"looks like the map at {here}"
 
-    def _try(
-        self, points: np.ndarray, floor: float, guess: np.ndarray, surface: Surface, align: Align
-    ) -> FoundPose | None:
+    def _try(self, scan: _Scan, guess: np.ndarray, surface: Surface, align: Align) -> FoundPose | None:
         surface.move_to(guess[:3, 3])
         if surface.target is None:
             return None
         voxels, normals = self._level_map(surface)
-        guess = self._from_above(points, floor, guess, voxels, normals)
-        alignment = align(guess)
+        guess = self._from_above(scan.points, scan.floor, guess, voxels, normals)
+        alignment = align(guess @ scan.T_scan_sensor)
         if alignment.status is AlignmentStatus.LOST:
             return None
-        T_level_sensor = np.eye(4)
-        T_level_sensor[:3] = self._R_world_level.T @ alignment.T_world_camera[:3]
+        T_level_scan = alignment.T_world_camera @ inverse(scan.T_scan_sensor)
+        T_level_scan[:3] = self._R_world_level.T @ T_level_scan[:3]
         upright = np.abs(normals[:, 2]) < _STEEP
-        standing = self._upright_points(points, floor, T_level_sensor, surface)
-        fit = _fit(standing, voxels[upright], normals[upright], surface.target.voxel)
-        through = _through(points, transform_points(voxels, inverse(T_level_sensor)))
-        return FoundPose(alignment, fit, through)
-
-    def _upright_points(
-        self, points: np.ndarray, floor: float, T_level_sensor: np.ndarray, surface: Surface
-    ) -> np.ndarray:
-        """What stands upright in the scan where the map can contain it, one point in a voxel, [n, 3] in the level
-        frame."""
-        assert surface.target is not None
-        standing = points[between(points, floor)]
-        _, first = np.unique(np.floor(standing / surface.target.voxel).astype(np.int64), axis=0, return_index=True)
-        standing = transform_points(standing[first], T_level_sensor)
-        return standing[surface.covers(standing @ self._R_world_level.T)]
+        standing = transform_points(scan.standing_points(surface.target.voxel), T_level_scan)
+        covered = standing[surface.covers(standing @ self._R_world_level.T)]
+        fit = _fit(covered, voxels[upright], normals[upright], surface.target.voxel)
+        through = _through(scan.points, transform_points(voxels, inverse(T_level_scan)))
+        return FoundPose(alignment, fit, through, len(covered) / max(1, len(standing)))
 
     def _level_map(self, surface: Surface) -> tuple[np.ndarray, np.ndarray]:
         """Voxels of the target and their normals, [n, 3], in the level frame."""

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import SequenceError
+from ggslam.errors import NoPointsError, SequenceError
 from ggslam.formats.cloud_files import read_cloud_file
 from ggslam.formats.pcd import read_viewpoint
 from ggslam.formats.trajectory import read_trajectory
@@ -56,6 +56,7 @@ class ScanSequence:
         """
         self.path, self._columns = Path(path), columns
         self._told = False
+        self._empty: set[int] = set()
         files = scan_files(self.path)
         if not files:
             raise SequenceError(f"{path}: no scans ({', '.join(_SUFFIXES)})")
@@ -70,15 +71,28 @@ class ScanSequence:
     def __len__(self) -> int:
         return len(self._files)
 
+    @property
+    def all_empty(self) -> bool:
+        """Whether all scans were read and none has a point."""
+        return len(self._empty) == len(self)
+
     def scan(self, index: int) -> LaserScan:
-        """Reads a scan of the selection. Of the first with points that have no position, how many is told.
+        """Reads a scan of the selection; one that saw nothing has no points. Of the first with points that have no
+        position, how many is told.
 
         Raises:
             FormatError: it is damaged.
         """
-        cloud = read_cloud_file(self._files[index], self._columns, tell=not self._told)
-        self._told = self._told or cloud.nowhere > 0
-        return LaserScan(index, float(self.timestamps[index]), cloud.points.astype(np.float32))
+        points = np.zeros((0, 3), np.float32)
+        try:
+            cloud = read_cloud_file(self._files[index], self._columns, tell=not self._told)
+            self._told = self._told or cloud.nowhere > 0
+            points = cloud.points.astype(np.float32)
+        except NoPointsError:
+            pass
+        if not len(points):
+            self._empty.add(index)
+        return LaserScan(index, float(self.timestamps[index]), points)
 
     def stream(self) -> Iterator[LaserScan]:
         """All scans in order."""

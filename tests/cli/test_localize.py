@@ -150,9 +150,33 @@ def test_scans_are_found_without_a_start_pose(scans: Path, tmp_path: Path) -> No
     for out in ("cloud", "store"):
         found = summary(tmp_path / out)
         assert found["located_share"] == 1 and found["rmse_m"] < 0.03 and found["statuses"]["found"] == 1
-    far = ["--near", f"{x + 100:.1f} {y:.1f} 2", "--stop", 2, "--out", tmp_path / "far"]
-    done("localize", tmp_path / "map.grid", scans, *far)
-    assert summary(tmp_path / "far")["located_share"] == 0
+    far = ["--near", f"{x + 100:.1f} {y:.1f} 2"]
+    for path in (tmp_path / "map.grid", cloud):
+        one_error(ggslam("localize", path, scans, *far), "--near", "has nothing within 6")
+
+
+def test_a_scan_without_points_is_lost_and_the_ride_goes_on(scans: Path, tmp_path: Path) -> None:
+    shutil.copytree(scans, tmp_path / "ride")
+    files = sorted((tmp_path / "ride").rglob("*.npy"))[:4]
+    np.save(files[1], np.full_like(np.load(files[1]), np.nan))
+    np.save(files[2], np.load(files[2])[:0])
+    cloud = scans.parent / "cloud.npy"
+    command = ["localize", cloud, tmp_path / "ride", "--start-pose", "given", "--stop", 4, "--out", tmp_path / "out"]
+    done(*command)
+    frames = json.loads((tmp_path / "out" / "localization.json").read_text())["frames"]
+    assert [frame["status"] == "lost" for frame in frames] == [False, True, True, False]
+    for file in files:
+        np.save(file, np.full((9, 3), np.nan, np.float32))
+    one_error(ggslam(*command), str(tmp_path / "ride"), "none of 4 scans has a point")
+
+
+def test_a_start_pose_that_is_not_used_is_told(scans: Path, tmp_path: Path) -> None:
+    x, y, z = read_tum(scans / "trajectory.txt").T_world_camera[0, :3, 3]
+    cloud, wrong = scans.parent / "cloud.npy", f"{x:.2f} {y:.2f} {z + 30:.2f} 0 0 0 1"
+    output = done("localize", cloud, scans, "--start-pose", wrong, "--stop", 1, "--out", tmp_path / "out")
+    assert "the start pose was not used" in " ".join(output.split()) and "30.0 m" in output
+    output = done("localize", cloud, scans, "--start-pose", "given", "--stop", 1, "--out", tmp_path / "given")
+    assert "not used" not in output
 
 
 def test_scans_are_located_in_an_octomap(scans: Path, tmp_path: Path) -> None:

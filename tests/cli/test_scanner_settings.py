@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,32 @@ def test_a_store_by_defaults_suits_the_scanner_and_locates_its_scans(ride: Path,
     assert settings_of_scans(ScanSequence(ride), cut=True).spacing < settings.spacing
 
 
+def test_a_scanner_that_sees_few_metres_is_recorded_wherever_it_walks(tmp_path: Path) -> None:
+    """1.3 m above the ground, 1 m beside the centres of cells: far from all of them by R 1."""
+    ride = tmp_path / "yard"
+    (ride / "scans").mkdir(parents=True)
+    rng = np.random.default_rng(5)
+    boxes = []
+    while len(boxes) < 60:
+        x, y = rng.uniform(-14, 26), rng.uniform(-12, 12)
+        half, height = rng.uniform(0.15, 0.8, 2), rng.uniform(0.7, 2.5)
+        if abs(y - 1) > 1.2 + half.max():
+            boxes.append([x, y, height / 2, *half, height / 2, rng.uniform(0, np.pi)])
+    world = World(100.0, 30.0, 2, np.array(boxes), np.zeros((0, 2)), np.zeros((0, 2), np.int64))
+    scanner = Scanner(columns=450, rings=16, lowest_deg=-25, highest_deg=5, farthest=9.0, noise=0.01)
+    poses = np.array([se3_exp(np.array([0, 0, 0, 0, 0, 0.03 * n])) for n in range(25)])
+    poses[:, :3, 3] = [[0.5 * n, 1.0, 1.3] for n in range(25)]
+    for number, T in enumerate(poses):
+        np.save(ride / "scans" / f"{number:06d}.npy", scanner.scan(world, T, number).points)
+    write_tum(ride / "trajectory.txt", np.arange(25) / 10, poses)
+    output = done("submaps", ride, "--out", tmp_path / "yard.grid")
+    assert "that nothing was recorded of" not in output and "7 cells written" in output
+    done("localize", tmp_path / "yard.grid", ride, "--start-pose", "given", "--out", tmp_path / "out")
+    assert summary(tmp_path / "out")["located_share"] == 1 and errors(tmp_path / "out", ride).max() < 0.03
+    output = done("submaps", ride, "--out", tmp_path / "few.grid", "--radius", 1)
+    assert "25 of 25 poses lie in cells that nothing was recorded of" in output and "submaps.radius=1.74" in output
+
+
 def test_what_is_set_wins_and_a_map_that_is_too_small_is_warned_of(ride: Path, tmp_path: Path) -> None:
     seed = ["--spacing", 2, "--radius", 1.5, "--sensor-range", 10, "--voxel", 0.05]
     done("submaps", ride, "--out", tmp_path / "small.grid", *seed, "--set", "submaps.partial_radius=10")
@@ -87,7 +114,10 @@ def test_what_is_set_wins_and_a_map_that_is_too_small_is_warned_of(ride: Path, t
     strict = [word for one in ("scans.min_overlap=0.9", "scans.min_counted=1000000") for word in ("--set", one)]
     strict += ["--out", tmp_path / "strict"]
     done("localize", tmp_path / "small.grid", ride, "--start-pose", "given", *strict)
-    assert set(summary(tmp_path / "strict")["statuses"]) == {"found", "lost"}  # what tracking loses is looked up
+    frames = json.loads((tmp_path / "strict" / "localization.json").read_text())["frames"]
+    assert {frame["status"] for frame in frames} <= {"found", "lost"}  # what tracking loses is looked up
+    found = [frame["overlap"] for frame in frames if frame["status"] == "found"]
+    assert found and min(found) >= 0.9
 
 
 def test_settings_that_do_not_exist_are_one_error(ride: Path, tmp_path: Path) -> None:
@@ -104,7 +134,9 @@ def test_small_scenes_keep_their_settings(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     (tmp_path / "near").mkdir()
     np.save(tmp_path / "near" / "0.npy", rng.uniform(-4, 4, (5000, 3)))
-    assert settings_of_scans(ScanSequence(tmp_path / "near")) == INDOORS
+    near = settings_of_scans(ScanSequence(tmp_path / "near"))
+    assert near == replace(INDOORS, radius=near.radius) and near.radius >= np.sqrt(3) / 2 * near.spacing
+    assert with_chosen(near, {"spacing": 1.0}).radius == pytest.approx(0.9)
     assert settings_of_cloud(rng.uniform(-10, 10, (5000, 3))) == INDOORS
     assert settings_of_cloud(np.zeros((0, 3))) == INDOORS
     outdoors = settings_of_cloud(rng.uniform(-80, 80, (5000, 3)) * [1, 1, 0.05])

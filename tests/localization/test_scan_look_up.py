@@ -11,7 +11,7 @@ import pytest
 
 from ggslam.errors import ConfigError
 from ggslam.formats.raw_points import read_pose_graph, read_raw_points
-from ggslam.localization.level import about_z, floor_height
+from ggslam.localization.level import about_z, floor_height, level_turn
 from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
 from ggslam.localization.map_picture import picture_of_store
 from ggslam.localization.near import Near, parse_near
@@ -24,7 +24,7 @@ from ggslam.localization.scans import LaserScan
 from ggslam.localization.surface import NORMAL, SCAN_TARGET, PartialSurface, packed_normals
 from ggslam.localization.visits import ScanSights, record_visit
 from ggslam.native.loader import NativeContext
-from ggslam.scene.poses import separation, transform_points
+from ggslam.scene.poses import se3_exp, separation, transform_points
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
@@ -127,6 +127,57 @@ def test_scans_are_found_where_they_were_made(made: Made, kind: str, request: py
         assert result.status is LocalizationStatus.FOUND and moved < 0.02 and turned < 0.2
     lost = [result.reason for result in results if not result.status.is_located]
     assert all(reason for reason in lost)
+
+
+@pytest.mark.parametrize("tilt_deg", [6.0, 10.0])
+def test_a_tilted_sensor_is_found(made: Made, recorded: Path, tilt_deg: float) -> None:
+    T = made.poses[20].copy()
+    for turn in ([0, 1, 0], [1, -1, 0]):
+        axis = np.radians(tilt_deg) * np.array(turn) / np.linalg.norm(turn)
+        mount = se3_exp(np.array([0, 0, 0, *axis]))
+        points = SCANNER.scan(made.world, T @ mount, 77).points.astype(float)
+        up = (T @ mount)[2, :3]
+        assert np.degrees(np.arccos(level_turn(points)[2] @ up)) < 1.0
+        (result,) = looked_up(recorded, [points])
+        moved, turned = separation(result.T_world_sensor, T @ mount)
+        assert result.status is LocalizationStatus.FOUND and moved < 0.03 and turned < 0.3
+
+
+def test_levelling_leaves_what_stands_upright() -> None:
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-9, 9, (2000, 2)), np.full(2000, -1.5)])
+    assert np.array_equal(level_turn(ground), np.eye(3))
+    assert np.array_equal(level_turn(ground[:20]), np.eye(3)) and np.array_equal(level_turn(ground[:0]), np.eye(3))
+    tilted = ground @ se3_exp(np.array([0, 0, 0, np.radians(8), 0, 0]))[:3, :3]
+    assert np.abs((tilted @ level_turn(tilted).T)[:, 2] + 1.5).max() < 1e-9
+
+
+def test_scans_that_see_too_little_are_refused(made: Made, recorded: Path) -> None:
+    scan, T = made.scans[20], made.poses[20]
+    near = scan[np.linalg.norm(scan, axis=1) < 2.0]
+    narrow = scan[np.abs(np.degrees(np.arctan2(scan[:, 1], scan[:, 0]))) < 5]
+    for few in (near, narrow):
+        (result,) = looked_up(recorded, [few])
+        assert result.status is LocalizationStatus.LOST and ("too little" in result.reason or "floor" in result.reason)
+    ring = Scanner(rings=1, columns=720, lowest_deg=0, highest_deg=0).scan(made.world, T, 1).points
+    (result,) = looked_up(recorded, [ring])
+    assert result.status is LocalizationStatus.LOST and "single ring" in result.reason
+
+
+def test_a_map_of_few_places_believes_only_what_matches_well(made: Made, tmp_path: Path) -> None:
+    """What was seen from one place: all scans of the walk look most like it."""
+    with GridStore.create(tmp_path / "one.grid", GROUND) as store:
+        record_visit(store, [LaserScan(0, 0.0, made.scans[0])], made.poses[:1], ScanSights("xy"), "one")
+    results = looked_up(tmp_path / "one.grid", made.scans[:40:3])
+    assert results[0].status is LocalizationStatus.FOUND
+    for result, T in zip(results, made.poses[:40:3], strict=True):
+        if result.status.is_located:
+            assert separation(result.T_world_sensor, T)[0] < 0.1 and result.overlap >= 0.5
+    with GridStore.open(tmp_path / "one.grid") as store, PartialSurface(store, SCAN_TARGET, NativeContext()) as surface:
+        look_up = ScanLookUp(lambda: scan_places(store), "xy", min_overlap=0.9999)
+        tracker = ScanTracker(ScanTrackerSettings(), NativeContext(), None, look_up)
+        strict = Localizer(surface, tracker, None).locate(made.scans[3])
+    assert strict.status is LocalizationStatus.LOST and "100% needed" in strict.reason
 
 
 @pytest.mark.long("ten scans, each looked up on its own")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Sequence as Several
@@ -21,18 +22,21 @@ from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.sensor_settings import settings_of_scans, with_chosen
 from ggslam.jobs.submaps.stores import INDOORS, cloud_voxel, is_cloud, is_store, store_of_cloud, store_of_run, visit_of
 from ggslam.localization.frames import FrameTracker
-from ggslam.localization.localizer import Localization, Localizer
+from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
+from ggslam.localization.map_picture import MapPicture
 from ggslam.localization.near import Near, parse_near
 from ggslam.localization.places import StoredPlaces
 from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.scan_maps import scan_places
+from ggslam.localization.scan_places import ScanPlaces
 from ggslam.localization.scan_tracker import ScanTracker
 from ggslam.localization.scans import ScanSequence, scan_files
 from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface, point_spacing
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
-from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.scene.origin import GRID
+from ggslam.scene.poses import quaternion_to_matrix, separation
 from ggslam.sequences.rig import one_camera
 from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
@@ -48,6 +52,8 @@ _SHORT = 8
 """Letters of a run's fingerprint in the name of the store of its map."""
 _FARTHEST = 1e7
 """Metres from the origin of the map that a start pose may be."""
+_WHOLE = GRID / 4
+"""Metres that are a whole number of a scan's voxels: origins lie on the grid of coarse ones, four times as wide."""
 _FINEST = 1.5
 """A target's voxels are at least this many times as wide as those that the map was thinned with, and for scans as its
 points are apart."""
@@ -116,7 +122,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         opened.callback(surface.close)
         places: StoredPlaces | ScanLookUp | None
         if isinstance(recording, ScanSequence):
-            places = ScanLookUp(partial(scan_places, store, near), store.settings.axes, chosen.settings.look_up)
+            places = _scan_look_up(request, store, near, chosen.settings)
         else:
             places = _places(request, recording, store, start, near, observer)
         localizer = _localizer(chosen.settings, recording, places, surface, context, start)
@@ -129,7 +135,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
             submaps.partial_radius,
         )  # fmt: skip
-    for warning in report.warnings():
+    for warning in [*filter(None, [_start_note(start, results)]), *report.warnings()]:
         observer.note(warning)
     with delay_interrupts():
         write_localization(report, out, observer)
@@ -231,7 +237,11 @@ def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | N
 
 
 def _target(request: LocalizeRequest, submaps: SubmapSettings, own: TargetSettings, spacing: float) -> TargetSettings:
+    """Of images or (`own` is `SCAN_TARGET`) scans, whose map may lie anywhere in the world: a map moved by whole
+    hundreds of metres has the same voxels."""
     voxel = max(own.voxel, _FINEST * submaps.voxel, _FINEST * spacing)
+    if own is SCAN_TARGET and voxel < _WHOLE:
+        voxel = _WHOLE / math.floor(_WHOLE / voxel * (1 + 1e-9))
     return replace(own, voxel=voxel if request.voxel is None else request.voxel)
 
 
@@ -252,6 +262,33 @@ def _places(
         where = "" if near is None else f" {near}"
         raise ConfigError(f"{request.map}: has no places to look up{where}: `start_pose` is needed{reason}")
     return places
+
+
+def _scan_look_up(
+    request: LocalizeRequest, store: GridStore, near: Near | None, settings: LocalizeSettings
+) -> ScanLookUp:
+    held = None if near is None else scan_places(store, near)
+    if held is not None and not len(held):
+        raise ConfigError(f"`near`: {request.map} has nothing {near}")
+
+    def make() -> ScanPlaces | MapPicture:
+        return scan_places(store) if held is None else held
+
+    return ScanLookUp(make, store.settings.axes, settings.look_up, settings.scans.min_overlap)
+
+
+def _start_note(start: np.ndarray | None, results: Several[Localization]) -> str:
+    """What became of a start pose that was not used; empty if it was, or there was none."""
+    if start is None or not results or results[0].status in (LocalizationStatus.OK, LocalizationStatus.DEGENERATE):
+        return ""
+    first = results[0]
+    if first.status is not LocalizationStatus.FOUND:
+        return f"the start pose was not used: {first.reason}"
+    moved, turned = separation(start, first.T_world_sensor)
+    return (
+        f"the start pose was not used: nothing matches there; the first one was looked up and found {moved:.1f} m and "
+        f"{turned:.0f} degrees from it"
+    )
 
 
 def _localizer(
@@ -281,6 +318,8 @@ def _run(
         for item in items:
             results.append(localizer.locate(item))
             observer.advance(len(results), len(recording))
+        if isinstance(recording, ScanSequence) and recording.all_empty:
+            raise SequenceError(f"{recording.path}: none of {len(recording)} scans has a point with a position")
     except (GgslamError, KeyboardInterrupt) as stopped:  # what was located is written first
         return results, stopped
     return results, None

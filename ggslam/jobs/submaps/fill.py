@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -38,6 +39,8 @@ from ggslam.submaps.store_objects import ObjectEvent, StoreObjects, read_objects
 
 AddRun = Callable[[Path, GridStore, "str | None", "float | None"], object]
 """Writes a run (its folder) into a store that is open for writing, as a visit of a name at a time."""
+_MANY = 0.1
+"""A note where more than this share of a recording left nothing in the store."""
 _NEAR_IN_TIME = 0.02
 """Seconds by which a pose of another file may differ from a frame."""
 
@@ -141,6 +144,8 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
             watched = _with_progress(items, observer, len(poses))
             written = record_visit(store, watched, poses, sights, request.visit or source.resolve().name, request.at)
             observer.note(f"{len(written)} cells written")
+            if missed := _words_of_missed(store, poses):
+                observer.note(missed)
         elif cloud is not None:
             store_of_cloud(source, store, request.visit, request.at, cloud=cloud)
         else:
@@ -252,6 +257,20 @@ def _poses(
     if not near.any():
         raise FormatError(f"{request.poses}: none of its times is within {_NEAR_IN_TIME} s of a frame")
     return poses
+
+
+def _words_of_missed(store: GridStore, poses: np.ndarray) -> str:
+    """What to say of items, of poses [n, 4, 4], in cells that nothing is recorded of; empty if those are few."""
+    known = poses[np.isfinite(poses).all((1, 2)), :3, 3]
+    missed = sum(store.key_of(position) not in store for position in known)
+    if missed <= _MANY * len(known):
+        return ""
+    s, grid = store.settings, store.grid
+    enough = math.ceil(50 * s.spacing * math.sqrt(grid.spans.sum())) / 100
+    return (
+        f"{missed} of {len(known)} poses lie in cells that nothing was recorded of: none came within R {s.radius:g} m "
+        f"of their centres; `--set submaps.radius={enough:g}` records every cell that is passed"
+    )
 
 
 def _with_progress(items: Iterator[Frame | LaserScan], observer: Observer, total: int) -> Iterator[Frame | LaserScan]:

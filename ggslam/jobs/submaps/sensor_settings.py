@@ -3,7 +3,8 @@
 
 Most of a scan's points lie within R'; farther ones are few and add little. A scanner's sub-maps reach far beyond their
 cells, so cells of a third of R' are enough of them. Where a whole cloud is cut, a cell has only what lies in it, and
-smaller cells follow the ball of R' better. Depth cameras and scanners that see no farther than 10 m get `INDOORS`.
+smaller cells follow the ball of R' better. Depth cameras and rooms get `INDOORS`, scanners that see no farther than
+10 m the same with a greater R: a walk need not come near the centres of its cells, which lie one above another, too.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ _CUT_CELLS = 6
 """R' over the edge of a cloud's cells."""
 _NEAR_CENTRE = 0.9
 """R over the edge of a cell: from 0.87 on each place in a cube is within R of its centre."""
+_SHORT = replace(INDOORS, radius=_NEAR_CENTRE * INDOORS.spacing)
+"""Of a scanner that sees no farther than rooms reach."""
 _VOXELS = 300
 """R' over the edge of a voxel."""
 _OUTDOORS_M = 60.0
@@ -52,7 +55,7 @@ def settings_of_scans(scans: ScanSequence, cut: bool = False) -> SubmapSettings:
     ranges = np.concatenate([np.linalg.norm(scans.scan(number).points, axis=1) for number in chosen.tolist()])
     ranges = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(ranges):
-        return INDOORS
+        return _SHORT
     most, farthest = np.percentile(ranges, [_MOST, _ALMOST_ALL]).tolist()
     return _of_reach(most * _SPARE, farthest, cut)
 
@@ -72,7 +75,7 @@ def settings_of_cloud(points: np.ndarray) -> SubmapSettings:
 def with_chosen(settings: SubmapSettings, chosen: Mapping[str, Any]) -> SubmapSettings:
     """Settings with fields that were set on purpose; R goes with an edge of a cell that was."""
     edge = chosen.get("spacing")
-    if edge is not None and "radius" not in chosen and settings.spacing != INDOORS.spacing:
+    if edge is not None and "radius" not in chosen and settings.radius != INDOORS.radius:
         settings = replace(settings, radius=_NEAR_CENTRE * edge)
     return replace(settings, **chosen)
 
@@ -88,7 +91,7 @@ def in_words(settings: SubmapSettings) -> str:
 
 def _of_reach(reach: float, farthest: float, cut: bool) -> SubmapSettings:
     if reach <= INDOORS.partial_radius:
-        return INDOORS
+        return _SHORT
     radius = min(_FARTHEST, _round_up(reach))
     spacing = max(INDOORS.spacing, _handy(radius / (_CUT_CELLS if cut else _CELLS)))
     return replace(
