@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import NoPointsError, SequenceError
-from ggslam.formats.cloud_files import read_cloud_file
+from ggslam.formats.cloud_files import NOT_READ, read_cloud_file
 from ggslam.formats.pcd import read_viewpoint
 from ggslam.formats.trajectory import read_trajectory
 
 _SUFFIXES = (".bin", ".npy", ".pcd")
 _POSES = ("trajectory.txt", "groundtruth.txt", "poses.txt", "trajectory.csv", "poses.g2o")
+_BAGS = (".bag", ".mcap")
+"""These may hold images."""
 _RATE = 10.0
 """Scans per second where nothing tells times."""
 
@@ -107,6 +109,14 @@ def scan_files(path: Path) -> list[Path]:
             if files:
                 return files
     return []
+
+
+def refuse_unread_scans(path: Path) -> None:
+    """Raises SequenceError for a folder of scans of a kind that is not read; says why."""
+    for folder in (path / "scans", path):
+        for file in sorted(folder.iterdir()) if folder.is_dir() else []:
+            if file.suffix.lower() in NOT_READ and file.suffix.lower() not in _BAGS:
+                raise SequenceError(f"{file}: is not read: {NOT_READ[file.suffix.lower()]}")
 
 
 def _poses(folder: Path, files: list[Path]) -> tuple[np.ndarray, np.ndarray | None]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import ggslam, refuse
 
 from ggslam.errors import FormatError, SequenceError
 from ggslam.formats.pcd import pcd_bytes
@@ -58,3 +59,13 @@ def test_poses_of_scans_may_stand_in_their_own_headers(tmp_path: Path) -> None:
     (tmp_path / "2.pcd").write_bytes(data.replace(own, b"VIEWPOINT 0 0 0 0 0 0 0"))
     with pytest.raises(FormatError, match=r"2\.pcd: VIEWPOINT"):
         ScanSequence(tmp_path)
+
+
+@pytest.mark.parametrize("command", [("localize", "{map}", "{scans}"), ("submaps", "{scans}", "--out", "{out}")])
+@pytest.mark.parametrize("ending", ["las", "e57", "pcap"])
+def test_folders_of_scans_of_other_kinds_are_named(tmp_path: Path, command: tuple[str, ...], ending: str) -> None:
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / f"0.{ending}").write_bytes(b"LASF")
+    paths = {"map": tmp_path.parent / f"{tmp_path.name}.npy", "scans": tmp_path, "out": tmp_path / "store"}
+    np.save(paths["map"], np.random.default_rng(0).normal(size=(100, 3)))
+    refuse(ggslam(*(word.format(**paths) for word in command)), f"0.{ending}: is not read")

@@ -30,7 +30,7 @@ from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.scan_maps import scan_places
 from ggslam.localization.scan_places import ScanPlaces
 from ggslam.localization.scan_tracker import ScanTracker
-from ggslam.localization.scans import ScanSequence, scan_files
+from ggslam.localization.scans import ScanSequence, refuse_unread_scans, scan_files
 from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface, Surface, point_spacing
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER, RunFolder
@@ -223,6 +223,7 @@ def _open_recording(request: LocalizeRequest) -> Sequence | ScanSequence:
     if request.sequence.format is None and scan_files(path):
         wanted = request.sequence
         return ScanSequence(path, wanted.start, wanted.stop, wanted.stride, request.columns)
+    refuse_unread_scans(path)
     return one_camera(request.sequence.open(), "localising")
 
 

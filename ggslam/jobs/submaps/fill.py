@@ -25,7 +25,7 @@ from ggslam.jobs.submaps.stores import (
     store_of_cloud,
     store_of_run,
 )
-from ggslam.localization.scans import LaserScan, ScanSequence, scan_files
+from ggslam.localization.scans import LaserScan, ScanSequence, refuse_unread_scans, scan_files
 from ggslam.localization.visits import FrameSights, ScanSights, record_visit
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER
@@ -227,6 +227,7 @@ def _open(
     if scan_files(request.source):
         scans = _scans(request)
         return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights(settings.axes)
+    refuse_unread_scans(request.source)
     frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())
     poses = _poses(request, frames.timestamps, frames.ground_truth, frames.pose_problem)
