@@ -7,7 +7,7 @@
 3. G-ICP. Then the scan has to agree with the map both ways: what stands in the scan lies on surfaces of the map, and
    the scan looks through none of them. Where two different poses agree about equally well, neither is believed.
 
-A sensor that is tilted is levelled by the floor first (`level_turn`).
+A sensor whose floor is tilted (`level_turn`) is tried both ways: it may be the sensor that is tilted, or the ground.
 
 How much a match tells depends on what the scan sees: one that sees little, near or in a narrow view, finds it at many
 places; and where a map has few places nothing shows how much other ones would match. Both then want more.
@@ -127,14 +127,18 @@ class _Scan:
     T_scan_sensor: np.ndarray
 
     @staticmethod
-    def of(points: np.ndarray) -> _Scan | None:
-        """Of points [n, 3] in the sensor's frame; None where they show no floor."""
+    def of(points: np.ndarray) -> list[_Scan]:
+        """Of points [n, 3] in the sensor's frame: as they are, and with a tilted floor levelled; none where they show
+        no floor."""
         points = np.asarray(points, np.float64)[np.isfinite(points).all(1)]
-        T = np.eye(4)
-        T[:3, :3] = level_turn(points)
-        points = points @ T[:3, :3].T
-        floor = floor_height(points)
-        return None if floor is None else _Scan(points, floor, T)
+        turn = level_turn(points)
+        found = []
+        for R in (np.eye(3), turn) if (turn != np.eye(3)).any() else (turn,):
+            T, level = np.eye(4), points @ R.T
+            T[:3, :3], floor = R, floor_height(level)
+            if floor is not None:
+                found.append(_Scan(level, floor, T))
+        return found
 
     def standing_points(self, voxel: float) -> np.ndarray:
         """What stands upright, one point in a voxel, [m, 3]."""
@@ -194,25 +198,29 @@ class ScanLookUp:
         """
         if self._places is None:
             self._places = self._make_places()
-        scan = _Scan.of(points)
-        reason = self._why_not(scan)
-        if scan is None or reason:
+        scans = _Scan.of(points)
+        reason = self._why_not(scans)
+        if reason:
             return None, reason
-        found, tried = self._try_all(scan, surface, align)
-        if found:
-            best = max(found, key=lambda pose: pose.score).alignment.T_world_camera
-            turned = best @ scan.T_scan_sensor
-            turned[:3, :3] = turned[:3, :3] @ about_z(np.pi)
-            if (pose := self._try(scan, turned, surface, align)) is not None:
-                found.append(pose)
+        found: list[FoundPose] = []
+        tried = 0
+        for scan in scans:
+            poses, count = self._try_all(scan, surface, align)
+            found, tried = found + poses, tried + count
+            if poses:
+                best = max(poses, key=lambda pose: pose.score).alignment.T_world_camera
+                turned = best @ inverse(scan.T_scan_sensor)
+                turned[:3, :3] = turned[:3, :3] @ about_z(np.pi)
+                if (pose := self._try(scan, turned, surface, align)) is not None:
+                    found.append(pose)
         return self._judge(sorted(found, key=lambda pose: -pose.score), tried)
 
-    def _why_not(self, scan: _Scan | None) -> str:
-        if scan is None:
+    def _why_not(self, scans: list[_Scan]) -> str:
+        if not scans:
             return _NO_FLOOR
-        if scan.is_ring:
+        if scans[0].is_ring:
             return "a scan of a single ring cannot be looked up: it shows no heights"
-        if scan.structure < self.settings.min_structure:
+        if max(scan.structure for scan in scans) < self.settings.min_structure:
             return "the scan sees too little to tell one place from another"
         return "" if self._places else "there are no places to look it up among"
 

@@ -100,6 +100,7 @@ def test_a_scanner_that_sees_few_metres_is_recorded_wherever_it_walks(tmp_path: 
     assert "25 of 25 poses lie in cells that nothing was recorded of" in output and "submaps.radius=1.74" in output
 
 
+@pytest.mark.long("locates a ride three times")
 def test_what_is_set_wins_and_a_map_that_is_too_small_is_warned_of(ride: Path, tmp_path: Path) -> None:
     seed = ["--spacing", 2, "--radius", 1.5, "--sensor-range", 10, "--voxel", 0.05]
     done("submaps", ride, "--out", tmp_path / "small.grid", *seed, "--set", "submaps.partial_radius=10")
@@ -145,6 +146,7 @@ def test_small_scenes_keep_their_settings(tmp_path: Path) -> None:
     assert with_chosen(outdoors, {"spacing": 3.0, "radius": 1.0}).radius == 1.0
 
 
+@pytest.mark.long("locates scans of a LiDAR")
 def test_the_lidar_of_the_field_is_located(shared_data: Path, tmp_path: Path) -> None:
     """Raw scans of KITTI in a map of three of them: as near the given poses as against the whole map."""
     case = shared_data / "field" / "maps" / "lidar_radius"
