@@ -28,7 +28,8 @@ from ggslam.system.array_forms import Form, PoseForm, check_arrays
 
 PLACES = "places.npz"
 _FORMS = {
-    "poses": PoseForm("f8", "views"), "counts": Form("int", "views", below=2**31 - 1),
+    "poses": PoseForm("f8", "views", farthest_m=PoseForm.FARTHEST_ON_EARTH_M),
+    "counts": Form("int", "views", below=2**31 - 1),
     "codes": Form("u1", "views", None), "descriptors": Form("u1", "landmarks", 32),
     "points": Form("f4", "landmarks", 3, finite=True),
     "camera": Form("f8", 6, finite=True),

@@ -67,18 +67,22 @@ class PoseForm(Form):
     Args:
         code: as of `Form`.
         leading: lengths of the axes before the last two.
+        farthest_m: metres from the origin that they may be.
     """
 
-    FARTHEST_M = 1e7
-    """From the origin: UTM and Earth-centred coordinates are nearer."""
+    FARTHEST_M = 1e6
+    """In the world of a run: farther off float32 has steps of 0.1 m."""
+    FARTHEST_ON_EARTH_M = 1e7
+    """In the world of a map: UTM and Earth-centred coordinates are nearer."""
     _ROUNDING = 1e-3
 
-    def __init__(self, code: str = "f8", *leading: int | str | None) -> None:
+    def __init__(self, code: str = "f8", *leading: int | str | None, farthest_m: float = FARTHEST_M) -> None:
         super().__init__(code, *leading, 4, 4, finite=True)
+        self._farthest_m = farthest_m
 
     def _check_values(self, array: np.ndarray) -> str | None:
-        if not np.isfinite(array).all() or np.abs(array).max(initial=0) > self.FARTHEST_M:
-            return f"expected a pose within {self.FARTHEST_M:g} m of the origin"
+        if not np.isfinite(array).all() or np.abs(array).max(initial=0) > self._farthest_m:
+            return f"expected a pose within {self._farthest_m:g} m of the origin"
         rotation = array[..., :3, :3]
         off = np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max(initial=0)
         if off > self._ROUNDING or (np.linalg.det(rotation) < 0).any() or (array[..., 3, :] != [0, 0, 0, 1]).any():

@@ -37,8 +37,8 @@ class FusionSettings(Structure):
 
     _fields_ = [
         ("min_depth", c_float), ("max_depth", c_float), ("free_share", c_float), ("edge", c_float),
-        ("clearing", c_float), ("max_free_weight", c_float), ("points", c_int32),
-        ("bounded", c_int32), ("low", c_int32 * 3), ("high", c_int32 * 3),
+        ("clearing", c_float), ("max_free_weight", c_float), ("points", c_int32), ("bounded", c_int32),
+        ("low", c_int32 * 3), ("high", c_int32 * 3),
     ]
 
 
