@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from ggslam.errors import ConfigError
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
+
+Settings = TypeVar("Settings")
 
 
 def with_overrides(overrides: Sequence[str] | None, values: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -29,6 +31,19 @@ def with_overrides(overrides: Sequence[str] | None, values: dict[str, Any] | Non
             raise ConfigError(f"`overrides` {override}: cannot be read as a value: {error}") from None
         _assign(values, name.strip().split("."), value, override)
     return values
+
+
+def settings_with(kind: type[Settings], overrides: Sequence[str] | None) -> tuple[Settings, dict[str, Any]]:
+    """Settings of a class with overrides, and the nested values that they set.
+
+    Raises:
+        ConfigError: naming the setting.
+    """
+    values = with_overrides(overrides)
+    try:
+        return kind(**values), values
+    except ConfigError as error:
+        raise ConfigError(f"`overrides`: {error}") from None
 
 
 def _assign(values: dict[str, Any], names: list[str], value: Any, override: str) -> None:

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from ggslam.errors import ConfigError
 from ggslam.localization.scan_look_up import ScanLookUpSettings
 from ggslam.localization.scan_tracker import ScanTrackerSettings
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.system.overrides import with_overrides
+from ggslam.system.overrides import settings_with
 from ggslam.system.settings import settings_class
 from ggslam.tracking.settings import TrackerSettings
 
@@ -47,10 +46,5 @@ def localize_settings(overrides: Sequence[str] | None) -> ChosenSettings:
     Raises:
         ConfigError: naming the setting.
     """
-    values = with_overrides(overrides)
-    try:
-        settings = LocalizeSettings(**values)
-    except ConfigError as error:
-        raise ConfigError(f"`overrides`: {error}") from None
-    chosen = values.get("submaps", {})
-    return ChosenSettings(settings, {name: getattr(settings.submaps, name) for name in chosen})
+    settings, values = settings_with(LocalizeSettings, overrides)
+    return ChosenSettings(settings, {name: getattr(settings.submaps, name) for name in values.get("submaps", {})})

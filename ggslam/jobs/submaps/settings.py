@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import field
 from typing import Any, ClassVar
 
-from ggslam.errors import ConfigError
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.system.overrides import with_overrides
+from ggslam.system.overrides import settings_with
 from ggslam.system.settings import settings_class
 
 
@@ -29,9 +28,5 @@ def store_overrides(overrides: Sequence[str] | None) -> dict[str, Any]:
     Raises:
         ConfigError: naming the setting.
     """
-    values = with_overrides(overrides)
-    try:
-        settings = StoreSettings(**values).submaps
-    except ConfigError as error:
-        raise ConfigError(f"`overrides`: {error}") from None
-    return {name: getattr(settings, name) for name in values.get("submaps", {})}
+    settings, values = settings_with(StoreSettings, overrides)
+    return {name: getattr(settings.submaps, name) for name in values.get("submaps", {})}
