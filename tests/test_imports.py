@@ -17,7 +17,7 @@ FLOORS = (
     {"slam", "localization", "merging", "changes"},
     {"tracking", "mapping", "loops", "movers", "objects", "volumes", "submaps", "coding", "evaluation", "viewer",
      "reporting"},
-    {"rendering", "sequences", "formats", "features", "synthetic", "geometry"},
+    {"rendering", "sequences", "formats", "features", "synthetic", "geometry", "sight"},
     {"scene", "native", "cuda"},
     {"system", "interface"},
     {"errors"},

@@ -15,13 +15,13 @@ from types import ModuleType
 from typing import Any
 
 from ggslam.errors import CoreInputError, CoreMemoryError, NativeCoreError
-from ggslam.interface.core import codec, common, mapping, movers, objects, rendering, tracking, volumes
+from ggslam.interface.core import codec, common, mapping, objects, rendering, sight, tracking, volumes
 from ggslam.interface.cuda import common as cuda_common
 from ggslam.interface.cuda import mapping as cuda_mapping
 from ggslam.interface.cuda import rendering as cuda_rendering
 from ggslam.interface.cuda import tracking as cuda_tracking
 
-CORE = (codec, common, mapping, movers, objects, rendering, tracking, volumes)
+CORE = (codec, common, mapping, objects, rendering, sight, tracking, volumes)
 CUDA = (cuda_common, cuda_mapping, cuda_rendering, cuda_tracking)
 _FAULTS = {common.CoreFault.BAD_INPUT: CoreInputError, common.CoreFault.MEMORY_RAN_OUT: CoreMemoryError}
 _LONGEST_MESSAGE = 512

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from ggslam.geometry.fixed_to_camera import is_in_image_part
+from ggslam.geometry.image_parts import is_in_image_part
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap

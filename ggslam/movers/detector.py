@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 
 from ggslam.geometry.moved_depth import largest_shift
-from ggslam.movers.evidence import CoarseView, Margin, compare, thin_out
 from ggslam.movers.segments import Gathering, gather, grow_places
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import Trail
@@ -23,6 +22,8 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
+from ggslam.sight.margin import Margin
+from ggslam.sight.places import CoarseView, compare, thin_out
 from ggslam.system.array_forms import Form, Mask
 
 AGES = (1, 2, 4, 8, 16, 32, 48)

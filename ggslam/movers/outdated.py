@@ -16,11 +16,12 @@ import cv2
 import numpy as np
 
 from ggslam.movers.detector import GROWN, grow
-from ggslam.movers.evidence import CoarseView, Margin, PairEvidence, compare, thin_out
 from ggslam.movers.segments import grow_places, large_parts
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
+from ggslam.sight.margin import Margin
+from ggslam.sight.places import CoarseView, PairEvidence, compare, thin_out
 from ggslam.system.array_forms import Form, Mask
 
 COLUMNS = 160

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from ggslam.geometry.fixed_to_camera import parts_with_seeds
-from ggslam.movers.evidence import thin_out
+from ggslam.geometry.image_parts import parts_with_seeds
 from ggslam.movers.settings import MoverSettings
+from ggslam.sight.places import thin_out
 
 SAME_THING = 0.03
 """Neighbouring places whose depths differ by less than this share are of one thing."""

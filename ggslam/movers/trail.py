@@ -8,13 +8,14 @@ from typing import Annotated
 
 import numpy as np
 
-from ggslam.geometry.fixed_to_camera import parts_with_seeds
+from ggslam.geometry.image_parts import parts_with_seeds
 from ggslam.geometry.voxels import neighbour_step, voxel_keys
-from ggslam.movers.evidence import CoarseView, Margin, compare
 from ggslam.movers.segments import Gathering, gather
 from ggslam.movers.settings import MoverSettings
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points
+from ggslam.sight.margin import Margin
+from ggslam.sight.places import CoarseView, compare
 from ggslam.system.array_forms import Form
 
 VOXEL = 0.05

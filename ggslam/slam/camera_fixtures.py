@@ -11,10 +11,11 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from ggslam.geometry.fixed_to_camera import compare_views, parts_with_seeds, shrink_depth
+from ggslam.geometry.image_parts import parts_with_seeds
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
+from ggslam.sight.fixed_to_camera import compare_views, shrink_depth
 from ggslam.system.array_forms import DepthImage, Form, Mask, Pose
 
 COLUMNS = 80

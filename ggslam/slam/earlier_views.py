@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
-from ggslam.movers.evidence import CoarseView
 from ggslam.movers.outdated import (
     EarlierView,
     OutdatedParts,
@@ -24,6 +23,7 @@ from ggslam.movers.outdated import (
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points, turning_angle
+from ggslam.sight.places import CoarseView
 from ggslam.slam.run_movers import SURE
 from ggslam.system.array_forms import Pose
 from ggslam.tracking.settings import DepthNoise

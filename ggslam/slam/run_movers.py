@@ -10,7 +10,6 @@ import numpy as np
 
 from ggslam.geometry.moved_depth import largest_shift
 from ggslam.movers.detector import GROWN, MoverDetector, coarse_factor, grow
-from ggslam.movers.evidence import CoarseView, Margin
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
@@ -19,6 +18,8 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
+from ggslam.sight.margin import Margin
+from ggslam.sight.places import CoarseView
 from ggslam.system.array_forms import Pose
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
@@ -154,7 +155,7 @@ class RunMovers:
 
 def _margin(settings: MoverSettings, noise: DepthNoise) -> Margin:
     """What depths of one surface may differ by."""
-    return Margin(settings.margin_m, settings.margin_sigmas, noise.constant, noise.square)
+    return Margin(settings.margin_m, 0.0, settings.margin_sigmas, noise.constant, noise.square)
 
 
 def _without(points: PointSource, mask: np.ndarray) -> DeferredPoints:

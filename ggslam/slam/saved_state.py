@@ -37,7 +37,6 @@ from ggslam.mapping.mean_map import MeanMap
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.sampling import KeyframeSampler
 from ggslam.movers.detector import MoverDetector
-from ggslam.movers.evidence import CoarseView
 from ggslam.movers.found import MoverSight
 from ggslam.movers.outdated import EarlierView
 from ggslam.movers.patches import Patch
@@ -56,6 +55,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.sequences.moving_pixels import MovingPixels
+from ggslam.sight.places import CoarseView
 from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.color_poses import ColorPoses
 from ggslam.slam.config import Config

@@ -18,7 +18,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.array_archive import ArrayArchive, Arrays
-from ggslam.geometry.fixed_to_camera import is_in_image_part
+from ggslam.geometry.image_parts import is_in_image_part
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from ggslam.movers.detector import MoverDetector
-from ggslam.movers.evidence import CoarseView, Margin, compare
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import Trail, gone_since
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.sight.margin import Margin
+from ggslam.sight.places import CoarseView, compare
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 WALL, BOX = 3.0, 1.5
@@ -46,7 +47,7 @@ def frame(
     return Frame(n, n, n / 30, color, depth, CAMERA, mask if ids else None)
 
 
-margin = Margin(0.004, 5.0, NOISE)
+margin = Margin(0.004, 0.0, 5.0, NOISE)
 
 
 def look_at(boxes: list[float | None], seed: int | None = 0, ids: bool = False) -> list[np.ndarray | None]:
@@ -170,7 +171,7 @@ def test_what_an_earlier_view_shows_at_the_trail_is_gone(ids: bool) -> None:
     assert gone_since(old, there, trail, before.mask, (240, 320), 3, margin, settings, CONTEXT) is None
 
 
-KINECT = Margin(0.004, 5.0, 0.008)
+KINECT = Margin(0.004, 0.0, 5.0, 0.008)
 
 
 def noisy(n: int, step: float, shared: bool) -> Frame:

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ggslam.geometry.fixed_to_camera import compare_views, is_in_image_part, parts_with_seeds, shrink_depth
+from ggslam.geometry.image_parts import is_in_image_part, parts_with_seeds
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, transform_points
 from ggslam.sequences import open_sequence
+from ggslam.sight.fixed_to_camera import compare_views, shrink_depth
 from ggslam.slam.camera_fixtures import VIEWS, CameraFixtures, find_fixtures
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam

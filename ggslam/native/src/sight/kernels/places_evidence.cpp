@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Places of one view in another: where they fall, and what that says of them.
-#include "movers/places.hpp"
+#include "sight/places.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 namespace {
@@ -45,8 +45,10 @@ void project_places(const PlacesView& a, const OtherPlacesView& other, const Pro
 
 void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count, const ProjectedPlaces& places,
                   uint8_t* found) {
-  const float constant = job.noise_constant, square = job.noise_square, least = job.margin_least;
-  const float sigmas = job.margin_sigmas, rough = job.rough;
+  const SightMargin& margin = job.margin;
+  const float constant = static_cast<float>(margin.constant), square = static_cast<float>(margin.square);
+  const float least = static_cast<float>(margin.least), share_of_z = static_cast<float>(margin.share);
+  const float sigmas = static_cast<float>(margin.sigmas), rough = job.rough;
   uint8_t* passed = found;
   uint8_t* clearly = passed + count;
   uint8_t* surely = clearly + count;
@@ -54,7 +56,8 @@ void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count, 
   uint8_t* otherwise = same + count;
   for (std::size_t i = 0; i < count; ++i) {
     const float z = places.z[i], near = places.near[i], far = places.far[i];
-    const float slack = least + sigmas * (places.smooth[i] ? share : rough) * (constant + square * z * z);
+    const float base = share_of_z * z > least ? share_of_z * z : least;
+    const float slack = base + sigmas * (places.smooth[i] ? share : rough) * (constant + square * z * z);
     const uint8_t known = places.known[i], there = places.where[i] >= 0;
     const uint8_t beyond = known & (near > z + 2 * slack);
     const uint8_t surface = there & (near < z + slack) & (far > z - slack);

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <limits>
 
-#include "movers/places.hpp"
+#include "sight/places.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 namespace {

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `ggslam.movers.evidence` finds, slowly, by OpenCV and NumPy."""
+"""What `ggslam.sight.places` finds, slowly, by OpenCV and NumPy."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from ggslam.movers.evidence import (
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse, transform_points
+from ggslam.sight.margin import Margin
+from ggslam.sight.places import (
     EVERY,
     FEWEST,
     KNOWN,
@@ -15,13 +18,10 @@ from ggslam.movers.evidence import (
     ROUGH,
     SMOOTH,
     CoarseView,
-    Margin,
     PairEvidence,
     _window,
     thin_out,
 )
-from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse, transform_points
 
 
 def coarse_view(

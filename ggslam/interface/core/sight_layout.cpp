@@ -1,18 +1,27 @@
 // SPDX-License-Identifier: Apache-2.0
-// Written by scripts/make_native_mirrors.py from movers.hpp; changes are lost. Size of each structure and
+// Written by scripts/make_native_mirrors.py from sight.hpp; changes are lost. Size of each structure and
 // offsets of its fields, in the order of the header, so that a caller can check its mirrors of them.
 #include <cstddef>
 #include <cstdint>
 
-#include "interface/core/movers.hpp"
+#include "interface/core/sight.hpp"
 
 using ggslam::DepthPlacesJob;
 using ggslam::OtherPlacesView;
 using ggslam::PlacesEvidenceJob;
 using ggslam::PlacesView;
+using ggslam::SightJob;
+using ggslam::SightMargin;
 
 namespace {
 constexpr std::size_t kLayout[] = {
+    sizeof(SightMargin), offsetof(SightMargin, least), offsetof(SightMargin, share), offsetof(SightMargin, sigmas),
+    offsetof(SightMargin, constant), offsetof(SightMargin, square),
+    sizeof(SightJob), offsetof(SightJob, depth), offsetof(SightJob, near), offsetof(SightJob, far),
+    offsetof(SightJob, height), offsetof(SightJob, width), offsetof(SightJob, fx), offsetof(SightJob, fy),
+    offsetof(SightJob, cx), offsetof(SightJob, cy), offsetof(SightJob, T_camera_world), offsetof(SightJob, margin),
+    offsetof(SightJob, points), offsetof(SightJob, depths), offsetof(SightJob, count), offsetof(SightJob, codes),
+    offsetof(SightJob, pixels), offsetof(SightJob, z),
     sizeof(DepthPlacesJob), offsetof(DepthPlacesJob, depth), offsetof(DepthPlacesJob, height),
     offsetof(DepthPlacesJob, width), offsetof(DepthPlacesJob, factor), offsetof(DepthPlacesJob, reach),
     offsetof(DepthPlacesJob, nearest), offsetof(DepthPlacesJob, farthest), offsetof(DepthPlacesJob, least),
@@ -23,15 +32,13 @@ constexpr std::size_t kLayout[] = {
     offsetof(PlacesView, cy),
     sizeof(OtherPlacesView), offsetof(OtherPlacesView, places), offsetof(OtherPlacesView, T_this_view),
     sizeof(PlacesEvidenceJob), offsetof(PlacesEvidenceJob, view), offsetof(PlacesEvidenceJob, others),
-    offsetof(PlacesEvidenceJob, count), offsetof(PlacesEvidenceJob, moved), offsetof(PlacesEvidenceJob, margin_least),
-    offsetof(PlacesEvidenceJob, margin_sigmas), offsetof(PlacesEvidenceJob, noise_constant),
-    offsetof(PlacesEvidenceJob, noise_square), offsetof(PlacesEvidenceJob, rough),
-    offsetof(PlacesEvidenceJob, least_share), offsetof(PlacesEvidenceJob, nearest), offsetof(PlacesEvidenceJob, every),
-    offsetof(PlacesEvidenceJob, fewest), offsetof(PlacesEvidenceJob, found),
+    offsetof(PlacesEvidenceJob, count), offsetof(PlacesEvidenceJob, moved), offsetof(PlacesEvidenceJob, margin),
+    offsetof(PlacesEvidenceJob, rough), offsetof(PlacesEvidenceJob, least_share), offsetof(PlacesEvidenceJob, nearest),
+    offsetof(PlacesEvidenceJob, every), offsetof(PlacesEvidenceJob, fewest), offsetof(PlacesEvidenceJob, found),
 };
 }  // namespace
 
-GGSLAM_EXPORT const std::size_t* ggslam_movers_layout(int* count) {
+GGSLAM_EXPORT const std::size_t* ggslam_sight_layout(int* count) {
   *count = static_cast<int>(sizeof(kLayout) / sizeof(kLayout[0]));
   return kLayout;
 }

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame's depth says against that of frames before it: where they looked through what it sees now, and where it
-looks through what they saw.
+"""Whole views against one another, several times smaller: where other views looked through what a view sees now. What
+moves, and what left since an earlier visit, is found by this.
 
-Both compare coarse images, and with the nearest (or the farthest) depth around each place, so that neither outlines nor
+Views are compared with the nearest (or the farthest) depth around each place, so that neither outlines nor
 the last millimetre of a pose are taken for something that moved. On smooth surfaces these are of means, whose noise is
 small; how small is measured on what two views see alike, for noise that neighbouring pixels share, warped depth and
 errors of poses do not average out.
@@ -18,18 +18,23 @@ import cv2
 import numpy as np
 
 from ggslam.interface.arrays import address
-from ggslam.interface.core.movers import DepthPlacesJob, OtherPlacesView, PlacesEvidenceJob, PlacesView
+from ggslam.interface.core.sight import (
+    DepthPlacesJob,
+    OtherPlacesView,
+    PlacesEvidenceJob,
+    PlacesView,
+    SightMargin,
+)
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
+from ggslam.sight.margin import Margin
 from ggslam.system.array_forms import DepthImage, Mask, Pose
 
 SMOOTH = 2.5
 """Where depth varies by no more standard deviations of the camera than this its mean is compared."""
 KNOWN = 0.9
 """Share of the pixels about a place that have depth where their mean is compared."""
-
-
 ROUGH = 1.3
 """Standard deviations of a pixel's depth by which those of rough places differ: the nearest of several is compared."""
 LEAST_SHARE = 0.2
@@ -40,30 +45,6 @@ EVERY = 7
 """Of so many smooth places one tells how much depths differ."""
 FEWEST = 40
 """If there are so many of them."""
-
-
-@dataclass(frozen=True)
-class Margin:
-    """What depths of one surface may differ by.
-
-    Attributes:
-        least: metres, whatever the noise: poses are no better.
-        sigmas: standard deviations of the depth camera's noise...
-        constant, square: ...which is constant + square z^2, metres.
-    """
-
-    least: float
-    sigmas: float
-    constant: float
-    square: float = 0.0
-
-    def __call__(self, z: np.ndarray, share: np.ndarray | float = 1.0) -> np.ndarray:
-        """At depths in metres; `share`: of a pixel's noise that is left where a mean is compared."""
-        return np.float32(self.least) + np.float32(self.sigmas) * share * self.sigma(z)
-
-    def sigma(self, z: np.ndarray) -> np.ndarray:
-        """Standard deviation of a pixel's depth, metres."""
-        return np.float32(self.constant) + np.float32(self.square) * z * z
 
 
 @dataclass(frozen=True)
@@ -179,8 +160,7 @@ def compare(
     job = PlacesEvidenceJob(_places(view, alive), ctypes.addressof(asked), len(others))
     if moved is not None:
         job.moved = address(_of_places(moved, np.uint8, view, alive))
-    job.margin_least, job.margin_sigmas = margin.least, margin.sigmas
-    job.noise_constant, job.noise_square = margin.constant, margin.square
+    job.margin = SightMargin(margin.least, margin.share, margin.sigmas, margin.constant, margin.square)
     job.rough, job.least_share, job.nearest, job.every, job.fewest = ROUGH, LEAST_SHARE, NEAREST, EVERY, FEWEST
     job.found = address(found)
     load_library().ggslam_places_evidence(context.handle, ctypes.byref(job))

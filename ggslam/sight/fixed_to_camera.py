@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from ggslam.scene.camera import Camera
@@ -70,17 +69,3 @@ def compare_views(depth: np.ndarray, other: np.ndarray, T_other_camera: np.ndarr
     seen = other[np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)]
     inside &= seen > 0
     return PairEvidence(still & inside & (seen > (1 + BEHIND) * z), still, inside & (np.abs(seen - z) < SAME * z))
-
-
-def parts_with_seeds(seeds: np.ndarray, candidates: np.ndarray, least_share: float) -> np.ndarray:
-    """The connected parts of `candidates`, bool [h, w], of which at least a share are `seeds`, which are candidates."""
-    count, labels = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=8)
-    inside, of_them = (np.bincount(labels[image], minlength=count) for image in (candidates, seeds & candidates))
-    good = (inside > 0) & (of_them >= least_share * np.maximum(inside, 1)) & (of_them > 0)
-    return candidates & good[labels]
-
-
-def is_in_image_part(points: np.ndarray, part: np.ndarray, camera: Camera) -> np.ndarray:
-    """Which points [n, 3] in the camera's frame fall on a part of its image, bool [H, W]; bool [n]."""
-    rows, columns, inside = camera.project(points)
-    return inside & part[rows, columns]

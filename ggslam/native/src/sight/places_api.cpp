@@ -1,17 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
-// Entry points of what movers are found by: rows and views handed to threads, and how much depths of one surface differ.
+// Entry points of what views say of places: rows, views and points handed to threads, and how much depths of one
+// surface differ.
 #include <algorithm>
 #include <cmath>
 #include <vector>
 
 #include "common/context.hpp"
 #include "common/guard.hpp"
-#include "movers/places.hpp"
+#include "sight/places.hpp"
 
 namespace ggslam {
 namespace {
 
-constexpr std::size_t kRows = 4;  // handed out at once
+constexpr std::size_t kRows = 4, kPoints = 4096;  // handed out at once
 constexpr float kNormal = 0.6745f;  // the median of a normal distribution's absolute values
 
 void check_view(const char* name, const PlacesView& view) {
@@ -20,6 +21,16 @@ void check_view(const char* name, const PlacesView& view) {
   check_within(name, numbers, 4, 1e7);
   const void* const arrays[] = {view.depth, view.near, view.far, view.whole, view.smooth};
   for (const void* array : arrays) check_array(name, array, 1);
+}
+
+void check_margin(const SightMargin& margin) {
+  const double numbers[] = {margin.least, margin.share, margin.sigmas, margin.constant, margin.square};
+  for (const double number : numbers) check_range("margin", number, 0.0, 1e9);
+}
+
+// Standard deviation of a pixel's depth, metres.
+float sigma_at(const SightMargin& margin, float z) {
+  return static_cast<float>(margin.constant) + static_cast<float>(margin.square) * z * z;
 }
 
 // How far depth at a place of the other view, between its four pixels, is from that of the point there.
@@ -32,7 +43,7 @@ float off_by(const PlacesEvidenceJob& job, const PlacesView& other, float u, flo
   const float* lower_row = other.depth + static_cast<std::size_t>(low) * other.width;
   const float upper = (1 - a) * upper_row[left] + a * upper_row[right];
   const float lower = (1 - a) * lower_row[left] + a * lower_row[right];
-  return std::fabs((1 - b) * upper + b * lower - z) / (job.noise_constant + job.noise_square * z * z);
+  return std::fabs((1 - b) * upper + b * lower - z) / sigma_at(job.margin, z);
 }
 
 // How large differences between means of depth are, in standard deviations of a pixel, as most of them are.
@@ -98,7 +109,7 @@ GGSLAM_EXPORT int ggslam_places_evidence(void* context_, const ggslam::PlacesEvi
   using namespace ggslam;
   Context& context = object_of<Context>(context_);
   const PlacesEvidenceJob& job = object_of<PlacesEvidenceJob>(job_);
-  check_view("view", job.view);
+  check_view("view", job.view), check_margin(job.margin);
   check_array("others", job.others, job.count), check_array("found", job.found, job.count);
   for (int i = 0; i < job.count; ++i) {
     check_view("other view", job.others[i].places);
@@ -114,6 +125,27 @@ GGSLAM_EXPORT int ggslam_places_evidence(void* context_, const ggslam::PlacesEvi
     project(job.view, job.others[i], places);
     const float share = measured_share(job, job.others[i].places, places, count);
     judge(job, share, count, places, job.found + 5 * count * i);
+  });
+  return 0;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_sight(void* context_, const ggslam::SightJob* job_) try {
+  using namespace ggslam;
+  Context& context = object_of<Context>(context_);
+  const SightJob& job = object_of<SightJob>(job_);
+  check_camera(job.width, job.height, job.fx, job.fy, job.cx, job.cy), check_margin(job.margin);
+  check_within("T_camera_world", job.T_camera_world, 12, 1e9);
+  const void* const images[] = {job.depth, job.near, job.far};
+  for (const void* image : images) check_array("images", image, 1);
+  const void* const results[] = {job.codes, job.pixels, job.z};
+  for (const void* result : results) check_array("results", result, job.count);
+  if (job.points == nullptr) {
+    const std::int64_t pixels = std::int64_t{job.height} * job.width;
+    check_range("count", job.count, pixels, pixels), check_array("depths", job.depths, job.count);
+  }
+  const auto classify = GGSLAM_DISPATCH(context.isa, classify_places);
+  context.pool.parallel_for(elements(job.count), kPoints, [&](std::size_t begin, std::size_t end, int) {
+    classify(job, begin, end);
   });
   return 0;
 } GGSLAM_CATCH_ALL

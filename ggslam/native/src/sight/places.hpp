@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Rows of what `interface/core/movers.hpp` describes.
+// Parts of what `interface/core/sight.hpp` describes.
 #pragma once
 #include <cstddef>
 
 #include "common/dispatch.hpp"
-#include "interface/core/movers.hpp"
+#include "interface/core/sight.hpp"
 
 namespace ggslam {
 
@@ -46,3 +46,5 @@ GGSLAM_DECLARE_KERNEL(void project_places(const PlacesView& view, const OtherPla
 // The results by one other view, [5, count]; `share`: of a pixel's noise, where both views are smooth.
 GGSLAM_DECLARE_KERNEL(void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count,
                                         const ProjectedPlaces& places, uint8_t* found))
+// What a view says of the points, or of its own pixels, [begin, end).
+GGSLAM_DECLARE_KERNEL(void classify_places(const SightJob& job, std::size_t begin, std::size_t end))

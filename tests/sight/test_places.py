@@ -7,14 +7,15 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from evidence_reference import coarse_view, compare_views
+from places_reference import coarse_view, compare_views
 
-from ggslam.movers.evidence import CoarseView, Margin, PairEvidence, compare
 from ggslam.native.loader import NativeContext, available_instruction_sets
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import se3_exp
+from ggslam.sight.margin import Margin
+from ggslam.sight.places import CoarseView, PairEvidence, compare
 
-MARGIN = Margin(0.004, 5.0, 0.001, 0.002)
+MARGIN = Margin(0.004, 0.0, 5.0, 0.001, 0.002)
 ARRAYS = ("depth", "near", "far", "whole", "smooth")
 
 

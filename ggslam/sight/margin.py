@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far measured depths of one surface may differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+SIGMAS = 5.0
+"""Standard deviations of the depth camera's noise up to which depths are of one surface: neighbouring pixels share a
+part of their noise, so that a few of many pixels are off by more than three."""
+
+
+class Noise(Protocol):
+    """The standard deviation of a depth camera at depth z is constant + square z^2, metres."""
+
+    @property
+    def constant(self) -> float:
+        """Metres, at the camera."""
+
+    @property
+    def square(self) -> float:
+        """1/m, growth with the squared depth."""
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Depths z of one surface differ by at most max(least, share z) + sigmas (constant + square z^2), metres.
+
+    The first term is for errors of poses and of the surfaces of maps, the second for the noise of the depth camera.
+    The defaults hold for views whose poses are refined, and for surfaces without noise, as maps render them.
+
+    Attributes:
+        least: metres; no surface is better known than this.
+        share: of the distance, for errors of rotation.
+        sigmas: standard deviations of the noise.
+        constant, square: the noise, see `Noise`.
+    """
+
+    least: float = 0.02
+    share: float = 0.01
+    sigmas: float = 0.0
+    constant: float = 0.0
+    square: float = 0.0
+
+    @staticmethod
+    def of(noise: Noise) -> Margin:
+        """The margin where depths of a camera with this noise are compared."""
+        return Margin(sigmas=SIGMAS, constant=noise.constant, square=noise.square)
+
+    def times(self, factor: float) -> Margin:
+        """A margin `factor` times as wide."""
+        return replace(self, least=factor * self.least, share=factor * self.share, sigmas=factor * self.sigmas)
+
+    def __call__(self, z: np.ndarray, noise_share: np.ndarray | float = 1.0) -> np.ndarray:
+        """Metres at depths z [...] in metres; `noise_share` of the noise is left where means of depth are compared."""
+        return np.maximum(self.least, self.share * z) + self.sigmas * noise_share * self.sigma(z)
+
+    def sigma(self, z: np.ndarray) -> np.ndarray:
+        """Standard deviation of the depth camera at depths [...] in metres, metres."""
+        return self.constant + self.square * z * z
