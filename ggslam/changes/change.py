@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from ggslam.changes.fits import Fit
-from ggslam.changes.sightings import Tolerance
 from ggslam.changes.things import Thing
+from ggslam.sight.margin import Margin
 
 Kind = Literal["moved", "removed", "added", "look", "unseen"]
 HARDLY_SEEN = "hardly looked at by the newer visit"
@@ -57,5 +57,5 @@ class Detection:
     unseen: list[Change] = field(default_factory=list)
     ids_believed: bool = False
     stayed: int = 0
-    tolerance: Tolerance = field(default_factory=lambda: Tolerance(0.0, 0.0))
+    tolerance: Margin = field(default_factory=lambda: Margin(0.0, 0.0))
     notes: list[str] = field(default_factory=list)

@@ -16,12 +16,13 @@ from ggslam.changes.placing import Placing
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
 from ggslam.changes.shapes import fit_shapes
-from ggslam.changes.sightings import Sightings, Surface, Tolerance, Visit
+from ggslam.changes.sightings import Sightings, Surface, Visit
 from ggslam.changes.thing_views import ThingViews
 from ggslam.changes.things import UNNAMED, JudgedSurface, Thing, things_by_id, things_by_surface
 from ggslam.changes.turns import hidden_sector, tell_turn
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points, turning_angle
+from ggslam.sight.margin import Margin
 from ggslam.volumes.upright import estimate_up
 
 _SAME_PLACE = 0.03
@@ -75,25 +76,25 @@ class ChangeDetector:
 
     # --- evidence ----------------------------------------------------------------------------------------------------
 
-    def _usual_tolerance(self, surfaces: list[Surface]) -> Tolerance:
+    def _usual_tolerance(self, surfaces: list[Surface]) -> Margin:
         """How near surfaces have to be to be one: by how much the visits differ where nothing changed."""
         s, offsets = self.settings, []
         for number, surface in enumerate(surfaces):
             sample = surface.points[:: max(1, len(surface.points) // _SAMPLE)]
-            least = Tolerance(_FAR_TOLERANCES * s.tolerance_m, _FAR_TOLERANCES * s.tolerance_relative)
+            least = Margin(_FAR_TOLERANCES * s.tolerance_m, _FAR_TOLERANCES * s.tolerance_relative)
             other = self.sights[1 - number].look_up(sample, least)
             offsets.append(np.abs(other.offset[np.isfinite(other.offset)]))
         usual = np.concatenate(offsets)
         spread = float(np.median(usual)) if len(usual) else 0.0
-        return Tolerance(s.tolerance_m, max(s.tolerance_relative, s.tolerance_spread * spread))
+        return Margin(s.tolerance_m, max(s.tolerance_relative, s.tolerance_spread * spread))
 
-    def _judge(self, number: int, surface: Surface, tolerance: Tolerance) -> JudgedSurface:
+    def _judge(self, number: int, surface: Surface, tolerance: Margin) -> JudgedSurface:
         own = self.sights[number].look_up(surface.points, tolerance)
         kept = (own.through <= self.settings.contradicted * own.present) & (own.present >= self.settings.min_views)
         points, ids = surface.points[kept], surface.labels[kept].astype(np.int64)
         other = self.sights[1 - number].look_up(points, tolerance)
         distance = cKDTree(self.visits[number].T_world_camera[:, :3, 3]).query(points)[0]
-        return JudgedSurface(points, surface.colors[kept], surface.toward[kept], ids, other, tolerance.at(distance))
+        return JudgedSurface(points, surface.colors[kept], surface.toward[kept], ids, other, tolerance(distance))
 
     def _ids_agree(self) -> bool:
         """Whether things that stayed have the same ids in both visits. Few may have taken the places of others."""

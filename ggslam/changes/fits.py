@@ -10,9 +10,10 @@ from scipy.spatial import cKDTree
 
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
-from ggslam.changes.sightings import Evidence, Sightings, Tolerance
+from ggslam.changes.sightings import Evidence, Sightings
 from ggslam.changes.things import color_apart
 from ggslam.scene.poses import inverse, transform_points
+from ggslam.sight.margin import Margin
 
 _APART_M = 0.05
 """Metres that surfaces lie apart which count as much as all that fits."""
@@ -78,7 +79,7 @@ class Judge:
         self, old: Shape, new: Shape, sights_old: Sightings, sights_new: Sightings, settings: ChangeSettings
     ) -> None:
         self.settings = settings
-        self._within = Tolerance(settings.fit_m, settings.tolerance_relative)
+        self._within = Margin(settings.fit_m, settings.tolerance_relative)
         rng = np.random.default_rng(0)
         old, new = old.sample(_JUDGED, rng), new.sample(_JUDGED, rng)
         self._sides = [

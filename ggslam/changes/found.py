@@ -61,7 +61,8 @@ class ChangeTable:
         found = self.found
         return {
             "version": VERSION, "ids_believed": found.ids_believed, "stayed": found.stayed,
-            "tolerance": asdict(found.tolerance), "changes": [self._entry(change) for change in found.changes],
+            "tolerance": {"metres": found.tolerance.least, "share": found.tolerance.share},
+            "changes": [self._entry(change) for change in found.changes],
             "unseen": [
                 {"name": self.label(c), "ids": list(c.old.ids) if c.old else [], "reason": c.reason}
                 for c in found.unseen

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from ggslam.changes.change import Change, Detection
 from ggslam.changes.detection import ChangeDetector
 from ggslam.changes.settings import ChangeSettings
-from ggslam.changes.sightings import NEAR, Evidence
+from ggslam.changes.sightings import Evidence
 from ggslam.changes.things import Thing
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -160,10 +160,7 @@ class Renewal:
         points = np.concatenate([np.zeros((0, 3)), *(p for change in self.found.changes for p in self._points(change))])
         shown = []
         for camera, T in zip(cameras, T_world_camera, strict=True):
-            x, y, z = transform_points(points, inverse(T)).T
-            ahead = np.where(z > NEAR, z, np.inf)
-            column, row = x / ahead * camera.fx + camera.cx, y / ahead * camera.fy + camera.cy
-            inside = (z > NEAR) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+            inside = camera.project(transform_points(points, inverse(T)))[2]
             shown.append(int(inside.sum()) >= least)
         return np.array(shown, bool)
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,9 +17,9 @@ from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, transform_points
+from ggslam.sight.margin import Margin
+from ggslam.sight.view import Sight, View
 
-NEAR = 0.1
-"""Metres; what is nearer to the camera is not looked up."""
 OUTLINE = 0.05
 """Where depth changes by more than this share of it between neighbours, it belongs to what is behind as much."""
 BYTE = np.float32(1 / 255)
@@ -27,8 +27,6 @@ _NEIGHBOURS, _STRIDE = 4, 2
 """Measured points that tell the surface at a place; pixels of which one is looked at, along each axis."""
 _THINNED_EVERY = 8
 """Pictures whose points are gathered before they are thinned out: memory."""
-_BLOCK = 0.25
-"""Metres: edge of the blocks of space that are passed by together if a picture cannot show them."""
 AROUND = np.ones((3, 3), np.uint8)
 """A pixel and those around it."""
 
@@ -50,27 +48,6 @@ class Picture:
     depth: np.ndarray
     color: np.ndarray
     labels: np.ndarray
-
-    def nearest(self) -> np.ndarray:
-        """Least depth of each pixel and those around it, float32 [H, W]; 0 = one of them shows no surface."""
-        return cv2.erode(self.depth, AROUND)
-
-    def farthest(self) -> np.ndarray:
-        """Greatest depth likewise; 0 = none shows a surface."""
-        return cv2.dilate(self.depth, AROUND)
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """How near surfaces have to be to be one: so many metres, or such a share of their distance from the camera,
-    whichever is more."""
-
-    metres: float
-    share: float
-
-    def at(self, distance: np.ndarray) -> np.ndarray:
-        """Metres."""
-        return np.maximum(self.metres, self.share * distance)
 
 
 @dataclass(frozen=True)
@@ -173,37 +150,6 @@ class Visit:
     has_objects: bool
 
 
-class _Blocks:
-    """Points in the order of the blocks of space that they lie in: those that a picture cannot show are passed by."""
-
-    def __init__(self, points: np.ndarray) -> None:
-        keys = voxel_keys(points, _BLOCK)
-        order = np.argsort(keys, kind="stable")
-        self.points = points[order]
-        self.places = np.empty(len(order), np.int64)
-        """Where each of the points is now."""
-        self.places[order] = np.arange(len(order))
-        new = np.diff(keys[order], prepend=keys.min(initial=0) - 1) != 0
-        first = np.flatnonzero(new)
-        self._block = np.cumsum(new) - 1
-        sizes = np.diff(np.append(first, len(points)))[:, None]
-        self._middles = np.add.reduceat(self.points, first) / sizes if len(first) else np.zeros((0, 3))
-
-    def before(self, picture: Picture) -> np.ndarray:
-        """Rows of `points` of the blocks that a picture may show."""
-        camera = picture.camera
-        x, y, z = transform_points(self._middles, picture.T_camera_world).T
-        reach = np.sqrt(3) * _BLOCK
-        shown = z > NEAR - reach
-        sides = (
-            (x, (camera.cx + 1) / camera.fx), (-x, (camera.width - camera.cx) / camera.fx),
-            (y, (camera.cy + 1) / camera.fy), (-y, (camera.height - camera.cy) / camera.fy),
-        )  # fmt: skip
-        for along, slope in sides:  # the planes through the camera that bound the view
-            shown &= along + slope * z > -reach * np.hypot(1, slope)
-        return np.flatnonzero(shown[self._block])
-
-
 class Sightings:
     """A visit's map, seen from its own keyframes, as far as it was measured: maps go on behind what was seen.
 
@@ -222,39 +168,34 @@ class Sightings:
         ]
         for picture in self.pictures:
             measured.mask(picture)
+        # What was not measured may be anything: views say nothing beside it.
+        self._views = [
+            View.of(picture.depth, picture.camera, T, Margin(), context, whole_only=True)
+            for picture, T in zip(self.pictures, visit.T_world_camera, strict=True)
+        ]
 
-    def look_up(self, points: np.ndarray, tolerance: Tolerance) -> Evidence:
-        """What the keyframes saw at world points [n, 3]; surfaces that lie within the tolerance are one."""
-        blocks = _Blocks(points)
-        points, count = blocks.points, len(points)
-        through, present, hidden = (np.zeros(count, np.int32) for _ in range(3))
-        color, offset = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
-        for picture in self.pictures:
-            near = blocks.before(picture)
-            rows, pixels, z = project(points[near], picture)
-            rows = near[rows]
-            within = tolerance.at(z)
-            nearest, farthest = picture.nearest().reshape(-1)[pixels], picture.farthest().reshape(-1)[pixels]
-            known = nearest > 0
-            behind, before = known & (nearest > z + within), known & (farthest < z - within)
-            through[rows[behind]] += 1
-            hidden[rows[before]] += 1
-            own = picture.depth.reshape(-1)[pixels]
-            here = known & ~behind & ~before
-            present[rows[here]] += 1
-            color[rows[here]] += picture.color.reshape(-1, 3)[pixels[here]] * BYTE
-            offset[rows[here]] += (own / z - 1)[here]
+    def look_up(self, points: np.ndarray, margin: Margin) -> Evidence:
+        """What the keyframes saw at world points [n, 3]; surfaces that lie within the margin are one."""
+        through, present, hidden = (np.zeros(len(points), np.int32) for _ in range(3))
+        color, offset = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
+        for picture, view in zip(self.pictures, self._views, strict=True):
+            answers = replace(view, margin=margin).classify_points(points)
+            through += answers.through
+            hidden += answers.codes == Sight.HIDDEN
+            here = np.flatnonzero((answers.codes >= Sight.BEFORE) & (answers.codes <= Sight.BEHIND))
+            pixels = answers.pixels[here]
+            present[here] += 1
+            color[here] += picture.color.reshape(-1, 3)[pixels] * BYTE
+            offset[here] += picture.depth.reshape(-1)[pixels] / answers.z[here] - 1
         seen = np.maximum(present, 1)
         color[present == 0], offset[present == 0] = np.nan, np.nan
-        found = Evidence(through, present, hidden, color / seen[:, None], offset / seen)
-        return found.at(blocks.places)
+        return Evidence(through, present, hidden, color / seen[:, None], offset / seen)
 
     def surface(self, spacing: float) -> Surface:
         """All surfaces that the keyframes see, as points so far apart."""
         gathered, waiting = Surface.empty(), list[Surface]()
-        for number, picture in enumerate(self.pictures):
-            nearest, farthest = picture.nearest(), picture.farthest()
-            shown = (nearest > 0) & (farthest - nearest < OUTLINE * farthest)
+        for number, (picture, view) in enumerate(zip(self.pictures, self._views, strict=True)):
+            shown = (view.near > 0) & (view.far - view.near < OUTLINE * view.far)
             points, counts = back_project(picture, shown), np.ones(int(shown.sum()), np.int32)
             toward = inverse(picture.T_camera_world)[:3, 3] - points
             toward /= np.linalg.norm(toward, axis=1, keepdims=True)
@@ -271,21 +212,6 @@ def smaller(camera: Camera, width: int) -> Camera:
     if camera.width <= width:
         return camera
     return camera.resize(width, max(1, round(camera.height * width / camera.width)))
-
-
-def project(points: np.ndarray, picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of the world points [n, 3] that a picture may show, the pixels they fall on, and their depths."""
-    camera = picture.camera
-    R, t = picture.T_camera_world[:3, :3], picture.T_camera_world[:3, 3]
-    x, y, z = (  # by columns: as one product of matrices this narrow takes longer
-        points[:, 0] * R[k, 0] + points[:, 1] * R[k, 1] + points[:, 2] * R[k, 2] + t[k] for k in range(3)
-    )
-    ahead = np.where(z > NEAR, z, np.inf)
-    column = np.rint(x / ahead * camera.fx + camera.cx)
-    row = np.rint(y / ahead * camera.fy + camera.cy)
-    inside = (z > NEAR) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    rows = np.flatnonzero(inside)
-    return rows, (row[rows] * camera.width + column[rows]).astype(np.int64), z[rows]
 
 
 def _draw(
@@ -305,7 +231,7 @@ class _Measured:
 
     def __init__(self, visit: Visit, settings: ChangeSettings) -> None:
         self._visit, self._tree = visit, cKDTree(visit.measured)
-        self._within = Tolerance(settings.measured_m, settings.measured_relative)
+        self._within = Margin(settings.measured_m, settings.measured_relative)
         self._around = settings.around_m
 
     def mask(self, picture: Picture) -> None:
@@ -313,7 +239,7 @@ class _Measured:
         some = np.zeros(picture.depth.shape, bool)
         some[::_STRIDE, ::_STRIDE] = picture.depth[::_STRIDE, ::_STRIDE] > 0
         good = np.zeros(picture.depth.shape, np.uint8)
-        good[some] = self._off(back_project(picture, some)) <= self._within.at(picture.depth[some])
+        good[some] = self._off(back_project(picture, some)) <= self._within(picture.depth[some])
         small = good[::_STRIDE, ::_STRIDE]
         whole = cv2.resize(small, picture.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
         picture.depth[whole == 0] = 0

@@ -10,8 +10,10 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.changes.sightings import AROUND, NEAR, Picture, back_project, project
+from ggslam.changes.sightings import AROUND, Picture, back_project
 from ggslam.geometry.colored_surface import ColoredSurface
+from ggslam.scene.poses import transform_points
+from ggslam.sight.margin import Margin
 
 _FEWEST_PIXELS, _MOST_VIEWS = 12, 24
 """Pixels of the thing that a picture has to show, and pictures that are looked at."""
@@ -20,12 +22,14 @@ _OWN_M, _WINDOW = 0.015, 3
 _FACING = 0.35
 """Cosine of the angle between a face and the way to the camera; of what is seen at a smaller one nothing is said: there
 maps err."""
+_NEAR_M = 0.1
+"""What is nearer to the camera is not looked up."""
 _THIN_M = 0.01
 """Metres that a face lies behind the other face of the same board, at least."""
 _EDGE_PX = 0.75
 """Pixels beyond the middle of the thing's outermost ones that still are the thing's."""
-_HIDDEN = (0.015, 0.008)
-"""What was measured nearer than a point by so many metres, or such a share of its distance, hides it."""
+_HIDDEN = Margin(0.015, 0.008)
+"""What was measured nearer than a point by more hides it."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class ThingViews:
         R, t = self._poses[:, :3, :3], self._poses[:, :3, 3]
         p, n = shape.points @ R.transpose(0, 2, 1) + t[:, None], shape.normals @ R.transpose(0, 2, 1)
         fx, fy, cx, cy = (self._lens[:, k, None] for k in range(4))
-        ahead = np.where(p[..., 2] > NEAR, p[..., 2], np.inf)
+        ahead = np.where(p[..., 2] > _NEAR_M, p[..., 2], np.inf)
         u, v = p[..., 0] / ahead * fx + cx, p[..., 1] / ahead * fy + cy
         column, row = np.rint(u), np.rint(v)
         width, height = self._sizes[:, :1], self._sizes[:, 1:]
@@ -94,7 +98,7 @@ class ThingViews:
         seen = np.stack([(column - lens[:, 2]) / lens[:, 0], (row - lens[:, 3]) / lens[:, 1], np.ones(len(row))], 1)
         before = (n * (p - depth[:, None] * seen)).sum(1)  # of the surface that was measured, along the point's normal
         facing = -(n * p).sum(1) / np.linalg.norm(p, axis=1)
-        hidden = depth <= p[:, 2] - np.maximum(_HIDDEN[0], _HIDDEN[1] * p[:, 2])
+        hidden = depth <= p[:, 2] - _HIDDEN(p[:, 2])
         front, back = own & (facing > _FACING), own & (facing < -_FACING)
         outside = (depth > 0) & ~own & ~hidden
         out = self._outward[pixel]
@@ -113,10 +117,10 @@ def _own_pixels(
 ) -> np.ndarray:
     """bool [H, W], where a picture shows a thing with these points."""
     own, shape = np.zeros(picture.depth.shape, bool), picture.depth.shape
-    _, pixels, _ = project(points, picture)
-    if not len(pixels):
+    row, column, inside = picture.camera.project(transform_points(points, picture.T_camera_world))
+    row, column = row[inside], column[inside]
+    if not len(row):
         return own
-    row, column = np.divmod(pixels, shape[1])
     window = tuple(slice(max(0, k.min() - _WINDOW), k.max() + _WINDOW + 1) for k in (row, column))
     where = np.zeros(shape, bool)
     where[window] = picture.depth[window] > 0

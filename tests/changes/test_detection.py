@@ -16,7 +16,6 @@ from ggslam.changes.detection import ChangeDetector
 from ggslam.changes.fits import Fit
 from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
-from ggslam.changes.sightings import Picture, Sightings, Tolerance, _Blocks
 from ggslam.changes.things import Thing
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, transform_points, turning_angle
@@ -217,24 +216,6 @@ def test_what_the_first_visit_hardly_saw_was_not_added() -> None:
     found, detector = detect(SmallVisit([speck, CRATE, BRICK]), SmallVisit([CUP, CRATE, BRICK]), True)
     assert all(t.label != 2 for t in detector.things[0])
     assert found.changes == []
-
-
-def test_points_that_no_picture_shows_are_passed_by_and_all_others_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    sights = Sightings(SmallVisit([CUP], around=(0, 50), distance=0.4).build(), ChangeSettings(), NativeContext(2))
-    points, passed = np.random.default_rng(0).uniform(-1.5, 1.5, (4000, 3)), list[int]()
-    before = _Blocks.before
-
-    def noted(self: _Blocks, picture: Picture) -> np.ndarray:
-        rows = before(self, picture)
-        passed.append(len(points) - len(rows))
-        return rows
-
-    monkeypatch.setattr(_Blocks, "before", noted)
-    found = sights.look_up(points, Tolerance(0.02, 0.01))
-    monkeypatch.setattr(_Blocks, "before", lambda self, p: np.arange(len(self.points)))
-    for name, values in vars(sights.look_up(points, Tolerance(0.02, 0.01))).items():
-        np.testing.assert_array_equal(getattr(found, name), values)
-    assert found.hidden.any() and found.through.any() and max(passed) > 1000
 
 
 @pytest.mark.parametrize("count, shifted", [(310, True), (742, False)])
