@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 import torch
 
@@ -20,17 +19,15 @@ from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.merging.coverage import PlacedRun
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import inverse, transform_points
+from ggslam.sight.counts import SightCounts
+from ggslam.sight.margin import Margin
+from ggslam.sight.view import View
 
-_SIGMAS, _LEAST_M, _RELATIVE = 3.0, 0.02, 0.01
-"""A Gaussian is looked through that lies nearer than what was measured by so many standard deviations of depth, and by
-so many metres and so much of the distance."""
 _TIMES = 2
 """Keyframes that look through it at least, and so many times as many as see something there."""
 _MOST, _NEVER = 0.5, 0.01
 """Share of an object's Gaussians in whose places masks show others; and share of sights that show itself, where masks
 err at outlines."""
-_AROUND = np.ones((3, 3), np.uint8)
 
 
 def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
@@ -61,7 +58,7 @@ def without_ghosts(source: MergeSource, placed: PlacedRun, notes: list[str]) -> 
     rows = np.flatnonzero(began)
     seen = _look(source, placed, own, rows)
     notes += [f"{source.name}: left out: {problem}" for problem in seen.problems]
-    ghosts = rows[(seen.through >= _TIMES) & (seen.through >= _TIMES * seen.there)]
+    ghosts = rows[seen.counts.looked_through(_TIMES, _TIMES)]
     replaced = _find_replaced(gaussians.object_id.numpy()[rows], seen)
     if not len(ghosts) and not replaced:
         return gaussians
@@ -78,19 +75,17 @@ def without_ghosts(source: MergeSource, placed: PlacedRun, notes: list[str]) -> 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What keyframes say of Gaussians, int [n] each.
+    """What keyframes say of n Gaussians.
 
     Attributes:
-        through: how many look through one.
-        there: how many see a surface there...
-        alike, other: ...of its object, by their masks; of another one.
-        latest: the other object that was seen last.
+        counts: how many look through one, and how many see a surface there...
+        alike, other: ...of its object, by their masks; of another one; int [n].
+        latest: the other object that was seen last, int [n].
         shown: the objects that masks show anywhere.
         problems: frames that could not be read, and why.
     """
 
-    through: np.ndarray
-    there: np.ndarray
+    counts: SightCounts
     alike: np.ndarray
     other: np.ndarray
     latest: np.ndarray
@@ -112,11 +107,11 @@ def _find_replaced(ids: np.ndarray, seen: _Seen) -> dict[int, int]:
 
 def _look(source: MergeSource, placed: PlacedRun, own: Sequence[int], rows: np.ndarray) -> _Seen:
     """What a run's own keyframes, by number, say of some rows of its map."""
-    noise, sequence, masks = source.known.noise, source.sequence, source.has_lasting_ids()
+    margin, sequence, masks = Margin.of(source.known.noise), source.sequence, source.has_lasting_ids()
     assert sequence is not None
     means = placed.gaussians.means.numpy()[rows].astype(np.float64)
     ids = placed.gaussians.object_id.numpy()[rows].astype(int)
-    found = _Seen(*np.zeros((5, len(rows)), int))
+    found = _Seen(SightCounts.none(len(rows)), *np.zeros((3, len(rows)), int))
     for k in own:
         try:
             frame = sequence.frame(source.record.keyframes[k].frame, masks=masks)
@@ -124,21 +119,13 @@ def _look(source: MergeSource, placed: PlacedRun, own: Sequence[int], rows: np.n
         except GgslamError as error:
             found.problems.append(str(error))
             continue
-        seen = transform_points(means, inverse(placed.T_world_camera[k]))
-        row, column, inside = frame.camera.project(seen)
-        # Where a pixel's surroundings have no depth, or show an edge, it looks through what is nearer than all of them.
-        nearest = cv2.erode(np.where(frame.depth > 0, frame.depth, np.float32(0)), _AROUND)[row, column]
-        measured = frame.depth[row, column]
-        away = seen[:, 2]
-        margin = np.maximum(_SIGMAS * (noise.constant + noise.square * away**2), _LEAST_M + _RELATIVE * away)
-        there = inside & (measured > 0) & (np.abs(away - measured) <= margin)
-        found.through[:] += inside & (nearest > 0) & (away < nearest - margin)
-        found.there[:] += there
+        answers = View.of(frame.depth, frame.camera, placed.T_world_camera[k], margin).classify_points(means)
+        found.counts.add(answers)
         if mask is not None:
             found.shown.update(np.unique(mask).tolist())
-            shown = mask[row, column].astype(int)
-            other = there & (shown > 0) & (shown != ids)
-            found.alike[:] += there & (shown == ids)
+            shown = answers.at(mask).astype(int)
+            other = answers.same & (shown > 0) & (shown != ids)
+            found.alike[:] += answers.same & (shown == ids)
             found.other[:] += other
             found.latest[other] = shown[other]
     return found
