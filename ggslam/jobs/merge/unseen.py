@@ -15,11 +15,9 @@ import torch
 
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.poses import transform_points
+from ggslam.sight.margin import SIGMAS, Margin
+from ggslam.sight.view import View
 
-BEHIND_SIGMAS, BEHIND_RELATIVE = 3.0, 0.02
-"""A Gaussian is hidden that lies farther behind what a keyframe measured than so many standard deviations of depth, and
-than this share of the distance."""
 _KEPT = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
 
 
@@ -31,14 +29,12 @@ def find_seen(gaussians: GaussianMap, keyframes: Iterable[Keyframe], sigma: floa
         keyframes: with images.
         sigma: standard deviation of depth, metres.
     """
-    means = gaussians.means.detach().numpy()
+    means, margin = gaussians.means.detach().numpy().astype(np.float64), Margin(sigmas=SIGMAS, constant=sigma)
     left, found = np.arange(len(means)), np.zeros(len(means), bool)
     for keyframe in keyframes:
-        there = transform_points(means[left].astype(np.float64), keyframe.T_camera_world)
-        row, column, inside = keyframe.camera.project(there)
-        depth = keyframe.depth_m()[row, column]
-        behind = there[:, 2] - depth > np.maximum(BEHIND_SIGMAS * sigma, BEHIND_RELATIVE * depth)
-        seen = inside & ~(behind & (depth > 0))
+        view = View.of(keyframe.depth_m(), keyframe.camera, keyframe.T_world_camera, margin)
+        answers = view.classify_points(means[left])
+        seen = answers.inside & ~answers.behind
         found[left[seen]] = True
         left = left[~seen]
     return found
