@@ -9,9 +9,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.sight.margin import Margin
+from ggslam.sight.view import View
 
-_NEAR_M, _NEAR_RELATIVE = 0.05, 0.05
-"""A keyframe shows a point if it measured the point's depth but for so much; the larger of the two."""
+_MARGIN = Margin().times(2.5)
+"""Wider than between surfaces: the Gaussian in the middle of an object may lie within it, behind its surface."""
 
 
 def typical_points(means: np.ndarray, labels: np.ndarray) -> dict[int, np.ndarray]:
@@ -48,11 +50,6 @@ def count_chances(
     for keyframe in keyframes:
         if keyframe.mask is None or keyframe.frame_index == ELSEWHERE or not len(world):
             continue
-        T = keyframe.T_camera_world
-        p = world @ T[:3, :3].T + T[:3, 3]
-        rows, columns, shown = keyframe.camera.project(p)
-        inside = np.flatnonzero(shown & (keyframe.frame_index >= begin))
-        z = p[inside, 2]
-        near = np.abs(keyframe.depth_m()[rows[inside], columns[inside]] - z) < np.maximum(_NEAR_M, _NEAR_RELATIVE * z)
-        seen[inside[near]] += 1
+        view = View.of(keyframe.depth_m(), keyframe.camera, keyframe.T_world_camera, _MARGIN)
+        seen += view.classify_points(world).same & (keyframe.frame_index >= begin)
     return dict(zip(points, seen.tolist(), strict=True))
