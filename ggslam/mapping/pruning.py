@@ -15,12 +15,12 @@ from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
+from ggslam.sight.margin import Margin
 
 OUTLINE = 4
 """Pixels of a 320 pixel wide image about a thing's outline at which its depth is still that of the thing."""
-THICK_M, THICK_RELATIVE = 0.02, 0.01
-"""Metres, and share of the distance, by which Gaussians of a surface may lie behind what was measured of it."""
-
+_THICKNESS = Margin()
+"""How far Gaussians of a surface may lie before and behind what was measured of it."""
 FIRST_LOOK = 10
 """Keyframes at which one looks for the first time for what surfaces hide."""
 
@@ -81,17 +81,13 @@ def drop_before(
         seen = transform_points(means, keyframe.T_camera_world)
         row, column, inside = keyframe.camera.project(seen)
         near, far = first[row, column], last[row, column]
-        within = (seen[:, 2] > near - _thickness(far)) & (seen[:, 2] < far + _thickness(far))
+        thick = _THICKNESS(far)
+        within = (seen[:, 2] > near - thick) & (seen[:, 2] < far + thick)
         goes |= inside & around[row, column] & within
     stays = np.ones(len(gaussians), bool)
     stays[rows] = ~goes
     gaussians.keep(torch.from_numpy(stays))
     return int(goes.sum())
-
-
-def _thickness(depth: np.ndarray) -> np.ndarray:
-    """How far the surface of a thing may reach before and behind its measured depth, metres."""
-    return np.maximum(THICK_M, THICK_RELATIVE * depth)
 
 
 def blank_part(keyframe: Keyframe, part: np.ndarray) -> None:
