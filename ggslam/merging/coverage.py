@@ -13,6 +13,8 @@ from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
+from ggslam.sight.margin import Margin
+from ggslam.sight.view import Sight, View
 
 _SEAM_WIDTH = 160
 """Pixels of the small pictures that seams are looked for in."""
@@ -42,7 +44,8 @@ class Coverage:
     """
 
     def __init__(self, settings: SeamSettings, context: NativeContext) -> None:
-        self._settings = settings
+        self._alpha, self._margin = settings.alpha, Margin(settings.tolerance_m, settings.tolerance_relative)
+        self._context = context
         self._rasterizer = CpuRasterizer(context=context)
 
     def shared_views(self, base: GaussianMap, run: PlacedRun) -> np.ndarray:
@@ -50,19 +53,11 @@ class Coverage:
         shares = []
         for T, whole in zip(run.T_world_camera, run.cameras, strict=True):
             camera = whole.resize(_SEAM_WIDTH, max(1, round(whole.height * _SEAM_WIDTH / whole.width)))
-            own_alpha, own_depth = self._show(run.gaussians, camera, T)
-            alpha, depth = self._show(base, camera, T)
-            opaque = (alpha >= self._settings.alpha) & (own_alpha >= self._settings.alpha)
-            shares.append(float((opaque & (np.abs(depth - own_depth) <= self._tolerance(depth))).mean()))
+            view = View.of(self._show(base, camera, T), camera, T, self._margin, self._context)
+            shares.append(float((view.classify_depth(self._show(run.gaussians, camera, T)) == Sight.SAME).mean()))
         return np.array(shares)
 
-    def _show(
-        self, gaussians: GaussianMap, camera: Camera, T_world_camera: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Alpha and depth [H, W]."""
+    def _show(self, gaussians: GaussianMap, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:
+        """Depth [H, W] where a map is opaque, else 0."""
         view = self._rasterizer.forward(gaussians, camera, inverse(T_world_camera), features=False)
-        return view.alpha.numpy().copy(), view.expected_depth.numpy().copy()
-
-    def _tolerance(self, depth: np.ndarray) -> np.ndarray:
-        s = self._settings
-        return np.maximum(s.tolerance_m, s.tolerance_relative * depth)
+        return np.where(view.alpha.numpy() >= self._alpha, view.expected_depth.numpy(), np.float32(0))
