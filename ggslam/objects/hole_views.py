@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -12,11 +13,16 @@ import torch
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors
 from ggslam.scene.camera import Camera
+from ggslam.scene.poses import inverse
+from ggslam.sight.margin import Margin
+from ggslam.sight.view import Sight, View
 
 COVERED = 0.3
 """Share of a pixel's colour from which the object is said to cover it."""
 SOLID = 0.8
 """Alpha from which a pixel is said to show a surface; the rest of it would be black."""
+RENDERED = Margin()
+"""How far depths of one surface may differ between a map's renders."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +75,18 @@ class HoleView:
     now: np.ndarray
     picture: np.ndarray
 
+    @cached_property
+    def sight_before(self) -> View:
+        """What it looked through with the object..."""
+        return self._sight(self.before)
 
-def depth_tolerance(depth: np.ndarray) -> np.ndarray:
-    """By how much depths of one surface may differ between a map's renders, metres."""
-    return 0.015 + 0.01 * depth
+    @cached_property
+    def sight_now(self) -> View:
+        """...and without it."""
+        return self._sight(self.now)
+
+    def _sight(self, depth: np.ndarray) -> View:
+        return View.of(depth, self.view.camera, inverse(self.view.T_camera_world), RENDERED)
 
 
 def look(kept: Gaussians, removed: Gaussians, views: Sequence[CameraView], count: int) -> list[HoleView]:
@@ -139,13 +153,12 @@ def could_be_hidden(points: np.ndarray, views: Sequence[HoleView]) -> np.ndarray
     """
     through, seen, hidden, shows = np.zeros((4, len(points)), int)
     for v in views:
-        pixel, z, inside = v.view.project(points)
-        before, now, covered = (image.reshape(-1)[pixel] for image in (v.before, v.now, v.covered))
-        tolerance = depth_tolerance(z)
-        through += inside & (before > z + tolerance)
-        seen += inside & ~covered & (np.abs(before - z) <= tolerance)
-        hidden += inside & covered & (before < z + tolerance)
-        shows += inside & ((now == 0) | (now > z - tolerance))
+        before, now = v.sight_before.classify_points(points), v.sight_now.classify_points(points)
+        covered = before.at(v.covered)
+        through += before.before
+        seen += ~covered & before.same
+        hidden += before.inside & covered & ~before.before
+        shows += now.inside & ~now.behind
     return (hidden > 0.25 * (hidden + seen)) & (shows > 0) & (through <= 0.2 * (through + seen + hidden))
 
 
@@ -154,7 +167,6 @@ def is_open(points: np.ndarray, views: Sequence[HoleView]) -> np.ndarray:
     [M]."""
     out = np.zeros(len(points), bool)
     for v in views:
-        pixel, z, inside = v.view.project(points)
-        now, covered = v.now.reshape(-1)[pixel], v.covered.reshape(-1)[pixel]
-        out |= inside & covered & ((now == 0) | (now > z + depth_tolerance(z)))
+        now = v.sight_now.classify_points(points)
+        out |= now.at(v.covered) & (now.before | (now.codes == Sight.UNKNOWN))
     return out

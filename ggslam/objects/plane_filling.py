@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from ggslam.objects.hole_views import HoleView, could_be_hidden, depth_tolerance, is_open
+from ggslam.objects.hole_views import HoleView, could_be_hidden, is_open
 from ggslam.objects.rim_planes import RimPlane
 from ggslam.objects.texture import fill_gap
 from ggslam.rendering.cpu import CpuRasterizer
@@ -179,12 +179,12 @@ def as_seen(chart: Chart, views: Sequence[HoleView]) -> Chart:
     centres, color = chart.centres(), chart.color.reshape(-1, 3).copy()
     largest = np.zeros(len(centres))
     for v in views:
-        pixel, z, inside = v.view.project(centres)
+        now = v.sight_now.classify_points(centres)
         covered = cv2.dilate(v.covered.astype(np.uint8), np.ones((_OUTLINE, _OUTLINE), np.uint8)) > 0
-        shown = inside & ~covered.reshape(-1)[pixel] & (np.abs(v.now.reshape(-1)[pixel] - z) <= depth_tolerance(z))
-        slant = np.abs((centres - v.view.position) @ chart.axes[2]) / np.maximum(z, 1e-3) ** 3
+        shown = now.same & ~now.at(covered)
+        slant = np.abs((centres - v.view.position) @ chart.axes[2]) / np.maximum(now.z, 1e-3) ** 3
         better = shown & (slant > largest)
-        color[better], largest[better] = v.picture.reshape(-1, 3)[pixel[better]], slant[better]
+        color[better], largest[better] = now.at(v.picture)[better], slant[better]
     seen = cv2.erode((largest > 0).reshape(chart.known.shape).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return replace(chart, color=color.reshape(chart.color.shape), clean=seen if seen.any() else chart.clean)
 

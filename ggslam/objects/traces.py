@@ -13,11 +13,13 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ggslam.objects.hole_views import COVERED, CameraView, depth_tolerance, mark_removed, pick_views
+from ggslam.objects.hole_views import COVERED, RENDERED, CameraView, mark_removed, pick_views
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import copies_of, keep_rows
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors
+from ggslam.scene.poses import inverse
+from ggslam.sight.view import View
 
 _VIEWS = 32
 """Views, at most, that are asked."""
@@ -99,9 +101,10 @@ def _before(points: np.ndarray, removed: Gaussians, view: CameraView) -> np.ndar
     """Which points [N, 3] stand clearly before an object, bool [N]: what they hide of it is no trace of it."""
     out = CpuRasterizer().forward(removed, view.camera, view.T_camera_world, features=False)
     depth = np.where(out.alpha.numpy() > COVERED, out.expected_depth.numpy(), np.inf).astype(np.float32)
-    pixel, z, inside = view.project(points)
-    nearest = cv2.erode(depth, np.ones((5, 5), np.uint8)).reshape(-1)[pixel]
-    return inside & np.isfinite(nearest) & (z < nearest - depth_tolerance(z))
+    nearest = cv2.erode(depth, np.ones((5, 5), np.uint8))
+    nearest[~np.isfinite(nearest)] = 0
+    sight = View.of(nearest, view.camera, inverse(view.T_camera_world), RENDERED)
+    return sight.classify_points(points).before
 
 
 def _pixel_weights(rasterizer: CpuRasterizer, areas: Sequence[torch.Tensor]) -> torch.Tensor:
