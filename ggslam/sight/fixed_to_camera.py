@@ -6,17 +6,19 @@ It does not belong to the world: one looks through where it was a moment ago, an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
+from ggslam.sight.margin import Margin
+from ggslam.sight.view import Sight, View
 
-SAME = 0.03
-"""Depths that differ by less than this share are of the same surface."""
-BEHIND = 0.15
-"""Depth that is larger by this share than a surface's is seen through where the surface would have to be."""
+SAME = Margin.usual()
+PAST = SAME.times(3)
+"""The other view has to look past a surface by more than one margin: small images have the nearest depth of each cell,
+so that slanted surfaces and outlines differ by more. Of pixels of the world half as many are taken for fixed so."""
 LEAST_SHIFT = 0.03
 """Of the image's width: what would have to move less says nothing."""
 
@@ -58,14 +60,14 @@ def compare_views(depth: np.ndarray, other: np.ndarray, T_other_camera: np.ndarr
         T_other_camera: [4, 4], from the first camera's frame to the other's.
         camera: of both.
     """
-    moved = transform_points(camera.back_project(depth).reshape(-1, 3), T_other_camera).reshape(*depth.shape, 3)
-    z = np.maximum(moved[..., 2], 1e-3)
-    u = np.rint(camera.fx * moved[..., 0] / z + camera.cx)
-    v = np.rint(camera.fy * moved[..., 1] / z + camera.cy)
+    view = View.of(other, camera, np.eye(4), SAME)
+    moved = transform_points(camera.back_project(depth).reshape(-1, 3).astype(float), T_other_camera)
+    z = np.maximum(moved[:, 2], 1e-3)
+    u, v = (f * moved[:, k] / z + c for k, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy)))
     rows, columns = np.mgrid[: camera.height, : camera.width]
-    moves = (depth > 0) & (np.hypot(u - columns, v - rows) > LEAST_SHIFT * camera.width)
-    still = moves & (np.abs(other - depth) < SAME * depth)
-    inside = moves & (moved[..., 2] > 1e-3) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    seen = other[np.where(inside, v, 0).astype(int), np.where(inside, u, 0).astype(int)]
-    inside &= seen > 0
-    return PairEvidence(still & inside & (seen > (1 + BEHIND) * z), still, inside & (np.abs(seen - z) < SAME * z))
+    shift = np.hypot(u.reshape(depth.shape) - columns, v.reshape(depth.shape) - rows)
+    moves = (depth > 0) & (shift > LEAST_SHIFT * camera.width)
+    still = moves & (view.classify_depth(depth) == Sight.SAME)
+    past = replace(view, margin=PAST).classify_points(moved).before.reshape(depth.shape)
+    world = moves & view.classify_points(moved).same.reshape(depth.shape)
+    return PairEvidence(still & past, still, world)

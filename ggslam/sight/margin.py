@@ -50,6 +50,12 @@ class Margin:
         """The margin where depths of a camera with this noise are compared."""
         return Margin(sigmas=SIGMAS, constant=noise.constant, square=noise.square)
 
+    @staticmethod
+    def usual() -> Margin:
+        """The margin of a structured-light camera (Khoshelham and Oude Elberink, Sensors 2012), for depth of which the
+        noise is not known yet."""
+        return Margin(sigmas=SIGMAS, constant=0.0012, square=0.0019)
+
     def times(self, factor: float) -> Margin:
         """A margin `factor` times as wide."""
         return replace(self, least=factor * self.least, share=factor * self.share, sigmas=factor * self.sigmas)
