@@ -26,9 +26,6 @@ from ggslam.system.array_forms import Form, Mask
 
 COLUMNS = 160
 """Pixels: width of the images that are compared, about; small things count."""
-MARGIN_M, MARGIN_SIGMAS = 0.02, 5.0
-"""Depths of one surface differ by no more than so many metres (two visits are less well aligned than two frames of one)
-and so many standard deviations of the depth camera."""
 VIEWS, RATIO = 3, 2
 """Views that look through a place at least, and so many times as many as still see it."""
 LEAST_PLACES = 6
@@ -144,11 +141,6 @@ class EarlierView:
 def coarse_factor(camera: Camera) -> int:
     """How many times smaller the images are that are compared."""
     return max(1, round(camera.width / COLUMNS))
-
-
-def margin_of(constant: float, square: float) -> Margin:
-    """What depths of one surface may differ by, for a depth camera's noise of constant + square z^2, metres."""
-    return Margin(MARGIN_M, MARGIN_SIGMAS, constant, square)
 
 
 def compare_both_ways(

@@ -18,11 +18,11 @@ from ggslam.movers.outdated import (
     OutdatedParts,
     coarse_factor,
     compare_both_ways,
-    margin_of,
 )
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points, turning_angle
+from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView
 from ggslam.slam.run_movers import SURE
 from ggslam.system.array_forms import Pose
@@ -72,7 +72,7 @@ class EarlierViews:
         near = self._near(earlier, newest, T_world_newest)
         if not near:
             return []
-        margin = margin_of(noise.constant, noise.square)
+        margin = Margin.of(noise)
         view = CoarseView.of(newest.depth, newest.camera, coarse_factor(newest.camera), T_world_newest, margin, context)
         for k in near:
             if k.index not in self.views:
