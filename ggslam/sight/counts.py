@@ -43,7 +43,7 @@ class SightCounts:
         """Answers that were added count no more: the view was forgotten, or has moved and is asked again."""
         self._count(answers, -1)
 
-    def looked_through(self, least: int, ratio: float) -> np.ndarray:
+    def is_looked_through(self, least: int, ratio: float) -> np.ndarray:
         """bool [n]: at least `least` views look through it, and `ratio` times as many as show a surface there."""
         return (self.through >= least) & (self.through >= ratio * self.same)
 

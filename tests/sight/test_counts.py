@@ -42,7 +42,7 @@ def test_views_agree_on_a_wall() -> None:
     before, on, behind = np.split(np.arange(len(points())), 3)
     assert (counts.through[before] == counts.inside[before]).all() and counts.inside[before].min() >= 2
     assert (counts.same[on] == counts.inside[on]).all() and (counts.behind[behind] == counts.inside[behind]).all()
-    gone = counts.looked_through(3, 2)
+    gone = counts.is_looked_through(3, 2)
     assert gone[before].sum() > 50 and not gone[on].any() and not gone[behind].any()
 
 
@@ -62,6 +62,6 @@ def test_one_view_that_errs_is_not_enough() -> None:
     """Two views see through the wall's place: one more, and they would outvote a single one that shows it."""
     wrong = [wall_view(k, wall_m=5.0) for k in range(3)]
     on = slice(63, 126)
-    assert not count([wrong[0], wrong[1]]).looked_through(3, 2)[on].any()
-    assert count(wrong).looked_through(3, 2)[on].sum() > 20
-    assert not count([*wrong, wall_view(0), wall_view(1)]).looked_through(3, 2)[on].any()
+    assert not count([wrong[0], wrong[1]]).is_looked_through(3, 2)[on].any()
+    assert count(wrong).is_looked_through(3, 2)[on].sum() > 20
+    assert not count([*wrong, wall_view(0), wall_view(1)]).is_looked_through(3, 2)[on].any()

@@ -58,7 +58,7 @@ def without_ghosts(source: MergeSource, placed: PlacedRun, notes: list[str]) -> 
     rows = np.flatnonzero(began)
     seen = _look(source, placed, own, rows)
     notes += [f"{source.name}: left out: {problem}" for problem in seen.problems]
-    ghosts = rows[seen.counts.looked_through(_TIMES, _TIMES)]
+    ghosts = rows[seen.counts.is_looked_through(_TIMES, _TIMES)]
     replaced = _find_replaced(gaussians.object_id.numpy()[rows], seen)
     if not len(ghosts) and not replaced:
         return gaussians
