@@ -58,6 +58,13 @@ def test_what_the_earlier_map_shows_before_a_wall_goes() -> None:
     assert np.allclose(kept, np.array(POINTS[1:], np.float32)) and len(placed.gaussians) == len(POINTS)
 
 
+def test_each_keyframe_looks_from_where_it_is() -> None:
+    """Two metres beside the first, nothing of the earlier map is in view."""
+    source, placed = visit(POINTS, BIRTHS, own=2, depth=np.full((30, 40), WALL_M))
+    placed.T_world_camera[2, 0, 3] = -5.0
+    assert len(without_ghosts(source, placed, [])) == len(POINTS)
+
+
 @pytest.mark.parametrize("case", ["one keyframe", "no depth", "an edge beside it", "no recording", "no earlier map"])
 def test_what_is_not_surely_gone_stays(case: str) -> None:
     depth = np.full((30, 40), WALL_M)

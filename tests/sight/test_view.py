@@ -84,6 +84,20 @@ def test_pixels_and_whole_views_are_judged_as_their_points_are() -> None:
     turned = View.of(other_depth, CAMERA, POSE @ se3_exp(np.array([0.1, 0, 0, 0, 0.1, 0])), EXACT)
     codes = view.classify_points(turned.points()).codes.reshape(48, 64)
     assert np.array_equal(view.classify_view(turned)[1:], codes[1:]) and not np.array_equal(codes[1:], along[1:])
+    ahead = View.of(np.zeros((48, 64)), CAMERA, POSE @ se3_exp(np.array([0, 0, 1.0, 0, 0, 0])), EXACT)
+    assert not view.classify_view(ahead).any(), "its camera is in view, but it shows nothing"
+
+
+def test_answers_are_grouped_by_what_the_pixel_itself_shows() -> None:
+    """Through, before, same, behind, hidden, unknown, outside."""
+    pixels, depths = [WALL_PIXEL, WALL_EDGE, WALL_PIXEL, BOX_EDGE, BOX_PIXEL, HOLE, (48, 0)], [2, 2, 3, 2, 2, 2, 2]
+    points = np.concatenate([places([pixel], z) for pixel, z in zip(pixels, depths, strict=True)])
+    answers = View.of(scene(), CAMERA, POSE, EXACT).classify_points(points)
+    assert answers.before.tolist() == [True, True, False, False, False, False, False]
+    assert answers.through.tolist() == [True, False, False, False, False, False, False]
+    assert answers.same.tolist() == [False, False, True, False, False, False, False]
+    assert answers.behind.tolist() == [False, False, False, True, True, False, False]
+    assert answers.inside.tolist() == [True] * 6 + [False]
 
 
 def test_a_view_that_moves_with_its_world_says_the_same() -> None:
