@@ -16,6 +16,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
 from ggslam.system.array_forms import DepthImage, Form, Mask, Pose
+from ggslam.system.savable import savable
 
 COLUMNS = 80
 """Of the images that are compared, about."""
@@ -38,6 +39,7 @@ NEARER, NEARER_THAN_SCENE = 1.5, 0.5
 this share of the scene's distance: such depth is its flying pixels."""
 
 
+@savable()
 @dataclass
 class CameraFixtures:
     """Looks at the first located frames that are apart from one another.

@@ -26,6 +26,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points, turning_angle
 from ggslam.slam.run_movers import SURE
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult
 
@@ -38,6 +39,7 @@ SAMPLES = 5
 """Places of an earlier view along each axis by which it is told whether a keyframe may see the same."""
 
 
+@savable()
 @dataclass
 class EarlierViews:
     """What a run's own keyframes say of those of the map it began with.

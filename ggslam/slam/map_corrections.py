@@ -21,6 +21,7 @@ from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.slam.run_movers import RunMovers
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
@@ -30,6 +31,7 @@ LOOKED_BACK = 64
 """So many of the latest keyframes are searched for what has moved since."""
 
 
+@savable(not_saved="_surface _mapper _pager _masks _publishing")
 class MapCorrections:
     """Keeps the surface, which the tracker's thread reads, in step with the corrections that the mapper's makes.
 

@@ -26,6 +26,7 @@ from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.slam import TRIM_EVERY, Slam
 from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.rig_engine import RigTrackingEngine, RigView
@@ -47,6 +48,7 @@ class _Located:
     tracked: list[TrackingResult]
 
 
+@savable(not_saved="camera rig config context pager _notes _on_device _engine", after="use_scale_again", check="check")
 class RigSlam(Slam):
     """See `Slam`. `step_together` takes the frames of all cameras of a rig at one instant; the points of all of them
     are aligned at once. Every frame has a pose and may be a keyframe; the keyframes of an instant keep to one another

@@ -20,6 +20,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
@@ -33,6 +34,7 @@ DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
 
 
+@savable(not_saved="_reads_masks _margin context")
 class RunMovers:
     """Finds movers in each located frame, if the settings want it; else frames and results stay as they are.
 

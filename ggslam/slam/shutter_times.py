@@ -11,6 +11,7 @@ from ggslam.geometry.moved_depth import largest_shift, moved_depth
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 
 LEAST_SHIFT = 0.5
 """Pixels by which depth and colour have to be apart in a corner of the image."""
@@ -20,6 +21,7 @@ LARGEST_SHARE = 0.6
 """Of the time between two frames: depth that is farther from colour is left as it is."""
 
 
+@savable()
 @dataclass
 class ShutterTimes:
     """Knows where the depth camera was when it took the last images: its motion is taken to go on.

@@ -51,6 +51,7 @@ from ggslam.slam.step_log import StepLog
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
+from ggslam.system.savable import savable
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.settings import DepthNoise
@@ -62,6 +63,7 @@ TRIM_EVERY = 8
 milliseconds."""
 
 
+@savable(not_saved="camera config context pager _notes _on_device", after="use_scale_again")
 class Slam:
     """Synchronous SLAM: each step tracks one frame, maybe makes a keyframe of it, and trains the map a fixed number
     of iterations. Deterministic for a given configuration and machine.
@@ -398,6 +400,10 @@ class Slam:
         self.scale, self.tracker.settings = scale, scale_settings(self.config.tracking, scale)
         self.mapper.settings = scale_mapping(self.config.mapping, scale)
         self.surface.settings = self.tracker.settings.target
+
+    def use_scale_again(self) -> None:
+        """Settings of the parts, which are not saved, follow the scene of a restored state."""
+        self.use_scale(self.scale)
 
     def _follow_moves(self) -> None:
         """The tracker goes along with corrections of the map made since the last frame."""
