@@ -25,6 +25,7 @@ from ggslam.scene.poses import inverse
 from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView, compare, thin_out
 from ggslam.system.array_forms import Form, Mask
+from ggslam.system.savable import savable
 
 AGES = (1, 2, 4, 8, 16, 32, 48)
 """Each frame is compared with those so many frames before it."""
@@ -37,6 +38,7 @@ FEWEST_ROWS = 8
 """Rows and columns that the smaller images have at least, if the whole ones do."""
 
 
+@savable(not_saved="settings")
 @dataclass
 class MoverDetector:
     """Looks at located frames, each once and in their order.

@@ -23,6 +23,7 @@ from ggslam.scene.poses import inverse, transform_points
 from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView, PairEvidence, compare, thin_out
 from ggslam.system.array_forms import Form, Mask
+from ggslam.system.savable import savable
 
 COLUMNS = 160
 """Pixels: width of the images that are compared, about; small things count."""
@@ -54,6 +55,7 @@ class OutdatedParts:
     hidden: np.ndarray
 
 
+@savable()
 @dataclass
 class EarlierView:
     """An earlier keyframe's depth, and what newer views say of its places.

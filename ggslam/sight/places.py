@@ -30,6 +30,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.sight.margin import Margin
 from ggslam.system.array_forms import DepthImage, Mask, Pose
+from ggslam.system.savable import savable
 
 SMOOTH = 2.5
 """Where depth varies by no more standard deviations of the camera than this its mean is compared."""
@@ -47,6 +48,7 @@ FEWEST = 40
 """If there are so many of them."""
 
 
+@savable(fixed="depth near far whole smooth")
 @dataclass(frozen=True)
 class CoarseView:
     """A located depth image, `factor` times smaller.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from sight.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from sight.hpp; changes are lost.
 """What a view's depth says of other places: it looks through them, shows them, or has something before them."""
 
 from __future__ import annotations

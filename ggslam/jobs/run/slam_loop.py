@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -47,6 +47,7 @@ class SlamLoop:
         checkpointing: saves the state; None: never.
         stop: says when to end early.
         resume: brings a fresh `Slam` to where it was, and tells which frame comes next, None if it was nowhere yet.
+        told: notes of the run that were told at its start.
         saw_all: whether all frames were tracked, and what is left is the refinement.
     """
 
@@ -60,6 +61,7 @@ class SlamLoop:
     checkpointing: Checkpointing | None = None
     stop: StopRequest = field(default_factory=StopRequest)
     resume: Callable[[Slam], int | None] | None = None
+    told: list[str] = field(default_factory=list)
     saw_all: bool = False
     _between_steps: bool = False
 
@@ -76,6 +78,9 @@ class SlamLoop:
         folder = self.folder
         paging = new_staging(folder.path) if self.config.memory_limit_mb and folder is not None else None
         slam = make_slam(self.sequence, self.config, paging)
+        self.told = list(slam.start_notes)
+        for note in self.told:
+            self.observer.note(note)
         begin = None if self.resume is None else self.resume(slam)
         if begin is None and self.earlier is not None:
             start_in_map(slam, self.earlier, self.growing)
@@ -100,14 +105,6 @@ class SlamLoop:
             paced = RealtimeSlam(slam, self.config.realtime_fps, live=isinstance(sequence, LiveSequence))
             paced.run(frames, lambda *step: self._report(slam, *step))
             return
-        if isinstance(slam, RigSlam):
-            self._instants(slam, frames)
-            return
-        for frame in frames:
-            self._between_steps = False
-            self._report(slam, frame, slam.step(frame))
-
-    def _instants(self, slam: RigSlam, frames: Iterable[Frame]) -> None:
         for together in by_instant(frames):
             self._between_steps = False
             steps = slam.step_together(together)
@@ -129,7 +126,7 @@ class SlamLoop:
 
     def _refine(self, slam: Slam) -> SlamResult:
         self.saw_all = True
-        slam.settle_parts()
+        slam.join_parts()
         wanted = slam.refinement_steps
         if wanted:
             self.observer.begin("refine", wanted)

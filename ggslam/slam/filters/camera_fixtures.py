@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds out what is fixed to the camera (a tool, a bonnet) and takes it out of frames: it would be mapped
+again at every keyframe, in front of everything else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import cv2
+import numpy as np
+
+from ggslam.geometry.image_parts import parts_with_seeds
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse, separation
+from ggslam.sight.fixed_to_camera import compare_views, shrink_depth
+from ggslam.slam.filters.frame_filter import FrameFilter
+from ggslam.slam.map_removal import MapRemoval
+from ggslam.system.array_forms import DepthImage, Form, Mask, Pose
+from ggslam.system.savable import savable
+from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
+
+COLUMNS = 80
+"""Of the images that are compared, about."""
+EARLIER, VIEWS = 3, 16
+"""Each view is compared with so many before; after so many views nothing is looked for any more."""
+APART, TURNED_DEG = 0.05, 4.0
+"""Views are so far apart: metres for each metre of median depth, or degrees."""
+FEWEST, STILL_SHARE, AGAINST = 6, 0.3, 3
+"""So many comparisons of views, and this share of them, find depth where it was, this many times as many as find it to
+be of the world."""
+SEEDS, SEED_SHARE = 2, 0.05
+"""So many look through where something would be in the world, at this share of its pixels."""
+FARTHEST_M = 5.0
+"""A tool, a bonnet, a wing reach no farther; what is still in the image beyond is depth that a network guessed alike in
+frame after frame."""
+LEAST_SHARE = 0.005
+"""Of the image: less is left alone."""
+NEARER, NEARER_THAN_SCENE = 1.5, 0.5
+"""Nothing of the world is nearer than this many times the distance of what is fixed to the camera, if that is less than
+this share of the scene's distance: such depth is its flying pixels."""
+
+
+@savable()
+@dataclass
+class CameraFixtures(FrameFilter):
+    """Looks at the first located frames that are apart from one another.
+
+    Attributes:
+        mask: bool [H, W], what is fixed to the camera; None: nothing, as far as is known.
+        nearest: metres; nearer depth is of it, too, wherever it is in the image.
+        changes: how many times `mask` has changed.
+        views: frames that were compared.
+        comparisons: of one of them with another.
+        counts: int32 [3, h, w], comparisons that say of a pixel that it is fixed, still, of the world (`PairEvidence`).
+        latest: depth as compared, and pose, of the latest views.
+    """
+
+    order = 30
+
+    mask: Mask | None = None
+    nearest: float = 0.0
+    changes: int = 0
+    views: int = 0
+    comparisons: int = 0
+    counts: Annotated[np.ndarray, Form("i4", 3, None, None)] | None = None
+    latest: list[tuple[Annotated[np.ndarray, Form("f4", None, None)], Pose]] = field(default_factory=list)
+    _depth: DepthImage | None = None
+    """Of the frame at hand, as the camera gave it."""
+    _left_out: int = 0
+    """Of `changes`, those that the map knows of."""
+
+    def notes(self, frames: int) -> list[str]:
+        """What the user should know."""
+        if self.mask is None:
+            return []
+        return [f"{self.mask.mean():.0%} of every image is fixed to the camera (a tool, a holder): it is not mapped"]
+
+    def clean(self, frame: Frame) -> Frame:
+        """The frame without what is fixed to the camera: itself if that is nothing."""
+        self._depth = frame.depth
+        if self.mask is None:
+            return frame
+        valid = ~self.mask if frame.valid is None else frame.valid & ~self.mask
+        fixed = self.mask | (frame.depth < self.nearest)
+        return replace(frame, depth=np.where(fixed, np.float32(0), frame.depth), valid=valid)
+
+    def judge(
+        self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
+    ) -> tuple[Frame, TrackingResult]:  # fmt: skip
+        """The same; what the frame shows may be compared with later ones."""
+        self.follow(frame.camera, None if result.status is TrackingStatus.LOST else result.T_world_camera)
+        return frame, result
+
+    def after_insertion(self, removal: MapRemoval, newest: Frame) -> None:
+        """Removes what has turned out to be fixed to the camera."""
+        if self.mask is None or (self.changes == self._left_out and not newest.depth[self.mask].any()):
+            return
+        self._left_out = self.changes
+        if not removal.is_paged:
+            removal.drop_pixels(self.mask, self.nearest)
+
+    def follow(self, camera: Camera, T_world_camera: np.ndarray | None) -> None:
+        """The frame that `clean` was asked about last was located at a pose [4, 4], or not (None)."""
+        depth, self._depth = self._depth, None
+        if T_world_camera is None:
+            self.latest = []
+        elif depth is not None and self.views < VIEWS:
+            self._look(depth, camera, T_world_camera)
+
+    def _look(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
+        factor = max(1, round(camera.width / COLUMNS))
+        if self.latest:
+            moved, turned = separation(self.latest[-1][1], T_world_camera)
+            known = depth[:: 2 * factor, :: 2 * factor]
+            median = float(np.median(known[known > 0])) if (known > 0).any() else 0.0
+            if not median or (moved < APART * median and turned < TURNED_DEG):
+                return
+        small, smaller = shrink_depth(depth, camera, factor)
+        if self.counts is None:
+            self.counts = np.zeros((3, *small.shape), np.int32)
+        for other, T_world_other in self.latest:
+            T_other_camera = inverse(T_world_other) @ T_world_camera
+            for found in (
+                compare_views(small, other, T_other_camera, smaller),
+                compare_views(other, small, inverse(T_other_camera), smaller),
+            ):
+                self.counts += np.stack([found.fixed, found.still, found.world])
+                self.comparisons += 1
+        self.latest, self.views = [*self.latest[1 - EARLIER :], (small, T_world_camera.copy())], self.views + 1
+        if self.comparisons >= FEWEST:
+            self._judge(camera, factor, small)
+        if self.views == VIEWS:
+            self.latest = []
+
+    def _judge(self, camera: Camera, factor: int, depth: np.ndarray) -> None:
+        assert self.counts is not None
+        fixed, still, world = self.counts
+        candidates = (still >= max(FEWEST, STILL_SHARE * self.comparisons)) & (still >= AGAINST * world)
+        candidates &= depth < FARTHEST_M
+        found = parts_with_seeds(candidates & (fixed >= SEEDS), candidates, SEED_SHARE)
+        if found.mean() < LEAST_SHARE:
+            return
+        grown = cv2.dilate(found.astype(np.uint8), np.ones((3, 3), np.uint8))
+        large = cv2.resize(grown, (grown.shape[1] * factor, grown.shape[0] * factor), interpolation=cv2.INTER_NEAREST)
+        right, below = camera.width - large.shape[1], camera.height - large.shape[0]
+        mask = np.pad(large, ((0, below), (0, right)), mode="edge") > 0
+        mask = mask if self.mask is None else mask | self.mask
+        if self.mask is None or (mask & ~self.mask).mean() > LEAST_SHARE:
+            self.mask, self.changes = mask, self.changes + 1
+            own, scene = depth[found & (depth > 0)], depth[~found & (depth > 0)]
+            if len(own) and len(scene):
+                distance = float(np.percentile(own, 90))
+                self.nearest = NEARER * distance if distance < NEARER_THAN_SCENE * float(np.median(scene)) else 0.0
+
+
+def find_fixtures(frames: Iterable[Frame], poses: Mapping[int, np.ndarray]) -> CameraFixtures:
+    """What is fixed to the camera of a recording.
+
+    Args:
+        frames: of it, in their order.
+        poses: T_world_camera [4, 4] of them, by `Frame.index`.
+    """
+    fixtures = CameraFixtures()
+    for frame in frames:
+        if fixtures.views == VIEWS:
+            break
+        fixtures.clean(frame)
+        fixtures.follow(frame.camera, poses.get(frame.index))
+    return fixtures

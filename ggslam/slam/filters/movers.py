@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds what moves in the frames of a run and keeps it out of tracking, map and places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ggslam.geometry.moved_depth import largest_shift
+from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.movers.detector import GROWN, MoverDetector, coarse_factor, grow
+from ggslam.movers.recent import RecentFrame
+from ggslam.movers.settings import MoverSettings
+from ggslam.movers.tracks import MoverTracks
+from ggslam.movers.trail import gone_since
+from ggslam.native.loader import NativeContext
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse
+from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
+from ggslam.sight.margin import Margin
+from ggslam.sight.places import CoarseView
+from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
+from ggslam.slam.map_removal import MapRemoval
+from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
+from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
+from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
+
+SURE = (TrackingStatus.FIRST, TrackingStatus.OK, TrackingStatus.DEGENERATE)
+"""How frames are tracked in which something may be found that did not move before."""
+SWIFT = 3.0
+"""Widths of the image a second by which it shifts where rolling shutters warp it: by a tenth of its width between the
+first row and the last, if they are a thirtieth of a second apart."""
+DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
+"""Where frames are that nothing is said of: their poses may be wrong."""
+LOOKED_BACK = 64
+"""So many of the latest keyframes are searched for what has moved since."""
+
+
+@savable(not_saved="_reads_masks _margin context")
+class MoverFilter(FrameFilter):
+    """Finds movers in each located frame, if the settings want it; else frames and results stay as they are.
+
+    Args:
+        settings: see there.
+        reads_masks: whether frames' masks may be asked for.
+        context: that evidence is computed in; it may be replaced.
+    """
+
+    order = 40
+    in_rigs = InRigs.SHARED  # switched off by the settings of a rig: frames of different cameras follow one another
+    _before: tuple[float, Pose] | None
+
+    def __init__(self, settings: MoverSettings, reads_masks: bool, context: NativeContext) -> None:
+        self.detector = MoverDetector(settings)
+        self._reads_masks, self.context = reads_masks, context
+        self.pixels = MovingPixels()
+        """What was found in the frames so far."""
+        self.tracks = MoverTracks()
+        """The movers one by one."""
+        self._margin = _margin(settings, DepthNoise())
+        self._before = None
+        """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
+
+    @classmethod
+    def make(cls, made_of: FilterContext) -> MoverFilter:
+        """One as the settings want it."""
+        config = made_of.config
+        return cls(config.movers, config.masks.source in ("auto", "recording"), made_of.context)
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is looked for."""
+        return self.detector.settings.enabled
+
+    @property
+    def mask(self) -> np.ndarray | None:
+        """What moves in the frame tracked last, bool [H, W]; None: nothing, as far as is known."""
+        return self.detector.mask
+
+    def use_context(self, context: NativeContext) -> None:
+        """Evidence is computed in the tracker's thread, in this context."""
+        self.context = context
+
+    def expects_motion(self) -> bool:
+        """Whether something in the frame tracked last moves, or may."""
+        return self.detector.found is not None
+
+    def expect(self, frame: Frame) -> Frame:
+        """The frame to locate: without depth where something is expected to move."""
+        return self.detector.expect(frame) if self.active else frame
+
+    def judge(
+        self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
+    ) -> tuple[Frame, TrackingResult]:  # fmt: skip
+        """The frame without depth where something moves, which `Frame.moving` tells, and the result without points
+        of it."""
+        if not self.active:
+            return frame, result
+        result = self._look(frame, result, noise)
+        return self.detector.clean(frame), result
+
+    def _look(self, frame: Frame, result: TrackingResult, noise: DepthNoise | None) -> TrackingResult:
+        """Finds what moves in a frame that was located; returns the result without points of it."""
+        noise = noise or DepthNoise()
+        self._margin = _margin(self.detector.settings, noise)
+        known = result.status not in DOUBTFUL
+        shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
+        T_world_camera = result.T_world_camera if known else None
+        swift = self._is_swift(frame, T_world_camera, result.median_depth_m)
+        self.detector.look(shown, T_world_camera, self._margin, self.context, result.status in SURE, swift)
+        if known:
+            self.tracks.look(RecentFrame.of(shown, result.T_world_camera, self._margin), self.detector.things)
+        else:
+            self.tracks.clear()
+        mask = self.detector.mask
+        if mask is None:
+            return result
+        self.pixels.add(frame.index, mask)
+        return replace(result, points=_without(result.points, mask))
+
+    def _is_swift(self, frame: Frame, T_world_camera: np.ndarray | None, depth_m: float) -> bool:
+        """Whether the image shifts so fast since the frame before that shutters warp it."""
+        before, self._before = self._before, None if T_world_camera is None else (frame.timestamp, T_world_camera)
+        if before is None or T_world_camera is None or not frame.timestamp > before[0]:
+            return False
+        shift = largest_shift(inverse(T_world_camera) @ before[1], frame.camera, depth_m)
+        return shift > SWIFT * frame.camera.width * (frame.timestamp - before[0])
+
+    def after_insertion(self, removal: MapRemoval, newest: Frame) -> None:
+        """Removes what was mapped before it began to move, as far as the newest frame, which has just become a
+        keyframe, looks through where it was."""
+        if not self.has_trail or removal.is_paged:
+            return
+        keyframes = removal.keyframes
+        latest, earlier = keyframes[-1], [k for k in keyframes[-1 - LOOKED_BACK : -1] if k.frame_index != ELSEWHERE]
+        views = [(k.depth_m(), k.T_world_camera, k.mask) for k in earlier]
+        gone = self.gone_since(views, newest, latest.T_world_camera)
+        parts = [(k, part) for k, part in zip(earlier, gone, strict=True) if part is not None]
+        if parts:
+            removal.drop_moved(parts)
+
+    @property
+    def has_trail(self) -> bool:
+        """Whether anything was ever found."""
+        return self.active and len(self.detector.trail.keys) > 0
+
+    def gone_since(
+        self, earlier: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray | None]], newest: Frame,
+        T_world_newest: np.ndarray,
+    ) -> list[np.ndarray | None]:  # fmt: skip
+        """What earlier views show where something has moved since, and the newest frame looks through.
+
+        Args:
+            earlier: depth float32 [H, W], metres, T_world_camera [4, 4] and segments uint16 [H, W] of each.
+            newest: without what moves in it.
+            T_world_newest: [4, 4].
+
+        Returns:
+            Of each, bool [H, W]; None: nothing.
+        """
+        settings, camera, trail = self.detector.settings, newest.camera, self.detector.trail
+        factor = coarse_factor(camera, settings)
+        view = CoarseView.of(newest.depth, camera, factor, T_world_newest, self._margin, self.context)
+        found: list[np.ndarray | None] = []
+        for depth, T_world_camera, segments in earlier:
+            if depth.shape != newest.depth.shape:
+                found.append(None)
+                continue
+            old = CoarseView.of(depth, camera, factor, T_world_camera, self._margin, self.context)
+            part = gone_since(old, view, trail, segments, depth.shape, factor, self._margin, settings, self.context)
+            found.append(None if part is None else grow(part, GROWN))
+        return found
+
+    def notes(self, frames: int) -> list[str]:
+        """What the user should know of a run of so many frames."""
+        found = len(self.pixels)
+        return [f"something moves in {found} of {frames} frames: it is not mapped ({MOVERS_FILE})"] if found else []
+
+    def move(self, T_new_old: np.ndarray) -> None:
+        """Follows a correction [4, 4] of the world about the camera."""
+        self.detector.move(T_new_old)
+        if self._before is not None:
+            self._before = self._before[0], T_new_old @ self._before[1]
+        self.tracks.move(T_new_old)
+
+
+def _margin(settings: MoverSettings, noise: DepthNoise) -> Margin:
+    """What depths of one surface may differ by."""
+    return Margin(settings.margin_m, 0.0, settings.margin_sigmas, noise.constant, noise.square)
+
+
+def _without(points: PointSource, mask: np.ndarray) -> DeferredPoints:
+    """Points of a frame but those on a mask bool [H, W]."""
+
+    def choose() -> FramePoints:
+        read = points.read()
+        stays = ~mask[read.pixels[:, 1], read.pixels[:, 0]]
+        return FramePoints(
+            read.points[stays], read.normals[stays], read.covariances[stays], read.pixels[stays], read.weights[stays],
+            None if read.depths is None else read.depths[stays],
+        )  # fmt: skip
+
+    return DeferredPoints(choose, points.median_depth)
