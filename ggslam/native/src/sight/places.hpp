@@ -30,6 +30,19 @@ struct ProjectedPlaces {
   uint8_t* smooth;  // 1: and both views are smooth there
 };
 
+// Standard deviation of a pixel's depth at depth z, metres.
+template <class T>
+static inline T sigma_at(const SightMargin& m, T z) {
+  return static_cast<T>(m.constant) + static_cast<T>(m.square) * z * z;
+}
+
+// How far depths z of one surface may differ, metres; `noise_share`: of the noise that is left in means.
+template <class T>
+static inline T margin_at(const SightMargin& m, T z, T noise_share) {
+  const T least = static_cast<T>(m.least), of_distance = static_cast<T>(m.share) * z;
+  return (of_distance > least ? of_distance : least) + static_cast<T>(m.sigmas) * noise_share * sigma_at(m, z);
+}
+
 // A row of an image as if it were mirrored at its borders, without repeating them.
 inline int mirrored(int i, int count) {
   if (count == 1) return 0;

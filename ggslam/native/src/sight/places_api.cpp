@@ -28,11 +28,6 @@ void check_margin(const SightMargin& margin) {
   for (const double number : numbers) check_range("margin", number, 0.0, 1e9);
 }
 
-// Standard deviation of a pixel's depth, metres.
-float sigma_at(const SightMargin& margin, float z) {
-  return static_cast<float>(margin.constant) + static_cast<float>(margin.square) * z * z;
-}
-
 // How far depth at a place of the other view, between its four pixels, is from that of the point there.
 float off_by(const PlacesEvidenceJob& job, const PlacesView& other, float u, float v, float z) {
   const int left = std::clamp(static_cast<int>(u), 0, std::max(0, other.width - 2));

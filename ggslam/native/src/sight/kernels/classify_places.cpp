@@ -10,9 +10,7 @@ namespace {
 uint8_t judge(const SightJob& job, std::size_t pixel, double z) {
   const double own = job.depth[pixel], near = job.near[pixel], far = job.far[pixel];
   if (!(own > 0)) return kUnknown;
-  const SightMargin& m = job.margin;
-  const double base = m.share * z > m.least ? m.share * z : m.least;
-  const double within = base + m.sigmas * (m.constant + m.square * z * z);
+  const double within = margin_at(job.margin, z, 1.0);
   if (std::fabs(own - z) <= within) return kSame;
   if (own > z) return near > z + within ? kThrough : kBefore;
   return near > 0 && far < z - within ? kHidden : kBehind;

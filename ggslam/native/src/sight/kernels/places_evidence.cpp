@@ -45,10 +45,7 @@ void project_places(const PlacesView& a, const OtherPlacesView& other, const Pro
 
 void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count, const ProjectedPlaces& places,
                   uint8_t* found) {
-  const SightMargin& margin = job.margin;
-  const float constant = static_cast<float>(margin.constant), square = static_cast<float>(margin.square);
-  const float least = static_cast<float>(margin.least), share_of_z = static_cast<float>(margin.share);
-  const float sigmas = static_cast<float>(margin.sigmas), rough = job.rough;
+  const SightMargin margin = job.margin;  // a copy: what is written may not change it
   uint8_t* passed = found;
   uint8_t* clearly = passed + count;
   uint8_t* surely = clearly + count;
@@ -56,8 +53,7 @@ void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count, 
   uint8_t* otherwise = same + count;
   for (std::size_t i = 0; i < count; ++i) {
     const float z = places.z[i], near = places.near[i], far = places.far[i];
-    const float base = share_of_z * z > least ? share_of_z * z : least;
-    const float slack = base + sigmas * (places.smooth[i] ? share : rough) * (constant + square * z * z);
+    const float slack = margin_at(margin, z, places.smooth[i] ? share : job.rough);
     const uint8_t known = places.known[i], there = places.where[i] >= 0;
     const uint8_t beyond = known & (near > z + 2 * slack);
     const uint8_t surface = there & (near < z + slack) & (far > z - slack);
