@@ -67,13 +67,6 @@ class DeviceName(str, Enum):
     cuda = "cuda"
 
 
-class TrackerName(str, Enum):
-    """How frames are located."""
-
-    gicp = "gicp"
-    features = "features"
-
-
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; default runs/NAME.")]
 Record = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Keep the frames of a live camera in this folder, as a recording.")
@@ -87,7 +80,8 @@ Realtime = Annotated[
     float | None, typer.Option(metavar="FPS", help="Deliver frames at this rate; tracker and mapper run side by side.")
 ]
 Tracker = Annotated[
-    TrackerName | None, typer.Option(help="Track by generalised ICP (default), or by edge and plane features.")
+    str | None,
+    typer.Option(metavar="NAME", help="gicp: track by generalised ICP (default); edges_planes: by edges and planes."),
 ]
 Device = Annotated[
     DeviceName | None, typer.Option(help="Compute on the CPU (default), on an NVIDIA GPU, or on a GPU if there is one.")

@@ -192,9 +192,9 @@ class RigSlam(Slam):
     def _of_frames(self, frames: list[Frame], joint: TrackingResult, now: float) -> list[TrackingResult]:
         """The same for each of the frames: its pose, its own points, and how well they fit."""
         parts, shares = self._engine.parts, list[float | None]([None] * len(frames))
-        if joint.alignment is not None and len(joint.alignment.matches.read().voxels) == sum(map(len, parts)):
+        if joint.gicp is not None and len(joint.gicp.matches.read().voxels) == sum(map(len, parts)):
             noise = self.tracker.noise or DepthNoise()
-            shares = self._engine.overlaps(joint.alignment, self.tracker.settings.align, noise)
+            shares = self._engine.overlaps(joint.gicp, self.tracker.settings.align, noise)
         return [
             replace(
                 joint, points=part, overlap=joint.overlap if share is None else share,
