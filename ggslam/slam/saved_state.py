@@ -17,6 +17,7 @@ import numpy as np
 from ggslam.errors import ConfigError, FormatError
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.slam.config import Config
+from ggslam.slam.filters.earlier_views import EarlierViews
 from ggslam.slam.slam import Slam
 from ggslam.system.object_tree import Keeper, Kept, describe, restore
 from ggslam.system.savable import Rule, Rules, savable_classes
@@ -74,7 +75,7 @@ def check_state(slam: Slam) -> None:
             raise FormatError(f"keyframe {number}: not of this recording")
     if not all(view.fits() for view in slam.movers.detector.views):
         raise FormatError("views of what may move: not of their camera")
-    if not slam.earlier_views.check():
+    if not slam.filters.get(EarlierViews).check():
         raise FormatError("views of the map that the run began with: not of their cameras")
     slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]

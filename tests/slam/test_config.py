@@ -105,7 +105,8 @@ def test_overrides_that_are_no_list(overrides: Any) -> None:
 def test_the_old_name_of_a_tracker_is_read_and_said() -> None:
     """`features` of earlier versions, in --set and in files of settings, is `edges_planes`."""
     with pytest.warns(OldNameWarning) as said:
-        config = load_config(None, ["tracker=features", "features.align.budget_ms=3", "edges_planes.map.edge_voxel=0.25"])
+        given = ["tracker=features", "features.align.budget_ms=3", "edges_planes.map.edge_voxel=0.25"]
+        config = load_config(None, given)
     assert config.tracker == "edges_planes" and len(said) == 2
     assert config.edges_planes.align.budget_ms == 3 and config.edges_planes.map.edge_voxel == 0.25
     old = {"tracker": "features", "features": {"align": {"budget_ms": 3, "edges": 70}}}
