@@ -72,7 +72,7 @@ class Slam:
         paging: folder that what does not fit into `memory_limit_mb` moves to; None: a temporary one.
         library: CUDA kernels to compute with; None: as `config.device` says.
         extra_loss: a loss of one's own in every mapping iteration, extra_loss(view, keyframe) -> scalar tensor, see
-            `mapping.extra_loss.ExtraLoss`; on the CPU only.
+            `mapping.extra_loss.ExtraLoss`.
 
     Raises:
         InputError: a camera, settings or an extra loss that are none.
@@ -97,8 +97,6 @@ class Slam:
         self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
         self.start_notes = parts.notes
         """What the user should know of the parts that the settings chose."""
-        if extra_loss is not None and parts.on_device:
-            raise ConfigError("a loss of your own (extra_loss) needs device: cpu; on a GPU kernels compute the losses")
         self.mapper.extra_loss = extra_loss
         self.policy = KeyframePolicy(self.config.keyframes)
         self.scale = 1.0
