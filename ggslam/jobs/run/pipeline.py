@@ -258,9 +258,10 @@ class _Run:
         wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)
         told = None if error is None else repr(error)
         try:
-            folder, failure = save_somewhere(
-                self.folder, RunToWrite(self.config, described, result, told, names, wanted, verdicts)
-            )
+            run = RunToWrite(
+                self.config, described, result, told, names, wanted, verdicts, loss=self.request.loss
+            )  # fmt: skip
+            folder, failure = save_somewhere(self.folder, run)
             if (folder.path / "map.ply").is_file():
                 self.fit = self._or_note(lambda: self._fit(result, folder))
         finally:
