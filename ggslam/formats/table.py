@@ -93,7 +93,7 @@ def choose_writer(asked: str | None, out: Path, objects: str | None = None) -> W
     Raises:
         ConfigError: an unknown format; the name says none, or says another one than `asked`.
     """
-    named = named_by(out)
+    named = writers_for(out)
     if asked is not None:
         writer = next((known for known in writers() if known.name == asked), None)
         if writer is None:
@@ -111,9 +111,9 @@ def choose_writer(asked: str | None, out: Path, objects: str | None = None) -> W
     )
 
 
-def named_by(out: Path) -> list[Writer]:
+def writers_for(out: Path) -> list[Writer]:
     """Those whose files may have this name: of several endings that fit the longest counts."""
-    fits = {writer.name: len(writer.ending_of(out)) for writer in writers()}
+    fits = {writer.name: len(writer.longest_ending(out)) for writer in writers()}
     longest = max(fits.values())
     return [writer for writer in writers() if longest and fits[writer.name] == longest]
 
@@ -121,7 +121,7 @@ def named_by(out: Path) -> list[Writer]:
 def splat_writer(path: str | Path) -> Writer:
     """Who writes Gaussians, as they are, into a file of this name; raises ConfigError if no format is called so."""
     able = [writer for writer in writers() if writer.takes is Takes.GAUSSIANS and not writer.in_cells]
-    found = next((writer for writer in named_by(Path(path)) if writer in able), None)
+    found = next((writer for writer in writers_for(Path(path)) if writer in able), None)
     if found is None:
         known = dict.fromkeys(ending for writer in able for ending in writer.endings)
         raise ConfigError(f"{path}: expected a name that ends in one of {', '.join(known)}")

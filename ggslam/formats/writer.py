@@ -171,14 +171,14 @@ class Writer:
     in_cells: bool = False
     check: Callable[[Path], object] | None = None
 
-    def ending_of(self, path: Path) -> str:
+    def longest_ending(self, path: Path) -> str:
         """The longest of its endings that a name has; empty: none."""
         name = path.name.lower()
         return max((e for e in self.endings if name == e or (e[0] == "." and name.endswith(e))), key=len, default="")
 
     def check_path(self, path: Path) -> None:
         """Raises FormatError or MissingDependency if it cannot write a file of this name."""
-        if self.endings and not self.any_name and not self.ending_of(path):
+        if self.endings and not self.any_name and not self.longest_ending(path):
             suffixes = ", ".join(e for e in self.endings if e[0] == ".")
             other = "".join(f", or is called {e}" for e in self.endings if e[0] != ".")
             raise FormatError(f"{path}: a file of the format {self.name} ends in {suffixes}{other}")

@@ -135,14 +135,14 @@ def with_new_names(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
         old = values.pop(OLD_EDGES_PLANES)
         new = values.setdefault("edges_planes", old)
         if new is not old and isinstance(old, dict) and isinstance(new, dict):
-            values["edges_planes"] = _merged(old, new)
+            values["edges_planes"] = _merge(old, new)
         said.append(f"{OLD_EDGES_PLANES} is the old name of the settings edges_planes")
     return values, said
 
 
-def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+def _merge(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
     """Nested values of both; the new ones where both have one."""
-    both = {name: _merged(old[name], value) if isinstance(value, dict) and isinstance(old.get(name), dict) else value
+    both = {name: _merge(old[name], value) if isinstance(value, dict) and isinstance(old.get(name), dict) else value
             for name, value in new.items()}  # fmt: skip
     return {**old, **both}
 

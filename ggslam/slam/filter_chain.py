@@ -90,11 +90,11 @@ class FilterChain(FrameFilter):
             frame = one.expect(frame)
         return frame
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         for one in self.filters:
-            frame, result = one.located(frame, result, noise)
+            frame, result = one.judge(frame, result, noise)
         return frame, result
 
     def expects_motion(self) -> bool:

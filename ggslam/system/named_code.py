@@ -26,7 +26,7 @@ def load_named(name: str) -> object:
     try:
         module = _module_in(Path(place)) if place.endswith(".py") else importlib.import_module(place)
     except Exception as error:
-        raise ValueError(f"{place} cannot be imported: {told_with_line(error)}") from error
+        raise ValueError(f"{place} cannot be imported: {tell_with_line(error)}") from error
     if not hasattr(module, attribute):
         named = vars(module).items()
         own = [n for n, v in named if callable(v) and getattr(v, "__module__", "") == module.__name__]
@@ -34,7 +34,7 @@ def load_named(name: str) -> object:
     return getattr(module, attribute)
 
 
-def told_with_line(error: Exception) -> str:
+def tell_with_line(error: Exception) -> str:
     """An error of the user's code for people: its type, its text, and the line that it comes from."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [f for f in frames if "importlib" not in f.filename and f.filename != __file__]

@@ -17,7 +17,7 @@ from ggslam.mapping.losses import LossGradients
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.frame import Frame
 from ggslam.scene.identity import IDENTITY_CHANNELS
-from ggslam.system.named_code import load_named, told_with_line
+from ggslam.system.named_code import load_named, tell_with_line
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class NamedLoss:
         except (GgslamError, MemoryError, torch.cuda.OutOfMemoryError):
             raise
         except Exception as error:
-            raise ConfigError(f"`loss` {self.name}: {told_with_line(error)}") from error
+            raise ConfigError(f"`loss` {self.name}: {tell_with_line(error)}") from error
         return value
 
     def try_on(self, frame: Frame, device: torch.device) -> None:

@@ -110,10 +110,14 @@ def _other_loss(run: Path, model: str, loss: str | None) -> str:
 
 def go_on_command(run: Path, model: str = "", loss: str | None = None) -> str:
     """What goes on with a run that was cut off; `model` of masks and `loss`: that it was begun with."""
-    words = ["ggslam", "run", "--resume", str(run)]
-    words += ["--set", f"masks.model={model}"] if model else []
-    words += ["--loss", loss] if loss is not None else []
-    return shlex.join(words)
+    forms = {
+        (False, False): "ggslam run --resume {run}",
+        (True, False): "ggslam run --resume {run} --set masks.model={model}",
+        (False, True): "ggslam run --resume {run} --loss {loss}",
+        (True, True): "ggslam run --resume {run} --set masks.model={model} --loss {loss}",
+    }
+    values = {"run": str(run), "model": model, "loss": loss or ""}
+    return forms[bool(model), loss is not None].format(**{name: shlex.quote(text) for name, text in values.items()})
 
 
 def _earlier(start: StartRecord) -> RunFolder | None:

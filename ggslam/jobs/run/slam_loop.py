@@ -49,6 +49,7 @@ class SlamLoop:
         checkpointing: saves the state; None: never.
         stop: says when to end early.
         resume: brings a fresh `Slam` to where it was, and tells which frame comes next, None if it was nowhere yet.
+        told: notes of the run that were told at its start.
         loss: a loss of the user's own that joins the mapper's.
         saw_all: whether all frames were tracked, and what is left is the refinement.
     """
@@ -63,6 +64,7 @@ class SlamLoop:
     checkpointing: Checkpointing | None = None
     stop: StopRequest = field(default_factory=StopRequest)
     resume: Callable[[Slam], int | None] | None = None
+    told: list[str] = field(default_factory=list)
     loss: NamedLoss | None = None
     saw_all: bool = False
     _between_steps: bool = False
@@ -84,6 +86,9 @@ class SlamLoop:
             slam.start_notes.append(f"trained with a loss of your own, {self.loss.name}")
             if isinstance(self.sequence, Sequence):
                 self.loss.try_on(next(iter(self.sequence.stream(masks="lazy"))), slam.map.device)
+        self.told = list(slam.start_notes)
+        for note in self.told:
+            self.observer.note(note)
         begin = None if self.resume is None else self.resume(slam)
         if begin is None and self.earlier is not None:
             start_in_map(slam, self.earlier, self.growing)

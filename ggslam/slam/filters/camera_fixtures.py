@@ -87,7 +87,7 @@ class CameraFixtures(FrameFilter):
         fixed = self.mask | (frame.depth < self.nearest)
         return replace(frame, depth=np.where(fixed, np.float32(0), frame.depth), valid=valid)
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The same; what the frame shows may be compared with later ones."""

@@ -68,7 +68,7 @@ class EarlierViews(FrameFilter):
         """One that has compared nothing yet."""
         return cls(made_of.context)
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The same; the noise is known from now on."""

@@ -92,7 +92,7 @@ class MoverFilter(FrameFilter):
         """The frame to locate: without depth where something is expected to move."""
         return self.detector.expect(frame) if self.active else frame
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The frame without depth where something moves, which `Frame.moving` tells, and the result without points

@@ -62,7 +62,7 @@ class ShutterTimes(FrameFilter):
         self.T_color_depth = T_color_depth
         return replace(frame, depth=moved_depth(frame.depth, frame.camera, T_color_depth), depth_delay=0.0)
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The same; the depth camera's motion up to this frame is known from now on."""
