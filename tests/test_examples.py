@@ -74,6 +74,14 @@ def test_own_camera(run: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert len(list((tmp_path / "walk" / "rgb").iterdir())) == 4 and (tmp_path / "run" / "metrics.json").is_file()
 
 
+def test_own_loss(run: Program, room: Path, tmp_path: Path) -> None:
+    plain, sharp = map(float, re.findall(r"0\.\d+", run("own_loss.py", room, "--frames", 4)))
+    assert sharp < plain
+    own = ["--loss", EXAMPLES / "own_loss.py:same_saturation"]
+    ggslam("run", room, "--stop", 2, "--out", "run", "--iterations", 1, *own)
+    assert (tmp_path / "run" / "metrics.json").is_file()
+
+
 def test_remove_object(run: Program, finished: Path, tmp_path: Path) -> None:
     said = run("remove_object.py", finished, "sofa", "without")
     assert said.startswith("objects: ") and said.count("_color.png") == 3

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar
-from ggslam.jobs.export.formats import ExportFormat, UpAxis
+from ggslam.cli.old_names import Command
+from ggslam.jobs.export.up_axis import UpAxis
 from ggslam.volumes.output_frame import OutputFrame
 
 EPILOG = """
@@ -44,42 +45,68 @@ EPILOG = """
 """
 
 
+class ExportCommand(Command):
+    """Its help names the formats, whose table loads torch: only when somebody asks for help."""
+
+    def __init__(self, *arguments: Any, **more: Any) -> None:
+        super().__init__(*arguments, **more)
+        self._words: dict[str | None, str] = {}
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Shows the help."""
+        self.name_formats()
+        super().format_help(ctx, formatter)
+
+    def name_formats(self) -> None:
+        """Puts names, endings and meanings of the formats into the help of the options."""
+        from ggslam.formats.table import endings, names_of, readers, writers
+        from ggslam.formats.writer import Takes
+
+        gaussians = [known for known in writers() if known.takes in (Takes.GAUSSIANS, Takes.OBJECT_COLORS)]
+        named = {
+            "{endings}": " ".join(endings()),
+            "{readers}": ", ".join(known.name for known in readers()),
+            "{cells}": names_of([known for known in writers() if known.in_cells]),
+            "{folders}": ", ".join(known.name for known in writers() if known.in_cells or not known.endings),
+            "{formats}": "; ".join(f"{known.name}: {known.text}" for known in writers()),
+            "{by_object}": names_of([known for known in gaussians if known.by_object and known.name != "ply"]),
+            "{points}": names_of([known for known in writers() if known.takes is Takes.POINTS]),
+            "{views}": names_of([known for known in writers() if known.takes is Takes.VIEWS]),
+        }
+        for parameter in self.params:
+            words = self._words.setdefault(parameter.name, getattr(parameter, "help", None) or "")
+            for place, text in named.items():
+                words = words.replace(place, text)
+            parameter.help = words  # type: ignore[attr-defined]
+
+
 OutPath = Annotated[
     Path,
     typer.Option(
-        help="File to write; its name says the format (.ply .glb .obj .spz .splat .sog .usda .usdc .usdz .pcd .txt, "
-        ".compressed.ply; meta.json, lod-meta.json: SOG and streamed SOG in their folder). A folder for streamed-sog, "
-        "points, colmap, nerfstudio, and for several --objects with ply; with mesh, --objects takes either."
+        help="File to write; its name says the format ({endings}; meta.json and lod-meta.json: SOG and streamed SOG in "
+        "their folder). A folder for {folders}, and for several --objects with ply; with mesh, --objects takes either."
     ),
 ]
 FormatName = Annotated[
-    ExportFormat | None,
-    typer.Option(
-        "--format",
-        help="ply: Gaussians as 3DGS stores them; segmented: the same in the colours of their objects; compressed-ply, "
-        "spz, spz4 (.spz, versions 3 and 4), splat, sog: the same in fewer bytes; streamed-sog: in pieces and levels "
-        "of detail, for the web; gltf: the same as .glb (without this option a .glb is a mesh); usd: OpenUSD; points, "
-        "pcd: coloured points; mesh: .glb, .obj or .ply; trajectory: TUM; colmap, nerfstudio: images, poses and points "
-        "for other trainers. Default: what the name of --out says.",
-    ),
-]
+    str | None, typer.Option("--format", help="{formats}. Default: what the name of --out says.")
+]  # fmt: skip
 Voxel = Annotated[
     float | None,
-    typer.Option(help="Metres between points (points, pcd, colmap, nerfstudio; default 0.01), or the edge of a mesh's "
+    typer.Option(help="Metres between points ({points}, {views}; default 0.01), or the edge of a mesh's "
                  "voxels (default: volumes.tsdf.voxel of the run, 0.02); defaults are larger in large scenes."),
 ]  # fmt: skip
 MinOpacity = Annotated[
-    float, typer.Option(help="Leave out fainter Gaussians (not for trajectory, mesh; points, pcd: with --discs).")
+    float, typer.Option(help="Leave out fainter Gaussians (not for trajectory, mesh; {points}: with --discs).")
 ]
 Discs = Annotated[
     bool,
-    typer.Option("--discs", help="points, pcd: sample the discs of all Gaussians. Default: the surface that the "
+    typer.Option("--discs", help="{points}: sample the discs of all Gaussians. Default: the surface that the "
                  "keyframes see, rendered and fused, one point a voxel."),
 ]  # fmt: skip
 Objects = Annotated[
     str | None,
     typer.Option(help="Objects by name or id (mug,7), or all. ply: a file for each (of one, --out may be the "
-                 "file); segmented, mesh, sog, streamed-sog, gltf, usd: only these."),
+                 "file); mesh, {by_object}: only these."),
 ]  # fmt: skip
 Movers = Annotated[
     bool,
@@ -88,7 +115,7 @@ Movers = Annotated[
 ]  # fmt: skip
 Plain = Annotated[bool, typer.Option("--plain", help="Write only the fields of 3DGS: no object ids, no identities.")]
 Keyframes = Annotated[
-    bool, typer.Option("--keyframes", help="colmap, nerfstudio: write only keyframes and held-out frames.")
+    bool, typer.Option("--keyframes", help="{views}: write only keyframes and held-out frames.")
 ]
 Rendered = Annotated[
     bool,
@@ -117,9 +144,8 @@ Up = Annotated[
 
 SourcePath = Annotated[
     Path,
-    typer.Argument(metavar="MAP", help="Folder that `ggslam run` wrote; file of Gaussians (3DGS or compressed .ply, "
-                   ".sog or meta.json, .spz, .splat, .glb, .usda .usdc .usdz, .ggz); for streamed-sog also a grid "
-                   "store that `ggslam submaps` wrote."),
+    typer.Argument(metavar="MAP", help="Folder that `ggslam run` wrote; file of Gaussians ({readers}, .ggz); "
+                   "for {cells} also a grid store that `ggslam submaps` wrote."),
 ]  # fmt: skip
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import errno
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import typer
 from rich.markup import escape
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from ggslam import __version__
 from ggslam.cli import (
@@ -105,9 +106,9 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "verify": (verify_command.verify, verify_command.EPILOG),
     "synth": (synth_command.synth, synth_command.EPILOG), "inspect": (inspect_command.inspect, inspect_command.EPILOG),
 }  # fmt: skip
+_CLASSES: dict[str, type[TyperCommand]] = {"edit": edit_command.EditCommand, "export": export_command.ExportCommand}
 for _name, (_function, _epilog) in _COMMANDS.items():
-    _class = edit_command.EditCommand if _name == "edit" else Command
-    app.command(_name, cls=_class, epilog=_epilog, no_args_is_help=_name != "doctor")(_function)
+    app.command(_name, cls=_CLASSES.get(_name, Command), epilog=_epilog, no_args_is_help=_name != "doctor")(_function)
 
 
 def main() -> None:
@@ -116,7 +117,9 @@ def main() -> None:
     SIGTERM, 129 SIGHUP)."""
     errors = PlainConsole(stderr=True)
     try:
-        app()
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: errors.print(f"note: {message}", highlight=False, markup=False)
+            app()
     except GgslamError as error:
         errors.print(f"[bold red]error:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(error.exit_code)

@@ -67,13 +67,6 @@ class DeviceName(str, Enum):
     cuda = "cuda"
 
 
-class TrackerName(str, Enum):
-    """How frames are located."""
-
-    gicp = "gicp"
-    features = "features"
-
-
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; default runs/NAME.")]
 Record = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Keep the frames of a live camera in this folder, as a recording.")
@@ -87,8 +80,14 @@ Realtime = Annotated[
     float | None, typer.Option(metavar="FPS", help="Deliver frames at this rate; tracker and mapper run side by side.")
 ]
 Tracker = Annotated[
-    TrackerName | None, typer.Option(help="Track by generalised ICP (default), or by edge and plane features.")
+    str | None,
+    typer.Option(metavar="NAME", help="gicp: track by generalised ICP (default); edges_planes: by edges and planes."),
 ]
+Loss = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Add a loss of your own to the mapper's: module:function or "
+                 "path/to/file.py:function, called as function(view, keyframe) in every mapping iteration."),
+]  # fmt: skip
 Device = Annotated[
     DeviceName | None, typer.Option(help="Compute on the CPU (default), on an NVIDIA GPU, or on a GPU if there is one.")
 ]
@@ -151,7 +150,7 @@ def run(
     refine: Refine = None,
     realtime: Realtime = None,
     tracker: Tracker = None,
-    device: Device = None,
+    device: Device = None, loss: Loss = None,
     earlier: EarlierRun = None,
     localize_only: LocalizeOnly = False,
     loops: Loops = None,
@@ -174,7 +173,7 @@ def run(
 
     watched = _Watched(log, (host, port) if view else None, strict)
     if resume is not None:
-        return _go_on(context, resume, sequence, checkpoint_every, evaluate, settings, watched)
+        return _go_on(context, resume, sequence, checkpoint_every, evaluate, settings, loss, watched)
     reading = SequenceRequest(
         _recording(sequence), format_name, start, stop, stride, scale, masks, depth_scale,
         "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
@@ -186,7 +185,7 @@ def run(
     })  # fmt: skip
     request = replace(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
-        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check,
+        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check, loss=loss,
     )  # fmt: skip
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
 
@@ -205,15 +204,15 @@ def _overrides(settings: list[str] | None, shortcuts: dict[str, Any]) -> list[st
 
 def _go_on(
     context: typer.Context, run: Path, recording: Path | None, checkpoint_every: int | None, evaluate: bool,
-    settings: list[str] | None, watched: _Watched,
+    settings: list[str] | None, loss: str | None, watched: _Watched,
 ) -> None:  # fmt: skip
     """Goes on with a run that was cut off."""
     from ggslam.jobs.run.pipeline import resume
 
     models = [value for name, _, value in (text.partition("=") for text in settings or []) if name == _MODEL]
-    given = refuse_other_options(context, ["settings"] if len(models) == len(settings or []) else [])
+    given = refuse_other_options(context, ["loss", *(["settings"] if len(models) == len(settings or []) else [])])
     model = models[-1] if models else None
-    again = partial(resume, run, recording=recording, checkpoint_every=checkpoint_every, model=model)
+    again = partial(resume, run, recording=recording, checkpoint_every=checkpoint_every, model=model, loss=loss)
     again = partial(again, evaluate=evaluate) if "evaluate" in given else again
     _run_and_show(again, run.resolve().name, watched)
 
@@ -310,8 +309,9 @@ def go_on_command(run: Path) -> list[str]:
 
     if not has_checkpoints(run):
         return []
-    masks = Checkpoints(run).start().config.get("masks", {})
-    return [f"next: {resuming.go_on_command(run, masks.get('model', ''))}"]
+    start = Checkpoints(run).start()
+    model = start.config.get("masks", {}).get("model", "")
+    return [f"next: {resuming.go_on_command(run, model, start.loss)}"]
 
 
 def next_commands(run: Path) -> list[str]:

@@ -13,10 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ggslam.formats.writer import PosedViews, Takes, Writer
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, matrix_to_quaternion
-from ggslam.system.atomic import write_bytes
+from ggslam.system.atomic import make_empty_folder, make_folder, write_bytes, write_text
 
+MODEL = "sparse/0"
 _PINHOLE = 1
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track_length", "<u8")])
 
@@ -68,3 +70,20 @@ def _points(points: np.ndarray, colors: np.ndarray) -> bytes:
     rows["xyz"], rows["rgb"] = points, colors
     rows["error"] = -1  # COLMAP's word for unknown
     return struct.pack("<Q", len(rows)) + rows.tobytes()
+
+
+def _write(folder: Path, posed: PosedViews) -> str:
+    """`images/`, a sparse model `sparse/0/` in COLMAP's binary form and `sparse/0/test.txt`, the images that were held
+    out. Images are as the run saw them: undistorted, at its resolution, PNG."""
+    make_empty_folder(folder)
+    make_folder(folder / MODEL)
+    views = posed.save(folder / "images", None)
+    write_colmap_model(
+        folder / MODEL, [v.camera for v in views], [v.name for v in views], [v.T_world_camera for v in views],
+        posed.cloud.points, posed.cloud.colors,
+    )  # fmt: skip
+    write_text(folder / MODEL / "test.txt", "".join(f"{v.name}\n" for v in views if v.held_out))
+    return f"wrote {folder}: {posed.text(views)}, {len(posed.cloud)} points, COLMAP"
+
+
+WRITER = Writer("colmap", (), Takes.VIEWS, "images, poses and points, a COLMAP folder", _write)

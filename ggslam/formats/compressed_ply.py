@@ -21,6 +21,7 @@ from ggslam.errors import FormatError
 from ggslam.formats.morton import morton_order
 from ggslam.formats.ply import write_ply
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 
 CHUNK = 256
@@ -161,3 +162,16 @@ def _rows(columns: dict[str, np.ndarray], kind: str) -> np.ndarray:
     for name, column in columns.items():
         rows[name] = column
     return rows
+
+
+def _write(path: Path, splats: Splats) -> str:
+    degree, written = splats.like.sh_degree, write_compressed_ply(path, splats.whole())
+    if written == degree:
+        return splats.text(path)
+    which = f"degree {degree}" if written == degree - 1 else f"degrees {written + 1} to {degree}"
+    return f"{splats.text(path)}; left out colours of {which}: they are too faint for its steps of 1/32"
+
+
+WRITER = Writer(
+    "compressed-ply", (".compressed.ply", ".ply"), Takes.GAUSSIANS, "the same in fewer bytes", _write
+)

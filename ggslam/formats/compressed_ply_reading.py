@@ -11,6 +11,7 @@ from ggslam.errors import FormatError
 from ggslam.formats.compressed_ply import CHUNK, levels_of_steps
 from ggslam.formats.ply import read_ply
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_reader import properties_of_ply, read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
 from ggslam.scene.gaussian_map import SH_C0
 
@@ -95,3 +96,8 @@ def _column(path: Path, rows: np.ndarray, name: str) -> np.ndarray:
     if name not in (rows.dtype.names or ()) or rows.dtype[name].kind not in "fiu":
         raise FormatError(f"{path}: no numbers '{name}', which a compressed PLY has")
     return rows[name]
+
+
+READER = read_whole(
+    "compressed PLY", lambda path, head: set(PACKED) <= properties_of_ply(path, head), read_compressed_ply
+)

@@ -22,6 +22,7 @@ from ggslam.formats.gaussian_ply import object_ids
 from ggslam.formats.gaussian_rows import BLOCK, GaussianRows
 from ggslam.formats.positions import COARSE, coordinate_step
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_reader import SplatFile, SplatReader, properties_of_ply
 from ggslam.formats.splat_repair import THINNER, SplatFaults, columns_of, logits_of, map_of_columns, mend
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 
@@ -258,3 +259,13 @@ def _stack(vertex: np.ndarray, names: Sequence[str]) -> np.ndarray:
         for column, name in enumerate(names):
             out[:, column] = vertex[name]
     return out
+
+
+def _open(path: Path) -> SplatFile:
+    rows = ForeignGaussianRows(path)
+    return SplatFile("3DGS PLY", rows, {} if rows.has_ids else None, rows.notes())
+
+
+READER = SplatReader(
+    "3DGS PLY", lambda path, head: {"scale_0", "scale_1", "rot_0", "opacity"} <= properties_of_ply(path, head), _open
+)

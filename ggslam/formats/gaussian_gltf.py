@@ -22,6 +22,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats.linear_light import vertex_colors
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.system.atomic import atomic_write
 
@@ -170,3 +171,14 @@ def _put(
     for attribute in attributes:
         file.seek(start + attribute.start + first * attribute.width * attribute.dtype.itemsize)
         file.write(columns[attribute.name].astype(attribute.dtype).tobytes())
+
+
+def _write(path: Path, splats: Splats) -> str:
+    write_gaussian_gltf(path, splats.count, splats.parts(), splats.like.sh_degree, splats.names)
+    return splats.text(path, with_ids=True)
+
+
+WRITER = Writer(
+    "gltf", (".glb",), Takes.GAUSSIANS, "the same as glTF, .glb (without this option a .glb is a mesh)", _write,
+    by_object=True, y_up=True,
+)  # fmt: skip

@@ -19,10 +19,11 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.splat_columns import SplatColumns, check_count
+from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
 from ggslam.formats.spz_reading import spz_columns
 from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.system.foreign import MAX_TEXT_BYTES, member, read_foreign
+from ggslam.system.foreign import MAX_TEXT_BYTES, member, open_foreign, read_foreign
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz_2"
@@ -195,3 +196,20 @@ def _with_coefficients(columns: SplatColumns, count: int) -> SplatColumns:
     return SplatColumns(
         columns.means, columns.log_scales, columns.quaternions, columns.logits, sh, columns.object_id
     )
+
+
+def _is_gltf_of_splats(path: Path, head: bytes) -> bool:
+    """Whether the JSON part of a glTF names the extension: one without it is a mesh."""
+    if head[:4] != b"glTF" and path.suffix.lower() != ".gltf":
+        return False
+    try:
+        with open_foreign(path) as file:
+            length = struct.unpack_from("<I", file.read(20), 12)[0] if head[:4] == b"glTF" else 0
+            file.seek(20 if head[:4] == b"glTF" else 0)
+            text = file.read(min(length, 64 << 20) if length else 64 << 20)
+        return EXTENSION in json.loads(text).get("extensionsUsed", []) or EXTENSION.encode() in text
+    except (OSError, ValueError, AttributeError, struct.error, RecursionError, FormatError):
+        return False
+
+
+READER = read_whole("glTF", _is_gltf_of_splats, read_gaussian_gltf)

@@ -11,6 +11,7 @@ several readers take a file with a property of another type for damaged, or read
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ import torch
 
 from ggslam.errors import FormatError, InputError
 from ggslam.formats.ply import read_ply, write_ply_parts
+from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.atomic import write_bytes
 
 EXTRAS = ("object_id", "identity")
 _MEANS, _NORMALS = ["x", "y", "z"], ["nx", "ny", "nz"]
@@ -198,3 +201,24 @@ def _floats(path: str | Path, first: int, vertex: np.ndarray, names: Sequence[st
             where = f"property '{name}' of vertex {first + row}"
             raise FormatError(f"{path}: {where} is {vertex[name][row]}, expected a number")
     return torch.from_numpy(out)
+
+
+def _write(path: Path, splats: Splats) -> str:
+    """With object ids and identities where the content has them, and the classifier beside the file."""
+    identities = ("identity",) if splats.classifier is not None else ()
+    extra = () if splats.names is None else ("object_id", *identities)
+    write_gaussian_parts(path, splats.count, splats.parts(), splats.like, extra)
+    beside = ""
+    if splats.classifier is not None:
+        classifier = path.with_name(f"{path.stem}_classifier.npz")
+        write_bytes(classifier, splats.classifier().to_bytes())
+        beside = f" with object ids and identities, and {classifier.name}"
+    return f"wrote {path}: {splats.count} Gaussians{splats.note or beside}"
+
+
+WRITER = Writer(
+    "ply", (".ply",), Takes.GAUSSIANS, "Gaussians as 3DGS stores them", _write, any_name=True, by_object=True
+)
+SEGMENTED = replace(
+    WRITER, name="segmented", takes=Takes.OBJECT_COLORS, text="the same in the colours of their objects"
+)

@@ -19,6 +19,7 @@ import numpy as np
 from ggslam.errors import FormatError, MissingDependency, RunFolderError
 from ggslam.formats.optional_package import package_for
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.atomic import atomic_write, make_folder
@@ -120,3 +121,13 @@ def _extent(columns: SplatColumns, scales: np.ndarray) -> np.ndarray:
     R = quaternion_to_matrix(columns.quaternions.astype(np.float64))
     reach = _REACH * np.sqrt((R**2 @ (scales.astype(np.float64) ** 2)[:, :, None])[:, :, 0])
     return np.stack([(columns.means - reach).min(0), (columns.means + reach).max(0)]).astype(np.float32)
+
+
+def _write(path: Path, splats: Splats) -> str:
+    write_gaussian_usd(path, splats.whole(), splats.names)
+    return splats.text(path, with_ids=True)
+
+
+WRITER = Writer(
+    "usd", USD_ENDINGS, Takes.GAUSSIANS, "the same as OpenUSD", _write, by_object=True, y_up=True, check=usd_package
+)  # fmt: skip

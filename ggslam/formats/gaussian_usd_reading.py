@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.formats.gaussian_usd import usd_package
+from ggslam.formats.gaussian_usd import USD_ENDINGS, usd_package
 from ggslam.formats.splat_columns import UPRIGHT, SplatColumns
+from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
 from ggslam.system.foreign import member, open_foreign
 
@@ -118,3 +119,10 @@ def _place(pxr: ModuleType, prim: Any, columns: SplatColumns) -> None:
     """Moves Gaussians as the prims above them say; ValueError for what mirrors or stretches them."""
     matrix = pxr.UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(pxr.Usd.TimeCode.EarliestTime())
     columns.move_by(np.array(matrix, np.float64).T)
+
+
+READER = read_whole(
+    "OpenUSD",
+    lambda path, head: path.suffix.lower() in USD_ENDINGS or head.startswith((b"#usda ", b"PXR-USDC")),
+    read_gaussian_usd,
+)

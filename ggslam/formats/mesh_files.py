@@ -27,6 +27,7 @@ from ggslam.formats.linear_light import vertex_colors
 from ggslam.formats.optional_package import package_for
 from ggslam.formats.ply import write_ply
 from ggslam.formats.triangle_mesh import majority_labels
+from ggslam.formats.writer import SurfaceMesh, Takes, Writer
 from ggslam.scene.origin import local_origin, stored_positions
 from ggslam.scene.poses import translation
 from ggslam.system.atomic import write_bytes
@@ -168,3 +169,16 @@ def _node_name(label: int, names: Mapping[int, str]) -> str:
     if label == 0:
         return "unlabelled"
     return f"{label} {names[label]}" if label in names else f"object {label}"
+
+
+def _write(path: Path, mesh: SurfaceMesh) -> str:
+    write_mesh(
+        path, mesh.vertices, mesh.triangles, mesh.normals, mesh.colors, mesh.labels, mesh.names, mesh.z_up
+    )  # fmt: skip
+    return mesh.text(path)
+
+
+WRITER = Writer(
+    "mesh", (".glb", ".obj", ".ply"), Takes.MESH, "the surface as .glb, .obj or .ply", _write, by_object=True,
+    check=check_mesh_path,
+)  # fmt: skip

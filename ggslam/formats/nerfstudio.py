@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.formats.point_ply import write_metric_points
+from ggslam.formats.writer import PosedViews, Takes, Writer
 from ggslam.scene.camera import Camera
-from ggslam.system.atomic import write_text
+from ggslam.system.atomic import make_empty_folder, write_text
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MOST_DEPTH = 65.535
@@ -74,3 +76,19 @@ def millimetres(depth: np.ndarray) -> np.ndarray:
     """A depth image in metres, float [H, W], as uint16 millimetres; 0 where there is none or more than `MOST_DEPTH`."""
     known = (depth > 0) & (depth <= MOST_DEPTH)
     return np.where(known, np.rint(np.where(known, depth, 0) * 1000), 0).astype(np.uint16)
+
+
+def _write(folder: Path, posed: PosedViews) -> str:
+    """`images/`, `depth/` (16 bit, millimetres), `points.ply` and `transforms.json`, which names the images to train
+    on and those that were held out."""
+    make_empty_folder(folder)
+    views = posed.save(folder / "images", folder / "depth")
+    write_metric_points(folder / "points.ply", posed.cloud)
+    frames = [
+        TransformsFrame(f"images/{v.name}", f"depth/{v.name}", v.T_world_camera, v.held_out, v.camera) for v in views
+    ]
+    write_transforms(folder / "transforms.json", frames, "points.ply")
+    return f"wrote {folder}: {posed.text(views)} with depth, {len(posed.cloud)} points, nerfstudio"
+
+
+WRITER = Writer("nerfstudio", (), Takes.VIEWS, "images, depth, poses and points, a nerfstudio folder", _write)

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import gzip
 import struct
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -18,6 +20,7 @@ import numpy as np
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.optional_package import package_for
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import write_bytes
 
@@ -90,3 +93,18 @@ def _pack(gaussforge: ModuleType, path: str | Path, columns: SplatColumns, degre
     if "error" in answer:
         raise RunFolderError(f"cannot write {path}: gaussforge: {answer['error']}")
     return bytes(answer["data"])
+
+
+def _write(path: Path, splats: Splats, version: int = 3) -> str:
+    write_spz(path, splats.whole(), version)
+    return splats.text(path)
+
+
+WRITER = Writer(
+    "spz", (".spz",), Takes.GAUSSIANS, "the same in fewer bytes, SPZ version 3", _write, y_up=True,
+    check=spz_packages,
+)  # fmt: skip
+VERSION_4 = replace(
+    WRITER, name="spz4", text="the same as SPZ version 4", write=partial(_write, version=4),
+    check=partial(spz_packages, version=4),
+)  # fmt: skip

@@ -20,6 +20,8 @@ from ggslam.formats.pcd import read_pcd, write_pcd
 from ggslam.formats.ply import read_ply, write_ply
 from ggslam.formats.point_ply import grid_positions
 from ggslam.formats.positions import placed_rows
+from ggslam.formats.voxel_cloud import join_clouds
+from ggslam.formats.writer import SurfacePoints, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0
 from ggslam.system.foreign import open_foreign
 
@@ -238,3 +240,15 @@ def _unpacked_rgb(path: Path, packed: np.ndarray, name: str) -> np.ndarray:
         raise FormatError(f"{path}: field '{name}' is {packed.dtype}, expected 4 bytes")
     bits = np.ascontiguousarray(packed).view(np.uint32)
     return np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], 1).astype(np.uint8)
+
+
+def _write_pcd(path: Path, points: SurfacePoints) -> str:
+    cloud = join_clouds(points.clouds)
+    attributes = {"color": cloud.colors}
+    if cloud.object_id is not None:
+        attributes["object_id"] = cloud.object_id
+    write_point_cloud(path, cloud.points.astype("f4"), attributes)
+    return f"wrote {path}: {len(cloud)} points on a {points.voxel_size:g} m grid"
+
+
+WRITER = Writer("pcd", (".pcd",), Takes.POINTS, "coloured points with object ids", _write_pcd)

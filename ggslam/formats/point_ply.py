@@ -20,7 +20,8 @@ from ggslam.errors import FormatError
 from ggslam.formats.ply import read_ply, write_ply, write_ply_parts
 from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.voxel_cloud import VoxelCloud
-from ggslam.system.atomic import write_failure
+from ggslam.formats.writer import SurfacePoints, Takes, Writer
+from ggslam.system.atomic import make_folder, write_failure
 
 __all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "grid_positions", "read_points", "sample_points",
            "write_grid_points", "write_metric_points", "write_points", "write_points_in_parts"]  # fmt: skip
@@ -188,3 +189,13 @@ def _comment(path: str | Path, comments: list[str], key: str, count: int) -> np.
             if len(numbers) == count and np.isfinite(numbers).all() and (key != "voxel_size" or numbers[0] > 0):
                 return numbers
     raise FormatError(f"{path}: no usable header comment '{key}' (is it a cloud written by ggslam?)")
+
+
+def _write(folder: Path, points: SurfacePoints) -> str:
+    make_folder(folder)
+    count = write_points_in_parts(folder, points.clouds)
+    names = f"{METRIC_FILE} and {GRID_FILE}"
+    return f"wrote {folder}/{names}: {count} points on a {points.voxel_size:g} m grid"
+
+
+WRITER = Writer("points", (), Takes.POINTS, "coloured points, PLY in metres and in cells of a grid", _write)

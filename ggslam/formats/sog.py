@@ -28,6 +28,7 @@ from ggslam.errors import FormatError, RunFolderError
 from ggslam.formats.codebooks import scalar_codebook, vector_palette
 from ggslam.formats.morton import morton_order
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import make_folder, write_bytes
 
@@ -191,3 +192,13 @@ def _zip_of(files: Mapping[str, bytes]) -> bytes:
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, data)
     return packed.getvalue()
+
+
+def _write(path: Path, splats: Splats) -> str:
+    size = write_sog(path, splats.whole(), splats.names)
+    return splats.text(path, with_ids=True, size=size)
+
+
+WRITER = Writer(
+    "sog", (".sog", META), Takes.GAUSSIANS, "the same in fewer bytes, as images", _write, by_object=True
+)

@@ -19,8 +19,10 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.compressed_ply_reading import quaternions_of_smallest
+from ggslam.formats.gaussian_usd import USD_ENDINGS
 from ggslam.formats.sog import LARGEST_COUNT, META
 from ggslam.formats.splat_columns import SplatColumns, check_count
+from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
 from ggslam.system.foreign import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, is_plain_name, member, read_foreign
 from ggslam.system.images import claimed_size, decode_image
@@ -164,3 +166,21 @@ def _plain(name: str) -> str:
     if not is_plain_name(name):
         raise ValueError(f"names a file {name!r}")
     return name
+
+
+def _is_sog(path: Path, head: bytes) -> bool:
+    if path.name.lower() == META or path.suffix.lower() == ".sog":
+        return True
+    return path.suffix.lower() not in USD_ENDINGS and head[:2] == b"PK" and _is_zip_with_meta(path)
+
+
+def _is_zip_with_meta(path: Path) -> bool:
+    try:
+        with open_zip(path) as archive:
+            return any(name.lower().endswith(META) for name in archive.namelist())
+    except (*ZIP_DAMAGE, FormatError):
+        return False
+
+
+READER = read_whole("SOG", _is_sog, read_sog, (META,))
+STREAMED = read_whole("streamed SOG", lambda path, head: path.name.lower() == LEVELS, read_streamed_sog, (LEVELS,))

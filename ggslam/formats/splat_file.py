@@ -16,7 +16,9 @@ import torch
 
 from ggslam.errors import FormatError
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
+from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.system.atomic import atomic_write
 from ggslam.system.foreign import read_foreign
@@ -77,3 +79,12 @@ def read_splat(path: Path) -> SplatColumns:
 
 def _bytes(values: torch.Tensor) -> np.ndarray:
     return values.detach().cpu().round().clamp(0, 255).to(torch.uint8).numpy()
+
+
+def _write(path: Path, splats: Splats) -> str:
+    write_splat(path, splats.parts())
+    return splats.text(path)
+
+
+WRITER = Writer("splat", (".splat",), Takes.GAUSSIANS, "the same in 32 bytes a Gaussian", _write)
+READER = read_whole(".splat", lambda path, head: path.suffix.lower() == ".splat", read_splat)

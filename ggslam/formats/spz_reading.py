@@ -19,6 +19,7 @@ from ggslam.errors import FormatError
 from ggslam.formats.compressed_ply_reading import quaternions_of_smallest
 from ggslam.formats.optional_package import package_for
 from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
 from ggslam.system.foreign import read_foreign
 
@@ -144,3 +145,6 @@ def _smallest_three(words: np.ndarray) -> np.ndarray:
     shares = np.stack([(words >> shift & 511) / 511 * np.where(words >> shift + 9 & 1, -1, 1)
                        for shift in (20, 10, 0)], 1)  # fmt: skip
     return np.roll(quaternions_of_smallest(shares * np.sqrt(0.5), words >> 30), 1, axis=1)
+
+
+READER = read_whole("SPZ", lambda path, head: path.suffix.lower() == ".spz" or head[:4] == MAGIC, read_spz)

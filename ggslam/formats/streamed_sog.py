@@ -23,8 +23,9 @@ from ggslam.formats.point_sampling import MapPart
 from ggslam.formats.sog import META, sog_files, write_sog_folder
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_levels import coarser
+from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.system.atomic import write_text
+from ggslam.system.atomic import make_empty_folder, write_text
 
 INDEX = "lod-meta.json"
 LEVEL_RATIO = 4
@@ -209,3 +210,21 @@ def _union(bounds: Sequence[dict[str, list[float]]]) -> dict[str, list[float]]:
         "min": np.min([bound["min"] for bound in bounds], 0).tolist(),
         "max": np.max([bound["max"] for bound in bounds], 0).tolist(),
     }
+
+
+def _write(path: Path, splats: Splats) -> str:
+    folder, cells = path.parent if path.name == INDEX else path, splats.cells()
+    make_empty_folder(folder)
+    splats.done(0, len(cells))
+    size = write_streamed_sog(
+        folder, cells, splats.count, splats.names, lambda done: splats.done(done, len(cells))
+    )  # fmt: skip
+    levels = " + ".join(map(str, size.counts))
+    files = f"{size.chunks} SOG{'s' * (size.chunks != 1)}"
+    return f"wrote {folder / INDEX}: {levels} Gaussians in {files}, {size.bytes / 1e6:.1f} MB"
+
+
+WRITER = Writer(
+    "streamed-sog", (INDEX,), Takes.GAUSSIANS, "the same in pieces and levels of detail, for the web", _write,
+    any_name=True, by_object=True, in_cells=True,
+)  # fmt: skip

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError, InputError
+from ggslam.formats.writer import Takes, Writer
 from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalize, quaternion_to_matrix
 from ggslam.system.atomic import write_text
 from ggslam.system.clock_units import EPOCH_DIGITS, UNITS
@@ -243,3 +244,11 @@ def _pose(where: str, position: np.ndarray, quaternion: np.ndarray) -> np.ndarra
     T[:3, :3] = quaternion_to_matrix(np.array([w, x, y, z]))
     T[:3, 3] = position
     return T
+
+
+def _write(path: Path, trajectory: Trajectory) -> str:
+    written = write_tum(path, trajectory.timestamps, trajectory.T_world_camera)
+    return f"wrote {path}: {written} poses"
+
+
+WRITER = Writer("trajectory", (".txt",), Takes.TRAJECTORY, "the camera's poses, TUM", _write, any_name=True)

@@ -17,7 +17,8 @@ from ggslam.coding.decoder import decode_in_parts
 from ggslam.coding.splats import gaussians_of, is_splat_cloud
 from ggslam.errors import FormatError, InputError, RunFolderError
 from ggslam.formats.gaussian_rows import GaussiansInMemory
-from ggslam.formats.splat_formats import SplatFile, open_splats, splat_format
+from ggslam.formats.splat_formats import open_splats, splat_format
+from ggslam.formats.splat_reader import SplatFile
 from ggslam.formats.trajectory import Trajectory
 from ggslam.geometry.orbits import orbit
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap

@@ -61,6 +61,7 @@ class RunToWrite:
         wanted: names of files that are to be made yet.
         verdicts: what seems wrong with the run.
         failure: why the clouds could not be written.
+        loss: name of the user's own loss.
     """
 
     config: Config
@@ -71,6 +72,7 @@ class RunToWrite:
     wanted: tuple[str, ...]
     verdicts: Sequence[Verdict] = ()
     failure: GgslamError | OSError | None = None
+    loss: str | None = None
 
     def write(self, folder: Path) -> RunRecord:
         """Writes everything but run.json, what is small and precious first; returns what that is to say.
@@ -136,6 +138,7 @@ class RunToWrite:
             ggslam=__version__, complete=self.error is None and not missing, stopped_by=self.error,
             missing=list(missing), verdicts=[VerdictRecord(**vars(verdict)) for verdict in self.verdicts],
             environment={**environment(self.config.threads), "device": self.result.device},
+            loss=self.loss,
         )  # fmt: skip
 
 

@@ -14,7 +14,6 @@ Anything with a camera and an iterator of frames is a source:
 
 from __future__ import annotations
 
-import importlib
 import signal
 import threading
 from collections.abc import Iterator
@@ -31,6 +30,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.sequence import SkippedFrame
 from ggslam.system.atomic import make_folder, write_bytes, write_text
+from ggslam.system.named_code import load_named
 
 SCHEMES = ("realsense", "python")
 DEPTH_SCALE = 1000.0
@@ -59,7 +59,8 @@ class LiveSource(Protocol):
 
 
 def is_live(place: str | Path) -> bool:
-    """Whether a text names a live source: "realsense:", "realsense:SERIAL", "python:MODULE:CALLABLE"."""
+    """Whether a text names a live source: "realsense:", "realsense:SERIAL", "python:MODULE:CALLABLE" (or
+    python:FILE.py:CALLABLE)."""
     scheme, colon, _ = str(place).partition(":")
     return bool(colon) and scheme in SCHEMES
 
@@ -82,12 +83,13 @@ def open_live(place: str | Path, scale: float = 1.0) -> LiveSource:
         return RealSenseCamera(rest, scale)
     if scheme != "python":
         raise SequenceError(f"{place}: expected a live source of {', '.join(f'{name}:' for name in SCHEMES)}")
-    return _call(str(place), *rest.partition(":")[::2])
+    return _call(str(place), rest)
 
 
-def _call(place: str, module: str, function: str) -> LiveSource:
+def _call(place: str, name: str) -> LiveSource:
     try:
-        source = getattr(importlib.import_module(module), function)()
+        make = load_named(name)
+        source = make() if callable(make) else make
     except (ImportError, AttributeError, ValueError) as error:
         raise SequenceError(f"{place}: expected python:MODULE:CALLABLE: {error}") from None
     if not isinstance(source, LiveSource):

@@ -8,6 +8,7 @@ The settings of a part are declared beside the part (`ggslam/tracking`, `ggslam/
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import field
 from importlib import resources
@@ -32,6 +33,13 @@ from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.settings import TrackerSettings
 from ggslam.volumes.volume_settings import VolumeSettings
+
+OLD_EDGES_PLANES = "features"
+"""What `edges_planes` was called."""
+
+
+class OldNameWarning(FutureWarning):
+    """A setting was given by the name that it had in an earlier version."""
 
 
 @settings_class(frozen=True)
@@ -64,9 +72,9 @@ class Config:
     auto: that if it can be had and memory is not limited, else cpu."""
     sh_degree: int = setting(0, 0, 3, basic=True)
     """Spherical-harmonic degree of the colours."""
-    tracker: Literal["gicp", "features"] = setting("gicp", basic=True)
-    """gicp: G-ICP against the keyframes' points; features: edges and planes in a budget of time, and G-ICP where they
-    do not convince."""
+    tracker: Literal["gicp", "edges_planes"] = setting("gicp", basic=True)
+    """gicp: G-ICP against the keyframes' points; edges_planes: edges and planes in a budget of time, and G-ICP where
+    they do not convince."""
     realtime_fps: float = setting(0.0, 0, 1e4, "frames/s", basic=True)
     """0: synchronous. Otherwise frames arrive at this rate like from a camera; tracker and mapper run side by side."""
     refine_iterations: int = setting(-1, -1, 10**7, basic=True)
@@ -76,7 +84,7 @@ class Config:
     memory_limit_mb: float = setting(0.0, 0, 1e9, "MB", basic=True)
     """Resident memory of the run: what does not fit of map and keyframes is kept on disk; 0: no limit."""
     tracking: TrackerSettings = field(default_factory=TrackerSettings)
-    features: FeatureTrackerSettings = field(default_factory=FeatureTrackerSettings)
+    edges_planes: FeatureTrackerSettings = field(default_factory=FeatureTrackerSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
     loops: LoopSettings = field(default_factory=LoopSettings)
     mapping: MapperSettings = field(default_factory=MapperSettings)
@@ -112,9 +120,31 @@ def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config
     if unnamed := [name for name in values if not isinstance(name, str)]:
         raise ConfigError(f"{origin}: unknown setting {unnamed[0]}")
     try:
-        return Config(**values)
+        return Config(**with_new_names(values)[0])
     except ConfigError as error:
         raise ConfigError(f"{origin}: {error}") from None
+
+
+def with_new_names(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Settings in which names of earlier versions are replaced, and what was replaced, for people."""
+    values, said = dict(values), []
+    if values.get("tracker") == OLD_EDGES_PLANES:
+        values["tracker"] = "edges_planes"
+        said.append(f"tracker: {OLD_EDGES_PLANES} is the old name of edges_planes")
+    if OLD_EDGES_PLANES in values:
+        old = values.pop(OLD_EDGES_PLANES)
+        new = values.setdefault("edges_planes", old)
+        if new is not old and isinstance(old, dict) and isinstance(new, dict):
+            values["edges_planes"] = _merge(old, new)
+        said.append(f"{OLD_EDGES_PLANES} is the old name of the settings edges_planes")
+    return values, said
+
+
+def _merge(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """Nested values of both; the new ones where both have one."""
+    both = {name: _merge(old[name], value) if isinstance(value, dict) and isinstance(old.get(name), dict) else value
+            for name, value in new.items()}  # fmt: skip
+    return {**old, **both}
 
 
 def presets() -> dict[str, Path]:
@@ -125,6 +155,8 @@ def presets() -> dict[str, Path]:
 
 def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[str] | None = None) -> Config:
     """Settings from a preset's name or a YAML file, then `name.of.setting=value` overrides, in order.
+
+    Names of earlier versions are understood, with an `OldNameWarning`.
 
     Raises:
         ConfigError: naming the file and the setting.
@@ -138,6 +170,8 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
         values, origin = _read_yaml(path), str(path)
         config_from_dict(values, origin)
     with_overrides(overrides, values)
+    for said in with_new_names(values)[1]:
+        warnings.warn(said, OldNameWarning, stacklevel=2)
     return config_from_dict(values, "`overrides`" if overrides else origin)
 
 

@@ -242,8 +242,8 @@ class LoopCloser:
         if before >= 0:
             T_before_world = inverse(self.poses[before])
             information = SURE_INFORMATION  # without an alignment, what drift allows for is all that is unsure
-            if tracking.alignment is not None:
-                information = information_in_frame(tracking.alignment.information, T_before_world)
+            if tracking.information is not None:
+                information = information_in_frame(tracking.information, T_before_world)
             self.graph.add_odometry(before, number, T_before_world @ T, information, found, rigid, unknown=begins)
         if begins:
             self.parts.begin()

@@ -147,8 +147,8 @@ def make_tracker(camera: Camera, config: Config, context: NativeContext, library
         context: threads of the CPU.
         library: CUDA kernels to align with; None: on the CPU, where features are tracked in any case.
     """
-    if config.tracker == "features":
-        return FeatureTracker(camera, config.tracking, config.features, context)
+    if config.tracker == "edges_planes":
+        return FeatureTracker(camera, config.tracking, config.edges_planes, context)
     engine = None if library is None else CudaTrackingEngine(camera, library.whole_device(None), library)
     return GicpTracker(camera, config.tracking, context, engine=engine)
 

@@ -111,9 +111,9 @@ class RigLocator(FrameLocator):
     def _of_frames(self, frames: list[Frame], joint: TrackingResult, now: float) -> list[TrackingResult]:
         """The same for each of the frames: its pose, its own points, and how well they fit."""
         parts, shares = self._engine.parts, list[float | None]([None] * len(frames))
-        if joint.alignment is not None and len(joint.alignment.matches.read().voxels) == sum(map(len, parts)):
+        if joint.gicp is not None and len(joint.gicp.matches.read().voxels) == sum(map(len, parts)):
             noise = self._tracker.noise or DepthNoise()
-            shares = self._engine.overlaps(joint.alignment, self._tracker.settings.align, noise)
+            shares = self._engine.overlaps(joint.gicp, self._tracker.settings.align, noise)
         return [
             replace(
                 joint, points=part, overlap=joint.overlap if share is None else share,

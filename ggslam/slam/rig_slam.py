@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ggslam.errors import FormatError
+from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.scene.camera import Camera
 from ggslam.scene.rig import Rig
 from ggslam.slam.config import Config
@@ -29,7 +30,7 @@ class RigSlam(Slam):
     Args:
         rig: the cameras.
         config: all settings.
-        has_masks: as of `Slam`.
+        has_masks, extra_loss: as of `Slam`.
 
     Raises:
         ConfigError: settings that a rig does not go with.
@@ -37,9 +38,11 @@ class RigSlam(Slam):
 
     is_rig = True
 
-    def __init__(self, rig: Rig, config: Config | None = None, has_masks: bool | None = None) -> None:
+    def __init__(
+        self, rig: Rig, config: Config | None = None, has_masks: bool | None = None, extra_loss: ExtraLoss | None = None
+    ) -> None:
         self.rig = rig
-        super().__init__(rig.cameras[0], _settings_for(rig, config or Config()), has_masks)
+        super().__init__(rig.cameras[0], _settings_for(rig, config or Config()), has_masks, extra_loss=extra_loss)
         self.config = config or Config()
 
     def _make_filters(self, made_of: FilterContext) -> list[FilterChain]:

@@ -59,8 +59,6 @@ class RunState:
         self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
         self.start_notes = [*parts.notes, *notes(modes_of(self.config, self.is_rig, parts.on_device), self.config)]
         """What the user should know before the first frame: what the settings chose, and what such runs leave out."""
-        if extra_loss is not None and parts.on_device:
-            raise ConfigError("a loss of your own (extra_loss) needs device: cpu; on a GPU kernels compute the losses")
         self.mapper.extra_loss = extra_loss
         self.policy = KeyframePolicy(self.config.keyframes)
         self.scale = 1.0

@@ -51,7 +51,7 @@ class Slam(RunState):
         paging: folder that what does not fit into `memory_limit_mb` moves to; None: a temporary one.
         library: CUDA kernels to compute with; None: as `config.device` says.
         extra_loss: a loss of one's own in every mapping iteration, extra_loss(view, keyframe) -> scalar tensor, see
-            `mapping.extra_loss.ExtraLoss`; on the CPU only.
+            `mapping.extra_loss.ExtraLoss`.
 
     Raises:
         InputError: a camera, settings or an extra loss that are none.

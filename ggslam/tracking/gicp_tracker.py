@@ -109,7 +109,7 @@ class GicpTracker(Tracker):
         status = TrackingStatus.RECOVERED if reason else status
         if doubt:
             status, reason = TrackingStatus.DOUBTED, f"only {doubt}"
-        return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, found)
+        return TrackingResult.by_gicp(T.copy(), status, reason, points, found)
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
@@ -125,7 +125,7 @@ class GicpTracker(Tracker):
         motion.follow(view, T.copy())
         motion.remember(view, points, self.settings)
         held = dataclasses.replace(found, T_world_camera=T.copy())
-        return TrackingResult(T.copy(), TrackingStatus.OK, found.overlap, found.rmse, "", points, held, still=True)
+        return TrackingResult.by_gicp(T.copy(), TrackingStatus.OK, "", points, held, still=True)
 
     def _points(self, depth: np.ndarray, noise: DepthNoise) -> PointSource:
         settings = self.settings.points
@@ -265,4 +265,4 @@ class GicpTracker(Tracker):
         if len(points) < self.settings.align.min_matches:
             reason = f"only {len(points)} points have depth, {self.settings.align.min_matches} needed"
         pose = self.state.motion.T_world_camera.copy()
-        return TrackingResult(pose, TrackingStatus.LOST, found.overlap, found.rmse, reason, points, found)
+        return TrackingResult.by_gicp(pose, TrackingStatus.LOST, reason, points, found)

@@ -45,11 +45,13 @@ class TrackingResult:
     Attributes:
         T_world_camera: float64 [4, 4]; when lost, the last known pose.
         status: outcome.
-        overlap: share of the frame's points with a match near enough (`AlignmentResult.overlap`).
+        overlap: share of what the frame shows (points, or planes) with a match near enough.
         rmse_m: root mean square point-to-plane distance of those, metres.
         reason: why it was lost or is doubted, or how it was recovered, else empty.
         points: of the frame; what a keyframe adds to a `MeasuredSurface`.
-        alignment: everything G-ICP says; None for the first frame.
+        information: float64 [6, 6], inverse covariance of the pose, as `AlignmentResult.information` explains it; None
+            for the first frame.
+        gicp: everything G-ICP says; None for the first frame, and where another method located the frame.
         still: whether the pose is that of the frame before because the image says so (`still_camera`).
     """
 
@@ -59,8 +61,19 @@ class TrackingResult:
     rmse_m: float
     reason: str
     points: PointSource
-    alignment: AlignmentResult | None = None
+    information: np.ndarray | None = None
+    gicp: AlignmentResult | None = None
     still: bool = False
+
+    @staticmethod
+    def by_gicp(
+        T_world_camera: np.ndarray, status: TrackingStatus, reason: str, points: PointSource, found: AlignmentResult,
+        still: bool = False,
+    ) -> TrackingResult:  # fmt: skip
+        """The result of a frame that G-ICP aligned; arguments are the attributes of these names."""
+        return TrackingResult(
+            T_world_camera, status, found.overlap, found.rmse, reason, points, found.information, found, still
+        )
 
     @property
     def median_depth_m(self) -> float:
@@ -195,7 +208,7 @@ class Tracker(ABC):
         motion.restart(view, T)
         self.state.still.forget()
         motion.remember(view, points, self.settings)
-        return TrackingResult(T.copy(), TrackingStatus.RECOVERED, found.overlap, found.rmse, source, points, found)
+        return TrackingResult.by_gicp(T.copy(), TrackingStatus.RECOVERED, source, points, found)
 
     def track_from(self, frame: Frame, motion: CameraMotion, target: GicpTarget) -> TrackingResult:
         """Tries to locate a frame that was lost, as a camera that was lost elsewhere; if that succeeds without doubt,

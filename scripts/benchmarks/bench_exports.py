@@ -45,8 +45,8 @@ from standard_pictures import standard_picture
 from ggslam.errors import GgslamError
 from ggslam.evaluation.images import psnr, unit_range
 from ggslam.formats.splat_formats import read_splats
+from ggslam.formats.table import writers
 from ggslam.jobs.export.export_run import export_run
-from ggslam.jobs.export.formats import ExportFormat
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
@@ -172,7 +172,7 @@ def bench(run: Path, arguments: argparse.Namespace) -> None:
               for v in views]  # fmt: skip
     blank = " |" * (len(COLUMNS) - 3)
     print(f"| the map by ggslam's rules |{blank} {against_recording(views, images):.2f} | |")
-    wanted = arguments.formats or [kind.value for kind in ExportFormat]
+    wanted = arguments.formats or [known.name for known in writers()]
     for kind, plain in [(name, plain) for name in wanted for plain in ([True, False] if name == "ply" else [False])]:
         with tempfile.TemporaryDirectory() as out:
             print("| " + " | ".join(line(folder, kind, plain, views, original, Path(out))) + " |", flush=True)

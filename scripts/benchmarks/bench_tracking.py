@@ -226,7 +226,7 @@ def report(name: str, target_kind: str, run: Run) -> None:
     """Prints one row of the table and, under it, where the tracker was lost."""
     estimated = np.stack([r.T_world_camera for r in run.results])
     ate = f"{100 * ate_rmse(estimated, np.stack(run.truth)):8.3f}" if len(run.truth) == len(estimated) else "       -"
-    aligned = [r.alignment for r in run.results if r.alignment is not None]
+    aligned = [r.gicp for r in run.results if r.gicp is not None]
     statuses = Counter(r.status.value for r in run.results)
     print(
         f"{name[:14]:14s} {target_kind:8s} {len(estimated):5d} {ate} {np.median(run.track_ms):7.1f} "

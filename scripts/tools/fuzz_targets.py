@@ -100,7 +100,7 @@ def _ply_read(path: Path) -> Any:
 
 
 def _splats(folder: Path) -> list[Path]:
-    from ggslam.formats.splat_writing import write_splats
+    from ggslam.formats.splat_formats import write_splats
 
     names = ("map.ply", "map.compressed.ply", "map.sog", "map.spz", "map.splat", "map.glb", "map.usdc")
     for name in names:

@@ -18,6 +18,7 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from ggslam.cli.export_command import ExportCommand  # noqa: E402
 from ggslam.cli.main import _COMMANDS, app  # noqa: E402
 from ggslam.cli.old_names import OLD_NAMES  # noqa: E402
 
@@ -62,6 +63,8 @@ def page() -> str:
 
 def section(name: str, command: Any) -> str:
     """One command: what it does, examples, arguments and options."""
+    if isinstance(command, ExportCommand):
+        command.name_formats()
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     options = [p for p in command.params if p.param_type_name == "option" and not p.hidden]
     usage = " ".join([f"ggslam {name}", *(p.metavar or p.name.upper() for p in arguments), "[OPTIONS]"])

@@ -18,7 +18,7 @@ from ggslam.cli.console import ProgressLines, duration
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.old_names import OLD_NAMES
 from ggslam.errors import ConfigError
-from ggslam.jobs.export.formats import ExportFormat, choose_format
+from ggslam.formats.table import choose_writer
 
 COMMANDS = typer.main.get_command(main.app).commands  # type: ignore[attr-defined]
 
@@ -58,16 +58,16 @@ def test_old_names_of_options_are_understood(command: str) -> None:
      ("x.txt", "trajectory"), ("x.compressed.ply", "compressed-ply")],
 )  # fmt: skip
 def test_the_name_says_the_format(name: str, kind: str) -> None:
-    assert choose_format(None, Path(name), None).value == kind
-    assert choose_format(ExportFormat(kind), Path(name), None).value == kind
+    assert choose_writer(None, Path(name), None).name == kind
+    assert choose_writer(kind, Path(name), None).name == kind
 
 
 def test_formats_that_share_a_suffix_and_folders() -> None:
-    for kind in (ExportFormat.segmented, ExportFormat.compressed_ply, ExportFormat.mesh):
-        assert choose_format(kind, Path("x.ply"), None) is kind
-    assert choose_format(ExportFormat.gltf, Path("x.glb"), None) is ExportFormat.gltf
-    assert choose_format(ExportFormat.colmap, Path("folder"), None) is ExportFormat.colmap
-    assert choose_format(None, Path("folder"), "mug,7") is ExportFormat.ply
+    for kind in ("segmented", "compressed-ply", "mesh"):
+        assert choose_writer(kind, Path("x.ply"), None).name == kind
+    assert choose_writer("gltf", Path("x.glb"), None).name == "gltf"
+    assert choose_writer("colmap", Path("folder"), None).name == "colmap"
+    assert choose_writer(None, Path("folder"), "mug,7").name == "ply"
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_formats_that_share_a_suffix_and_folders() -> None:
 )  # fmt: skip
 def test_a_name_against_the_format_is_refused(asked: str | None, name: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        choose_format(None if asked is None else ExportFormat(asked), Path(name), None)
+        choose_writer(asked, Path(name), None)
 
 
 def test_a_log_gets_a_line_every_ten_seconds(monkeypatch: pytest.MonkeyPatch) -> None:

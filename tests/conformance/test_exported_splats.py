@@ -19,8 +19,8 @@ from splat_rendering import Pinhole, decibels, look_at, render
 from standard_pictures import standard_picture
 
 from ggslam.errors import RunFolderError
+from ggslam.formats.table import writers
 from ggslam.jobs.export.export_run import export_run
-from ggslam.jobs.export.formats import ExportFormat
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.poses import inverse
 
@@ -64,7 +64,7 @@ def seen(kind: str, splats: Splats) -> list[np.ndarray]:
 
 
 def test_every_format_is_read_by_somebody() -> None:
-    assert set(SPLAT_FORMATS) | OTHER_FORMATS == {kind.value for kind in ExportFormat}
+    assert set(SPLAT_FORMATS) | OTHER_FORMATS == {known.name for known in writers()}
 
 
 @pytest.mark.parametrize("with_objects", [True, False], ids=["objects", "plain"])

@@ -16,10 +16,8 @@ from typer.testing import CliRunner
 from ggslam.cli.main import app
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.formats.table import choose_writer
 from ggslam.jobs.export.export_run import export_run
-from ggslam.jobs.export.formats import ExportFormat, choose_format
-from ggslam.jobs.export.splats import ENDINGS, export_packed
-from ggslam.jobs.export.views import export_colmap, export_nerfstudio
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe
 from ggslam.runs.verification import accept_files
@@ -43,7 +41,7 @@ def run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
 
 
 def test_only_keyframes_and_what_is_held_out(run: RunFolder, tmp_path: Path) -> None:
-    export_nerfstudio(run, tmp_path / "few", voxel_size=0.05, keyframes_only=True)
+    export_run(run, tmp_path / "few", "nerfstudio", voxel=0.05, keyframes=True)
     values = json.loads((tmp_path / "few" / "transforms.json").read_text())
     keyframes = run.keyframes().keyframe_numbers()
     found = {int(frame["file_path"][-10:-4]) for frame in values["frames"]}
@@ -53,9 +51,9 @@ def test_only_keyframes_and_what_is_held_out(run: RunFolder, tmp_path: Path) -> 
 
 def test_a_folder_with_something_in_it_is_left_alone(run: RunFolder, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
-    for export in (export_colmap, export_nerfstudio):
+    for kind in ("colmap", "nerfstudio"):
         with pytest.raises(RunFolderError, match="not an empty folder"):
-            export(run, tmp_path)
+            export_run(run, tmp_path, kind)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -85,8 +83,8 @@ def test_splats_by_the_command_line(run: RunFolder, tmp_path: Path, kind: str) -
     if kind in ("spz", "spz4"):
         pytest.importorskip("gaussforge", reason="gaussforge is not installed (extra [splats])")
         pytest.importorskip("zstandard", reason="zstandard is not installed (extra [splats])")
-    out = tmp_path / f"map{ENDINGS[kind]}"
-    faint = export_packed(run, out, kind)
+    out = tmp_path / f"map{choose_writer(kind, tmp_path).endings[0]}"
+    faint = export_run(run, out, kind)
     result = CliRunner().invoke(
         app, ["export", str(run.path), "--format", kind, "--out", str(out), "--min-opacity", "0.6"]
     )
@@ -134,14 +132,14 @@ def test_gltf_plain_and_of_objects(run: RunFolder, tmp_path: Path) -> None:
     assert list(gltf["meshes"][0]["extras"]["objects"]) == [str(object_id)]
     with pytest.raises(FormatError, match=r"ends in \.glb"):
         export_run(run, tmp_path / "splats.gltf", "gltf")
-    assert choose_format(None, out, None) is ExportFormat.mesh
+    assert choose_writer(None, out, None).name == "mesh"
 
 
 def test_a_map_on_disk_is_written_cell_by_cell(
     run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, first = tmp_path / "whole.splat", len(run.gaussians()) // 3
-    export_packed(run, whole, "splat")
+    export_run(run, whole, "splat")
     copy = tmp_path / "run"
     shutil.copytree(run.path, copy)
     box = {"low": [-9, -9, -9], "high": [9, 9, 9]}
@@ -150,7 +148,7 @@ def test_a_map_on_disk_is_written_cell_by_cell(
     (copy / "map_cells.json").write_text(json.dumps({"version": 1, "cells": cells}))
     accept_files(copy)
     monkeypatch.setattr(RunFolder, "gaussians", None)  # the whole map is not asked for
-    export_packed(RunFolder.open(copy), tmp_path / "parts.splat", "splat")
+    export_run(RunFolder.open(copy), tmp_path / "parts.splat", "splat")
     assert (tmp_path / "parts.splat").read_bytes() == whole.read_bytes()
 
 
@@ -167,5 +165,5 @@ def test_what_does_not_go_together(run: RunFolder, tmp_path: Path) -> None:
     assert isinstance(refused(str(run.path), "--format", "splat", "--keyframes", *out), ConfigError)
     assert isinstance(refused(str(run.path), "--format", "colmap", "--voxel", "0", *out), ConfigError)
     with pytest.raises(RunFolderError, match="nothing to export"):
-        export_packed(run, tmp_path / "map.splat", "splat", min_opacity=1.1)
+        export_run(run, tmp_path / "map.splat", "splat", min_opacity=1.1)
     assert not list(tmp_path.iterdir())

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ggslam.errors import RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
-from ggslam.formats.splat_formats import open_splats, read_splats
-from ggslam.formats.splat_writing import write_splats
+from ggslam.formats.splat_formats import open_splats, read_splats, write_splats
 from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import VIEWS, MapFile, open_map

@@ -15,8 +15,8 @@ import pytest
 from command_line import ggslam, refuse, succeed
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
+from ggslam.formats.table import choose_writer
 from ggslam.jobs.export.export_run import export_run
-from ggslam.jobs.export.formats import ExportFormat, choose_format
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.verification import accept_files
@@ -104,11 +104,11 @@ def test_names_say_the_format(tmp_path: Path) -> None:
     named = {"a.sog": "sog", "a/meta.json": "sog", "a/lod-meta.json": "streamed-sog", "a.usd": "usd", "a.USDA": "usd",
              "a.usdc": "usd", "a.usdz": "usd", "a.compressed.ply": "compressed-ply"}  # fmt: skip
     for name, kind in named.items():
-        assert choose_format(None, Path(name), None) is ExportFormat(kind)
+        assert choose_writer(None, Path(name), None).name == kind
     with pytest.raises(ConfigError, match="does not say"):
-        choose_format(None, tmp_path / "my-meta.json", None)
+        choose_writer(None, tmp_path / "my-meta.json", None)
     with pytest.raises(ConfigError, match="says sog, but `format` says usd"):
-        choose_format(ExportFormat.usd, Path("a.sog"), None)
+        choose_writer("usd", Path("a.sog"), None)
 
 
 def test_what_is_refused(room_run: RunFolder, store: Path, tmp_path: Path) -> None:

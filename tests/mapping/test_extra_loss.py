@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from ggslam.errors import ConfigError, RenderError
+from ggslam.cuda.library import CudaLibrary
+from ggslam.errors import RenderError
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.rendering import render
@@ -89,9 +90,28 @@ def test_what_is_no_loss_is_refused(room: Path, loss: ExtraLoss, message: str) -
         trained(room, loss)
 
 
-def test_not_on_a_device(room: Path) -> None:
+@pytest.mark.long("the kernels run in an emulation of CUDA")
+def test_a_device_follows_it_as_the_cpu_does(room: Path) -> None:
+    """Kernels and torch share the gradients: colours, depth and alpha move by as much on either."""
     from cuda_emulation import emulated_library
 
-    camera = open_sequence(room, stop=1).camera
-    with pytest.raises(ConfigError, match="extra_loss.* needs device: cpu"):
-        Slam(camera, library=emulated_library(), extra_loss=lambda view, keyframe: view.image.sum())
+    def pull(view: RenderBuffers, keyframe: Keyframe) -> torch.Tensor:
+        return 0.3 * view.depth.mean() - 2 * view.image[0].mean() + 2 * view.alpha.mean()
+
+    def mapped(loss: ExtraLoss | None, library: CudaLibrary | None) -> RenderBuffers:
+        sequence = open_sequence(room, stop=2, scale=0.25)
+        slam = Slam(sequence.camera, load_config(None, SETTINGS), False, library=library, extra_loss=loss)
+        for frame in sequence.stream(masks=False):
+            slam.step(frame)
+        camera = slam.mapper.keyframes[0].camera
+        return render(slam.map.to("cpu"), camera, torch.from_numpy(slam.mapper.keyframes[0].T_camera_world))
+
+    library = emulated_library()
+    moved = {}
+    for name, kernels in (("cpu", None), ("device", library)):
+        plain, pulled = mapped(None, kernels), mapped(pull, kernels)
+        moved[name] = [float((getattr(pulled, part) - getattr(plain, part)).mean()) for part in ("depth", "alpha")]
+        moved[name].append(float((pulled.image[0] - plain.image[0]).mean()))
+    depth, alpha, red = moved["cpu"]
+    assert depth < -0.1 and alpha < -0.05 and red > 0.1
+    assert moved["device"] == pytest.approx(moved["cpu"], rel=0.05)

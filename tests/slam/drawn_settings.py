@@ -18,7 +18,9 @@ from ggslam.system.settings import Known, walk
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.tsdf import TsdfMap
 
-UNTOUCHED = ("masks.onnx.", "paging.", "memory_limit_mb", "realtime_fps", "device", "features.device", "masks.model")
+UNTOUCHED = (
+    "masks.onnx.", "paging.", "memory_limit_mb", "realtime_fps", "device", "edges_planes.device", "masks.model"
+)  # fmt: skip
 """Without effect in a short run on the CPU, or with effect on its time only."""
 MOST = {
     "threads": 4, "refine_iterations": 3, "mapping.iterations_per_frame": 3, "mapping.first_frame_iterations": 3,
@@ -26,8 +28,9 @@ MOST = {
     "loops.places.tables": 12, "loops.places.entries": 10**5, "loops.places.ferns": 1000,
     "loops.places.features.count": 2000, "loops.verification.registration.hypotheses": 1000,
     "tracking.recovery.features.count": 2000, "tracking.align.coarse_iterations": 20,
-    "tracking.align.fine_iterations": 20, "features.align.outer_iterations": 5, "features.align.inner_iterations": 5,
-    "features.map.slots": 1 << 18, "identity.final_passes": 2, "identity.pixels": 10**4,
+    "tracking.align.fine_iterations": 20,
+    "edges_planes.align.outer_iterations": 5, "edges_planes.align.inner_iterations": 5,
+    "edges_planes.map.slots": 1 << 18, "identity.final_passes": 2, "identity.pixels": 10**4,
     "identity.neighbours.samples": 2000, "identity.neighbours.neighbours": 20,
 }  # fmt: skip
 """Upper bounds of what costs time or memory."""
@@ -56,7 +59,7 @@ def draw_value(one: Known, rng: np.random.Generator) -> Any:
         value = min(max((one.default or low) * 10 ** (2 * share - 1), low), high)
     if int in (one.kind, *typing.get_args(one.kind)):
         value = min(max(round(value), low), high)
-    return 1 << (int(value).bit_length() - 1) if one.path == "features.map.slots" else value
+    return 1 << (int(value).bit_length() - 1) if one.path == "edges_planes.map.slots" else value
 
 
 def draw(seed: int, count: int) -> dict[str, Any]:
@@ -66,7 +69,8 @@ def draw(seed: int, count: int) -> dict[str, Any]:
     known = [one for one in able if not one.path.startswith(UNTOUCHED)]
     while True:
         chosen = {known[i].path: draw_value(known[i], rng) for i in rng.choice(len(known), count, replace=False)}
-        chosen.setdefault("tracker", "features" if any(path.startswith("features.") for path in chosen) else "gicp")
+        own = any(path.startswith("edges_planes.") for path in chosen)
+        chosen.setdefault("tracker", "edges_planes" if own else "gicp")
         try:
             configure(chosen)
         except GgslamError:

@@ -8,7 +8,15 @@ import pytest
 import yaml
 
 from ggslam.errors import ConfigError
-from ggslam.slam.config import Config, config_from_dict, config_to_dict, load_config, presets, save_config
+from ggslam.slam.config import (
+    Config,
+    OldNameWarning,
+    config_from_dict,
+    config_to_dict,
+    load_config,
+    presets,
+    save_config,
+)
 
 
 def test_round_trip_through_yaml(tmp_path: Path) -> None:
@@ -92,3 +100,20 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
 def test_overrides_that_are_no_list(overrides: Any) -> None:
     with pytest.raises(ConfigError, match="`overrides`: expected a list like"):
         load_config(None, overrides)
+
+
+def test_the_old_name_of_a_tracker_is_read_and_said() -> None:
+    """`features` of earlier versions, in --set and in files of settings, is `edges_planes`."""
+    with pytest.warns(OldNameWarning) as said:
+        given = ["tracker=features", "features.align.budget_ms=3", "edges_planes.map.edge_voxel=0.25"]
+        config = load_config(None, given)
+    assert config.tracker == "edges_planes" and len(said) == 2
+    assert config.edges_planes.align.budget_ms == 3 and config.edges_planes.map.edge_voxel == 0.25
+    old = {"tracker": "features", "features": {"align": {"budget_ms": 3, "edges": 70}}}
+    both = {**old, "edges_planes": {"align": {"budget_ms": 5}}}
+    assert config_from_dict(old).edges_planes.align.budget_ms == 3
+    found = config_from_dict(both).edges_planes.align
+    assert (found.budget_ms, found.edges) == (5, 70)  # the new name counts where both are given
+    assert "features" not in config_to_dict(config_from_dict(old)) and set(old) == {"tracker", "features"}
+    with pytest.raises(ConfigError):
+        config_from_dict({"features": {"nonsense": 1}})

@@ -21,7 +21,7 @@ from ggslam.slam.saved_state import describe_state, restore_state
 from ggslam.slam.slam import Slam
 
 FEW = ("mapping.iterations_per_frame=1", "mapping.first_frame_iterations=4", "identity.final_passes=1", "threads=1")
-VARIANTS = {"points": FEW, "features": (*FEW, "tracker=features", "masks.source=geometry")}
+VARIANTS = {"points": FEW, "features": (*FEW, "tracker=edges_planes", "masks.source=geometry")}
 FRAMES = 9
 STATES = 120
 

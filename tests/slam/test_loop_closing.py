@@ -205,7 +205,7 @@ def test_another_recording_is_localized_in_a_saved_map(room: Path, first_half: P
 
 def test_edges_and_planes_start_in_a_saved_map_too(room: Path, first_half: Path, tmp_path: Path) -> None:
     sequence = SequenceRequest(room, start=12)
-    overrides = [*CHEAP, "tracker=features"]
+    overrides = [*CHEAP, "tracker=edges_planes"]
     request = RunRequest(sequence, tmp_path / "v", None, overrides, False, map=first_half, localize_only=True)
     assert execute(request).error is None
     errors = errors_in_map(tmp_path / "v", room, 12)

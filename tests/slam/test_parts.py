@@ -324,7 +324,7 @@ def test_what_covers_the_view_for_long_takes_nothing_away(walk: Path) -> None:
     assert again.finish().trajectory().tobytes() == result.trajectory().tobytes()
 
 
-@pytest.mark.parametrize("setting", ["tracker=features", "movers.enabled=false", "loops.activity.forget_after=0.5"])
+@pytest.mark.parametrize("setting", ["tracker=edges_planes", "movers.enabled=false", "loops.activity.forget_after=0.5"])
 def test_other_ways_of_running_join_parts_too(back: Path, setting: str) -> None:
     frames = frames_of(back)
     result = run(frames, setting).finish()

@@ -21,7 +21,7 @@ FEW = ["mapping.iterations_per_frame=1", "refine_iterations=4"]
 
 @pytest.mark.parametrize(
     "settings",
-    [["masks.source=recording"], ["masks.source=geometry"], ["tracker=features"], ["realtime_fps=15"]],
+    [["masks.source=recording"], ["masks.source=geometry"], ["tracker=edges_planes"], ["realtime_fps=15"]],
     ids=["masks of the recording", "objects by geometry", "edges and planes", "against the clock"],
 )
 def test_every_pass(room: Path, tmp_path: Path, settings: list[str]) -> None:

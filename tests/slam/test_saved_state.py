@@ -34,7 +34,7 @@ FEW = ["mapping.iterations_per_frame=1", "mapping.first_frame_iterations=4", "id
 KINDS: dict[str, list[str]] = {
     "as usual": [],
     "no objects": ["identity.enabled=false", "loops.enabled=false"],
-    "edges and planes, segmented": ["tracker=features", "features.align.budget_ms=0", "masks.source=geometry"],
+    "edges and planes, segmented": ["tracker=edges_planes", "edges_planes.align.budget_ms=0", "masks.source=geometry"],
     "dense identities, degree 1": ["identity.schedule=dense", "sh_degree=1", "mapping.exposure.enabled=true"],
 }
 

@@ -140,7 +140,7 @@ def test_groups_are_made_from_dictionaries() -> None:
             {"tracking": {"points": {"max_depth": 0.05}}},
             "tracking.points.max_depth: expected more than min_depth, 0.1, found 0.05",
         ),
-        ({"features": {"map": {"slots": 3}}}, "features.map.slots: expected a power of two, found 3"),
+        ({"edges_planes": {"map": {"slots": 3}}}, "edges_planes.map.slots: expected a power of two, found 3"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_named(values: dict[str, Any], message: str) -> None:

@@ -11,7 +11,8 @@ import torch
 
 from ggslam.errors import ConfigError
 from ggslam.formats.positions import COARSE, coordinate_step
-from ggslam.formats.splat_writing import splat_writer, write_splats
+from ggslam.formats.splat_formats import write_splats
+from ggslam.formats.table import splat_writer
 from ggslam.jobs.edit.edit import Edit
 from ggslam.objects.editing import Change, rigid_motion
 from ggslam.objects.segmented_map import SegmentedMap

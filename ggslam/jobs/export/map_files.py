@@ -1,49 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's map in other forms, made from blocks of its Gaussians or cell by cell."""
+"""Objects of a run in files of their own, and the points of its surface."""
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-import torch
-
 from ggslam.errors import ConfigError, InputError, RunFolderError
-from ggslam.formats.point_ply import write_points_in_parts
-from ggslam.formats.trajectory import write_tum
-from ggslam.formats.voxel_cloud import VoxelCloud
+from ggslam.formats.writer import SurfacePoints
 from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
 from ggslam.objects.table import ObjectRecord
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.runs.opened_points import opened_points
-from ggslam.scene.gaussian_map import GaussianMap, rgb_to_sh
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.system.atomic import make_folder, write_bytes
 
 OBJECT_EXTRAS = ("object_id", "identity")
 """Properties of a 3DGS PLY that say which object a Gaussian belongs to."""
-
-
-def export_splats(
-    folder: RunFolder, path: Path, min_opacity: float = 0.0, plain: bool = False, prepare: Prepare | None = None
-) -> str:
-    """Writes the Gaussians that are at least this opaque as a 3DGS PLY; returns a line that says so.
-
-    A run with objects writes each Gaussian's object id and identity vector, too, and the classifier beside the file
-    (`NAME_classifier.npz`), unless `plain`. `prepare` changes them first.
-    """
-    with_objects = folder.has_objects() and not plain
-    chosen = ChosenGaussians.of(folder, folder.map_in_parts().rows, min_opacity, prepare=prepare)
-    make_folder(path.parent)
-    count = chosen.write(path, OBJECT_EXTRAS if with_objects else ())
-    if not with_objects:
-        return f"wrote {path}: {count} Gaussians"
-    beside = _write_classifier(path, folder.classifier())
-    return f"wrote {path}: {count} Gaussians with object ids and identities, and {beside.name}"
 
 
 def export_objects(
@@ -98,59 +74,16 @@ def _export_object(
     return f"wrote {record.label()} to {path}: {count} Gaussians"
 
 
-def export_segmented(
-    folder: RunFolder, path: Path, objects: str | None = None, min_opacity: float = 0.0, plain: bool = False,
-    prepare: Prepare | None = None,
-) -> str:  # fmt: skip
-    """Writes a 3DGS PLY whose Gaussians keep their shapes and opacities but have the colours of their objects.
-
-    Args:
-        folder: of a run with objects.
-        path: file to write; the classifier goes beside it, unless `plain`.
-        objects: only these, as in `export_objects`; None: the whole map, unlabelled Gaussians in grey.
-        min_opacity, plain, prepare: as in `export_objects`.
-
-    Raises:
-        ConfigError, RunFolderError: as in `export_objects`.
-    """
-    scene = ObjectsInParts.of(folder)
-    ids = None if objects is None else scene.table.select(objects)
-    chosen = ChosenGaussians.of(folder, scene.map.rows, min_opacity, ids, prepare)
-    make_folder(path.parent)
-    palette = torch.from_numpy(scene.table.palette())
-    count = chosen.write(path, () if plain else OBJECT_EXTRAS, lambda part: _color_by_object(part, palette))
-    if not plain:
-        _write_classifier(path, scene.classifier)
-    objects_written = len(scene.table) if ids is None else len(ids)
-    return f"wrote {path}: {count} Gaussians in the colours of {objects_written} object{'s' * (objects_written != 1)}"
-
-
-def _color_by_object(gaussians: GaussianMap, palette: torch.Tensor) -> None:
-    """Gives each Gaussian the colour of its object, from all sides; unlabelled ones become grey."""
-    gaussians.sh[:] = 0
-    gaussians.sh[:, 0] = rgb_to_sh(palette[gaussians.object_id.long()].float() / 255)
-
-
 def object_file_name(record: ObjectRecord) -> str:
     """`7_mug.ply`, in characters that every file system takes."""
     name = re.sub(r"[^A-Za-z0-9-]+", "_", record.name or "").strip("_")[:64]
     return f"{record.id}_{name}.ply" if name else f"{record.id}.ply"
 
 
-def export_points(
-    folder: RunFolder, path: Path, voxel_size: float | None, discs: bool = False, min_opacity: float = 0.0
-) -> str:
-    """Writes points.ply (metres) and points_grid.ply (integer cells) into the folder `path`; see `points_to_export`."""
-    voxel_size, clouds = points_to_export(folder, voxel_size, discs, min_opacity)
-    make_folder(path)
-    count = write_points_in_parts(path, clouds)
-    return f"wrote {path}/points.ply and points_grid.ply: {count} points on a {voxel_size:g} m grid"
-
-
 def points_to_export(
     folder: RunFolder, voxel_size: float | None, discs: bool = False, min_opacity: float = 0.0
-) -> tuple[float, Iterator[VoxelCloud]]:
-    """The voxel size, and the points of a run's surface in clouds, at least one that is not empty.
+) -> SurfacePoints:
+    """The points of a run's surface in clouds, at least one of them not empty.
 
     Args:
         folder: of the run.
@@ -172,15 +105,7 @@ def points_to_export(
         raise ConfigError(str(error)) from None
     if first is None:
         raise RunFolderError(f"{folder.path}: the map has no points to export")
-    return first.voxel_size, chain([first], clouds)
-
-
-def export_trajectory(folder: RunFolder, path: Path) -> str:
-    """Writes the camera poses as a TUM trajectory."""
-    trajectory = folder.trajectory()
-    make_folder(path.parent)
-    written = write_tum(path, trajectory.timestamps, trajectory.T_world_camera)
-    return f"wrote {path}: {written} poses"
+    return SurfacePoints(first.voxel_size, chain([first], clouds))
 
 
 def _write_classifier(ply: Path, classifier: IdentityClassifier) -> Path:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import RunFolderError, SequenceError
-from ggslam.formats.mesh_files import check_mesh_path, write_mesh
+from ggslam.formats.mesh_files import WRITER, write_mesh
+from ggslam.formats.writer import SurfaceMesh, Writer
 from ggslam.geometry.scene_size import scene_scale
 from ggslam.jobs.export.map_files import object_file_name
 from ggslam.jobs.progress import Observer, SilentObserver
@@ -58,9 +59,10 @@ class _Views:
 
 
 def export_mesh(
-    folder: RunFolder, out: Path, request: MeshRequest | None = None, observer: Observer | None = None
-) -> str:
-    """Writes the surface as PLY, OBJ or GLB (one node an object); returns a line that says so.
+    folder: RunFolder, out: Path, request: MeshRequest | None = None, observer: Observer | None = None,
+    writer: Writer = WRITER,
+) -> str:  # fmt: skip
+    """Writes the surface in a format of meshes; returns a line that says so.
 
     Depth is that of the recording at the run's poses. It is rendered from the map at the keyframes' poses instead if
     the recording is not there any more, if the run was edited (the recording shows the room as it was), or on request.
@@ -70,17 +72,18 @@ def export_mesh(
         out: file; or, with `request.objects`, a folder, for a PLY of each object.
         request: see `MeshRequest`.
         observer: receives progress updates.
+        writer: of the format.
 
     Raises:
         ConfigError: impossible voxel, unknown object, or an object without any surface.
-        FormatError: an ending that is no mesh's.
+        FormatError: an ending that is not the format's.
         MissingDependency: OBJ or GLB without trimesh.
         RunFolderError: no frame was located, or there is no surface.
     """
     request, observer = request or MeshRequest(), observer or SilentObserver()
     into_folder = request.objects is not None and not out.suffix
     if not into_folder:
-        check_mesh_path(out)
+        writer.check_path(out)
     table = folder.object_table() if folder.has_objects() or request.objects is not None else None
     ids = None if request.objects is None or table is None else table.select(request.objects)
     views = _views(folder, request)
@@ -92,7 +95,7 @@ def export_mesh(
     names = {} if table is None else {o.id: o.name for o in table.objects if o.name}
     place = out if into_folder else out.parent
     if ids is None:
-        return _write(out, mesh, names, views.origin, is_level) + _write_floor(place, surface, is_level)
+        return _write(writer, out, mesh, names, views.origin, is_level) + _write_floor(place, surface, is_level)
     labels = mesh.triangle_labels()
     if not np.isin(labels, ids).any():
         raise RunFolderError(f"{folder.path}: no surface of {request.objects} was found; smaller voxels may help")
@@ -100,7 +103,7 @@ def export_mesh(
         assert table is not None
         return _write_each(out, mesh, labels, table, ids, views.origin) + _write_floor(place, surface, is_level)
     part = mesh.part(np.isin(labels, ids))
-    return _write(out, part, names, views.origin, is_level) + _write_floor(place, surface, is_level)
+    return _write(writer, out, part, names, views.origin, is_level) + _write_floor(place, surface, is_level)
 
 
 def _fuse(folder: RunFolder, views: _Views, voxel: float | None, observer: Observer) -> Surface:
@@ -163,12 +166,14 @@ def _renders(views: RenderedViews) -> Iterator[PosedFrame]:
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def _write(path: Path, mesh: Mesh, names: dict[int, str], origin: str, z_up: bool) -> str:
+def _write(writer: Writer, path: Path, mesh: Mesh, names: dict[int, str], origin: str, z_up: bool) -> str:
     make_folder(path.parent)
     objects = mesh.objects()
     labels = mesh.labels if objects else None
-    write_mesh(path, mesh.vertices, mesh.triangles, mesh.normals, mesh.colors, labels, names, z_up)
-    return f"wrote {path}: {_size(mesh)}, {len(objects)} objects, from {origin}"
+    surface = SurfaceMesh(
+        mesh.vertices, mesh.triangles, mesh.normals, mesh.colors, labels, names, z_up, len(objects), origin
+    )  # fmt: skip
+    return writer.write(path, surface)
 
 
 def _write_floor(folder: Path, surface: Surface, is_level: bool) -> str:
@@ -194,7 +199,3 @@ def _write_each(out: Path, mesh: Mesh, labels: np.ndarray, table: ObjectTable, i
     lacking = f" ({without} have no surface at this voxel)" if without else ""
     total = sum(len(part.triangles) for part in written)
     return f"wrote {len(written)} object{'s' * (len(written) != 1)} to {out}{lacking}: {total} triangles, from {origin}"
-
-
-def _size(mesh: Mesh) -> str:
-    return f"{len(mesh.vertices)} vertices, {len(mesh.triangles)} triangles"

@@ -10,17 +10,14 @@ import torch
 
 from ggslam.errors import ConfigError
 from ggslam.formats.splat_columns import UPRIGHT
-from ggslam.jobs.export.formats import ExportFormat, UpAxis
+from ggslam.formats.writer import Writer
+from ggslam.jobs.export.up_axis import UpAxis
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import skew
 from ggslam.volumes.map_upright import upright_of
 
 _SAMPLED = 100_000
-_TURNED_BY_FORMAT = (ExportFormat.spz, ExportFormat.spz4, ExportFormat.gltf, ExportFormat.usd)
-"""Formats whose descriptions put y upwards: a map is turned by 180 degrees about x when it is written to them."""
-
-
 _R_AXES_LEVEL = {
     UpAxis.y: UPRIGHT, UpAxis.minus_y: np.eye(3), UpAxis.z: np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]),
 }  # fmt: skip
@@ -46,7 +43,7 @@ class UpwardTurn:
         gaussians.move(torch.arange(len(gaussians)), T)
 
 
-def upward_turn(folder: RunFolder, axis: UpAxis | str, kind: ExportFormat) -> UpwardTurn:
+def upward_turn(folder: RunFolder, axis: UpAxis | str, writer: Writer) -> UpwardTurn:
     """The turn after which `axis` of a file points away from the map's floor, and the first camera's x axis points as
     nearly as possible to where it did.
 
@@ -55,18 +52,17 @@ def upward_turn(folder: RunFolder, axis: UpAxis | str, kind: ExportFormat) -> Up
     Args:
         folder: of the map.
         axis: of the file.
-        kind: format that will be written.
+        writer: of the format that will be written.
 
     Raises:
         ConfigError: the format has another up axis.
     """
     axis = _axis_named(axis)
-    turned = kind in _TURNED_BY_FORMAT
-    if turned and axis is not UpAxis.y:
-        raise ConfigError(f"`up` {axis.value}: files of the format {kind.value} have y upwards")
+    if writer.y_up and axis is not UpAxis.y:
+        raise ConfigError(f"`up` {axis.value}: files of the format {writer.name} have y upwards")
     found = upright_of(_sample(folder), np.stack(list(folder.keyframes().poses().values())))
     source = "by its floor" if found.support > 0 else "as the cameras were held: no floor was found"
-    R = level(found.up) if turned else _R_AXES_LEVEL[axis] @ level(found.up)
+    R = level(found.up) if writer.y_up else _R_AXES_LEVEL[axis] @ level(found.up)
     degrees = np.degrees(np.arccos(np.clip(-found.up[1], -1, 1)))
     return UpwardTurn(R, f"{axis.value} is up, {source}, {degrees:.1f} degrees from the first camera's up")
 

@@ -138,7 +138,7 @@ class _FileSizes:
 
 def start_record(
     request: SequenceRequest, sequence: Sequence, config: Config, earlier: RunFolder | None, localize_only: bool,
-    evaluate: bool,
+    evaluate: bool, loss: str | None = None,
 ) -> StartRecord:  # fmt: skip
     """What a run is asked to do."""
     values = config_to_dict(config)
@@ -148,5 +148,6 @@ def start_record(
         "config": values, "config_hash": hash_of(values), "evaluate": evaluate,
         "map": None if earlier is None else earlier.path.absolute(),
         "map_fingerprint": None if earlier is None else fingerprint(earlier), "localize_only": localize_only,
+        "loss": loss,
         "environment": environment(config.threads),
     })  # fmt: skip

@@ -17,6 +17,7 @@ from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.checkpointing import Checkpointing, start_record
 from ggslam.jobs.run.health import doubt_movers, judge
 from ggslam.jobs.run.map_fit import MapFit, located_views, measure_fit
+from ggslam.jobs.run.named_loss import NamedLoss
 from ggslam.jobs.run.rescue import save_somewhere
 from ggslam.jobs.run.resuming import Resumption
 from ggslam.jobs.run.run_verdict import judge_result
@@ -48,7 +49,8 @@ T = TypeVar("T")
 class RunRequest:
     """A whole run; with `map` in the map of an earlier one, which grows unless `localize_only`. Its state is saved
     after every `checkpoint_every` frames: 0: never; None: as often as it hardly takes time. `check`: look at the
-    recording's depth first, and refuse what is certainly wrong with it."""
+    recording's depth first, and refuse what is certainly wrong with it. `loss`: a loss of the user's own, see
+    `named_loss`; it is run."""
 
     sequence: SequenceRequest
     out: Path | None = None
@@ -60,6 +62,7 @@ class RunRequest:
     localize_only: bool = False
     checkpoint_every: int | None = None
     check: bool = True
+    loss: str | None = None
 
 
 @dataclass
@@ -112,6 +115,9 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     config, earlier = load_config(request.config, request.overrides), None
     if request.localize_only and request.map is None:
         raise ConfigError("`localize_only` needs `map`: the run in whose map to localize")
+    loss = None if request.loss is None else NamedLoss.load(request.loss)
+    if loss is not None and request.localize_only:
+        raise ConfigError("`loss` trains the map, which `localize_only` leaves as it is")
     if request.map is not None:
         earlier = RunFolder.open(request.map)
         config = replace(config, sh_degree=earlier.config().sh_degree)
@@ -125,13 +131,14 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     verdicts = check_depth(sequence, observer) if request.check else None
     folder = RunFolder.create(out, overwrite=request.overwrite)
     with stop_on_request() as stop, folder_lock(folder.path):
-        run = _Run(request, config, sequence, earlier, folder, observer, follower, stop, depth=verdicts)
+        run = _Run(request, config, sequence, earlier, folder, observer, follower, stop, loss, depth=verdicts)
         return run.run(None)
 
 
 def resume(
     run: Path, observer: Observer | None = None, follower: Follower | None = None, *, recording: Path | None = None,
     evaluate: bool | None = None, checkpoint_every: int | None = None, model: str | None = None,
+    loss: str | None = None,
 ) -> RunOutcome:  # fmt: skip
     """Goes on with a run that was cut off, from its newest checkpoint. A synchronous run on the CPU becomes what it
     would have become, bit for bit.
@@ -145,20 +152,23 @@ def resume(
         checkpoint_every: as of `RunRequest`.
         model: the model of masks that the run was begun with, if it was with one: it is run like a program, and the
             folder may come from somebody else.
+        loss: name of the user's own loss that the run was begun with, likewise. What it remembers is not saved.
 
     Raises:
         GgslamError: there is nothing to go on from; the recording is another one; the run was made with another
-            version; `model` is not the run's.
+            version; `model` or `loss` is not the run's.
     """
     folder = RunFolder.open_unfinished(run)
     with stop_on_request() as stop, folder_lock(folder.path):
-        found = Resumption.of(folder, recording, evaluate, model)
+        found = Resumption.of(folder, recording, evaluate, model, loss)
         asked = RunRequest(
             found.request, folder.path, evaluate=found.start.evaluate if evaluate is None else evaluate,
-            localize_only=found.start.localize_only, checkpoint_every=checkpoint_every,
+            localize_only=found.start.localize_only, checkpoint_every=checkpoint_every, loss=loss,
         )  # fmt: skip
+        own = None if loss is None else NamedLoss.load(loss)
         observer = observer or SilentObserver()
-        return _Run(asked, found.config, found.sequence, found.earlier, folder, observer, follower, stop).run(found)
+        run_again = _Run(asked, found.config, found.sequence, found.earlier, folder, observer, follower, stop, own)
+        return run_again.run(found)
 
 
 @dataclass
@@ -173,6 +183,7 @@ class _Run:
     observer: Observer
     follower: Follower | None
     stop: StopRequest
+    loss: NamedLoss | None = None
     depth: list[Verdict] | None = None
     fit: MapFit | None = None
     saw_all: bool = False
@@ -188,7 +199,7 @@ class _Run:
             checkpointing = self._make_checkpointing(checkpoints, resumption)
             loop = SlamLoop(
                 sequence, self.config, observer, folder, self.earlier, not self.request.localize_only, self.follower,
-                checkpointing, self.stop,
+                checkpointing, self.stop, loss=self.loss,
             )  # fmt: skip
             if resumption is not None and checkpointing is not None:
                 loop.resume = lambda slam: resumption.restore(slam, checkpoints, checkpointing, observer)
@@ -229,8 +240,9 @@ class _Run:
             request = self.request
             checkpoints.begin(
                 start_record(
-                    request.sequence, sequence, self.config, self.earlier, request.localize_only, request.evaluate
-                )
+                    request.sequence, sequence, self.config, self.earlier, request.localize_only, request.evaluate,
+                    request.loss,
+                )  # fmt: skip
             )
         return Checkpointing(checkpoints, every, sequence, self.observer)
 
@@ -248,9 +260,10 @@ class _Run:
         wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)
         told = None if error is None else repr(error)
         try:
-            folder, failure = save_somewhere(
-                self.folder, RunToWrite(self.config, described, result, told, names, wanted, verdicts)
-            )
+            run = RunToWrite(
+                self.config, described, result, told, names, wanted, verdicts, loss=self.request.loss
+            )  # fmt: skip
+            folder, failure = save_somewhere(self.folder, run)
             if (folder.path / "map.ply").is_file():
                 self.fit = self._or_note(lambda: self._fit(result, folder))
         finally:

@@ -36,8 +36,9 @@ class Resumption:
 
     @staticmethod
     def of(
-        folder: RunFolder, recording: Path | None, evaluate: bool | None = None, model: str | None = None
-    ) -> Resumption:
+        folder: RunFolder, recording: Path | None, evaluate: bool | None = None, model: str | None = None,
+        loss: str | None = None,
+    ) -> Resumption:  # fmt: skip
         """That of a run.
 
         Args:
@@ -45,6 +46,7 @@ class Resumption:
             recording: where its recording is now; None: where it was.
             evaluate: whether it will be scored; None: as it was asked to.
             model: of masks that whoever goes on knows to be the run's.
+            loss: name of the loss, likewise.
 
         Raises:
             GgslamError: see `resume`.
@@ -61,6 +63,8 @@ class Resumption:
         config = config_from_dict(start.config, str(where))
         if (model or "") != config.masks.model:
             raise ConfigError(_other_model(folder.path, config.masks.model))
+        if loss != start.loss:
+            raise ConfigError(_other_loss(folder.path, config.masks.model, start.loss))
         request = request_in(start.open, recording)
         sequence = request.open(truth=start.evaluate if evaluate is None else evaluate)
         found, expected = identity_of(sequence), start.recording
@@ -97,10 +101,23 @@ def _other_model(run: Path, model: str) -> str:
     return f"{run}: was begun with a model of masks, which is run like a program; if it is yours: `{command}`"
 
 
-def go_on_command(run: Path, model: str = "") -> str:
-    """What goes on with a run that was cut off; `model`: of masks, that it was begun with."""
-    form = "ggslam run --resume {} --set masks.model={}" if model else "ggslam run --resume {}"
-    return form.format(shlex.quote(str(run)), shlex.quote(model))
+def _other_loss(run: Path, model: str, loss: str | None) -> str:
+    if loss is None:
+        return f"{run}: was begun without a loss of your own"
+    command = go_on_command(run, model, loss)
+    return f"{run}: was begun with the loss {loss}, which is run like a program; if it is yours: `{command}`"
+
+
+def go_on_command(run: Path, model: str = "", loss: str | None = None) -> str:
+    """What goes on with a run that was cut off; `model` of masks and `loss`: that it was begun with."""
+    forms = {
+        (False, False): "ggslam run --resume {run}",
+        (True, False): "ggslam run --resume {run} --set masks.model={model}",
+        (False, True): "ggslam run --resume {run} --loss {loss}",
+        (True, True): "ggslam run --resume {run} --set masks.model={model} --loss {loss}",
+    }
+    values = {"run": str(run), "model": model, "loss": loss or ""}
+    return forms[bool(model), loss is not None].format(**{name: shlex.quote(text) for name, text in values.items()})
 
 
 def _earlier(start: StartRecord) -> RunFolder | None:

@@ -14,6 +14,8 @@ from ggslam.cuda.availability import kernels_to_compile
 from ggslam.errors import DeviceError
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.run.checkpointing import Checkpointing
+from ggslam.jobs.run.named_loss import NamedLoss
+from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.starting import start_in_map
 from ggslam.scene.frame import Frame
@@ -48,6 +50,7 @@ class SlamLoop:
         stop: says when to end early.
         resume: brings a fresh `Slam` to where it was, and tells which frame comes next, None if it was nowhere yet.
         told: notes of the run that were told at its start.
+        loss: a loss of the user's own that joins the mapper's.
         saw_all: whether all frames were tracked, and what is left is the refinement.
     """
 
@@ -62,6 +65,7 @@ class SlamLoop:
     stop: StopRequest = field(default_factory=StopRequest)
     resume: Callable[[Slam], int | None] | None = None
     told: list[str] = field(default_factory=list)
+    loss: NamedLoss | None = None
     saw_all: bool = False
     _between_steps: bool = False
 
@@ -77,7 +81,11 @@ class SlamLoop:
             self.observer.note("compiling the CUDA kernels, once: about a minute")
         folder = self.folder
         paging = new_staging(folder.path) if self.config.memory_limit_mb and folder is not None else None
-        slam = make_slam(self.sequence, self.config, paging)
+        slam = make_slam(self.sequence, self.config, paging, self.loss)
+        if self.loss is not None:
+            slam.start_notes.append(f"trained with a loss of your own, {self.loss.name}")
+            if isinstance(self.sequence, Sequence):
+                self.loss.try_on(next(iter(self.sequence.stream(masks="lazy"))), slam.map.device)
         self.told = list(slam.start_notes)
         for note in self.told:
             self.observer.note(note)
@@ -154,11 +162,13 @@ class SlamLoop:
             raise
 
 
-def make_slam(sequence: Sequence | LiveSequence, config: Config, paging: Path | None = None) -> Slam:
+def make_slam(
+    sequence: Sequence | LiveSequence, config: Config, paging: Path | None = None, loss: ExtraLoss | None = None
+) -> Slam:
     """A fresh `Slam` for a recording; arguments and errors as of `Slam`."""
     if isinstance(sequence, RigSequence):
-        return RigSlam(sequence.rig, config, sequence.has_masks)
-    return Slam(sequence.camera, config, sequence.has_masks, paging)
+        return RigSlam(sequence.rig, config, sequence.has_masks, loss)
+    return Slam(sequence.camera, config, sequence.has_masks, paging, extra_loss=loss)
 
 
 def _for_people(stopped: BaseException) -> BaseException:

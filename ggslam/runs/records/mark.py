@@ -61,6 +61,7 @@ class RunRecord(RecordFile):
         displaced: objects that edits moved, as `Displacement.to_json` gives them.
         merged: the runs that this one was merged from; None: it was made of one recording.
         updated: whether of these the last one is a later visit, whose state the map shows.
+        loss: name of the user's own loss that the map was trained with; None: none.
     """
 
     FILE: ClassVar[str] = "run.json"
@@ -75,6 +76,7 @@ class RunRecord(RecordFile):
     displaced: dict[str, list[list[float]] | None] = {}
     merged: list[MergedRecord] | None = None
     updated: bool = False
+    loss: str | None = None
 
     @pydantic.field_validator("displaced", mode="before")
     @classmethod
@@ -104,6 +106,7 @@ class RunRecord(RecordFile):
         notes = [f"the run stopped early: {self.stopped_by}"] if self.stopped_by else []
         notes += [f"asked for, but not there: {', '.join(self.missing)}"] if self.missing else []
         notes += [f"{verdict.severity}: {verdict.text}" for verdict in self.verdicts]
+        notes += [f"trained with a loss of your own, {self.loss}"] if self.loss is not None else []
         if self.merged and self.updated:
             notes.append(f"{self.merged[0].run}, brought up to date by {self.merged[-1].run}")
         elif self.merged:

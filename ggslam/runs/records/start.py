@@ -29,6 +29,7 @@ class StartRecord(RecordFile):
         map: folder of the run whose map it began with.
         map_fingerprint: of that run.
         localize_only: whether that map stays as it is.
+        loss: name of the user's own loss, see `jobs.run.named_loss`; None: none. It is never loaded from here.
         environment: versions and machine; others compute the last bits differently.
     """
 
@@ -43,6 +44,7 @@ class StartRecord(RecordFile):
     map: str | None = None
     map_fingerprint: str | None = None
     localize_only: bool = False
+    loss: str | None = None
     environment: dict[str, str | int | float | None] = {}
 
 

@@ -90,9 +90,6 @@ class FeatureAlignment:
             points share errors).
         visibility: float64 [6], ascending, the share of the features that see each direction of motion.
         weak_directions: float64 [k, 6], the directions seen by too few (see `gicp.AlignmentResult`).
-        cost: mean Huber cost, in variances.
-        matches: int32 [P], voxel that each plane feature is matched to, -1 without.
-        squared_distances: float32 [P], squared point-to-plane distances, infinite without match.
     """
 
     T_map_sensor: np.ndarray
@@ -105,9 +102,6 @@ class FeatureAlignment:
     information: np.ndarray
     visibility: np.ndarray
     weak_directions: np.ndarray
-    cost: float
-    matches: np.ndarray
-    squared_distances: np.ndarray
 
 
 class _Scan:
@@ -121,10 +115,9 @@ class _Scan:
 
 @dataclass(frozen=True)
 class _Matched:
-    """Map surfaces of a scan's points: found bool [n], slots int64 [n], and `Matches.surfaces` [n, 8]."""
+    """Map surfaces of a scan's points: found bool [n], and `Matches.surfaces` [n, 8]."""
 
     found: np.ndarray
-    slots: np.ndarray
     surfaces: np.ndarray
 
     def distances(self, points: np.ndarray) -> np.ndarray:
@@ -207,7 +200,7 @@ class FeatureAligner:
         M = torch.from_numpy(T[:3].astype(np.float32)).to(features.planes.device)
         R, t = M[:, :3].T, M[:, 3]
         found = self._features.match(torch.addmm(t, features.points, R), scan.planes, features.all_normals @ R)
-        return _Matched(found.found.cpu().numpy(), found.slots.cpu().numpy(), found.surfaces.cpu().numpy())
+        return _Matched(found.found.cpu().numpy(), found.surfaces.cpu().numpy())
 
     def _residuals(self, scan: _Scan, matched: _Matched, T: np.ndarray, is_last: bool) -> _Residuals:
         """Distances of planes and edges. Before the last matching the pose is not yet good, and outliers are told
@@ -286,8 +279,6 @@ class FeatureAligner:
         return FeatureAlignment(
             fit.T, rows >= s.min_matches, settled, outer, steps, count / max(P, 1),
             math.sqrt(float(np.square(distance[inlier]).sum()) / max(count, 1)), fit.H, visibility, weak,
-            fit.cost / max(rows - residuals.lines, 1), np.where(found, matched.slots[:P], -1).astype(np.int32),
-            np.square(distance),
         )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from ggslam.tracking.edges_planes.extraction import ScanFeatures
 from ggslam.tracking.edges_planes.local_map import LocalFeatureMap
 from ggslam.tracking.edges_planes.scans import DepthImageFeatures
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PointMatches
+from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.noise import estimate_noise
@@ -180,7 +180,7 @@ class FeatureTracker(Tracker):
         self.local_map.update(scan, T, found.overlap)
         status = TrackingStatus.DEGENERATE if len(found.weak_directions) else TrackingStatus.OK
         status = TrackingStatus.RECOVERED if reason else status
-        return TrackingResult(T.copy(), status, found.overlap, found.rmse, reason, points, _as_gicp(found))
+        return _result(found, T.copy(), status, reason, points)
 
     def _give_up(self, points: PointSource, found: FeatureAlignment) -> TrackingResult:
         self.state.motion.lose()
@@ -193,7 +193,7 @@ class FeatureTracker(Tracker):
                 f"{needed} needed"
             )
         pose = self.state.motion.T_world_camera.copy()
-        return TrackingResult(pose, TrackingStatus.LOST, found.overlap, found.rmse, reason, points, _as_gicp(found))
+        return _result(found, pose, TrackingStatus.LOST, reason, points)
 
     def _may_ask_gicp(self) -> bool:
         return self.features.gicp_fallback and self.target is not None
@@ -215,12 +215,9 @@ class FeatureTracker(Tracker):
         return replace(result, status=TrackingStatus.RECOVERED, reason=reason)
 
 
-def _as_gicp(found: FeatureAlignment) -> AlignmentResult:
-    """The alignment in the terms of G-ICP; the information is about the world's origin, as there."""
-    T = found.T_map_sensor
-    status = AlignmentStatus.DEGENERATE if len(found.weak_directions) else AlignmentStatus.OK
-    return AlignmentResult(
-        T, status if found.usable else AlignmentStatus.LOST, found.converged, found.inner_iterations, found.overlap,
-        found.rmse, about_point(found.information, T[:3, 3]), found.information, found.visibility,
-        found.weak_directions, PointMatches(found.matches, found.squared_distances), found.cost,
-    )  # fmt: skip
+def _result(
+    found: FeatureAlignment, T_world_camera: np.ndarray, status: TrackingStatus, reason: str, points: PointSource
+) -> TrackingResult:
+    """The alignment as trackers report it; its information is about the sensor, that of results about the origin."""
+    information = about_point(found.information, found.T_map_sensor[:3, 3])
+    return TrackingResult(T_world_camera, status, found.overlap, found.rmse, reason, points, information)
