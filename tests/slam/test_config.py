@@ -9,6 +9,7 @@ import yaml
 
 from ggslam.errors import ConfigError
 from ggslam.slam.config import Config, config_from_dict, config_to_dict, load_config, presets, save_config
+from ggslam.system.settings import walk_public
 
 
 def test_round_trip_through_yaml(tmp_path: Path) -> None:
@@ -17,6 +18,21 @@ def test_round_trip_through_yaml(tmp_path: Path) -> None:
     again = load_config(tmp_path / "config.yaml")
     assert again == config
     assert again.seed == 7 and again.mapping.insertion.opacity == 0.25 and again.tracking.points.count == 4000
+
+
+def test_a_file_holds_public_settings_and_changed_internal_ones(tmp_path: Path) -> None:
+    config = load_config(None, ["tracking.align.min_matches=77", "loops.graph.turn_length=2.5"])
+    save_config(config, tmp_path / "config.yaml")
+    assert load_config(tmp_path / "config.yaml") == config
+    written = leaves(yaml.safe_load((tmp_path / "config.yaml").read_text()))
+    public = {one.path for one in walk_public(Config) if not one.path.startswith("tracking.noise.")}
+    assert written.keys() == public | {"tracking.align.min_matches", "loops.graph.turn_length"}
+
+
+def test_files_with_all_settings_are_read(tmp_path: Path) -> None:
+    config = load_config(None, ["mapping.rates.beta1=0.8"])
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config_to_dict(config)))
+    assert load_config(tmp_path / "config.yaml") == config
 
 
 def test_defaults_survive_the_dictionary() -> None:

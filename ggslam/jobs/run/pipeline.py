@@ -40,6 +40,7 @@ from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import reason_against_saving
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import StopRequest, stop_on_request
+from ggslam.system.settings import tuning_note
 
 T = TypeVar("T")
 
@@ -122,6 +123,8 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     if earlier is not None and out.resolve() in ancestors(earlier):
         raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
     observer = observer or SilentObserver()
+    if note := tuning_note(config):
+        observer.note(note)
     verdicts = check_depth(sequence, observer) if request.check else None
     folder = RunFolder.create(out, overwrite=request.overwrite)
     with stop_on_request() as stop, folder_lock(folder.path):

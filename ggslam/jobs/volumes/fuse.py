@@ -25,6 +25,7 @@ from ggslam.slam.config import Config, config_to_dict, load_config
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.opencv import opencv_errors
+from ggslam.system.settings import tuning_note
 from ggslam.volumes.maps import WINDOW, VolumeMaps
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.output_frame import OutputFrame, output_frame
@@ -152,6 +153,8 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     is_run = (request.source / MARKER).is_file()
     _check(request, is_run)
     config = _config(request)
+    if not request.live and (note := tuning_note(config)):  # a live run tells of it itself
+        observer.note(note)
     onto = None if request.onto is None else load_tsdf(request.onto)
     maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
     source: FrameSource | None = None
