@@ -7,8 +7,8 @@
 
 Each run appends a row, so that a table that was cut off goes on where it ended. A row whose hash (of trajectory and
 map) is the unchanged run's shows a number that these recordings do not use: it is idle, or it guards against what they
-lack. Nothing is halved or doubled out of its range; bools are turned, choices are left alone. With --screen a number
-that made a difference on a recording is not run on the next ones.
+lack. Nothing is halved or doubled out of its range; bools are turned, choices are left alone. --screen looks for idle
+numbers only: it does not score, and a number that made a difference once is not run again.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from ggslam.jobs.score.run import score_run
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.slam.config import Config
+from ggslam.system.interrupts import StopRequest, stop_on_request
 from ggslam.system.settings import walk
 
 SCORES = ("ate_mm", "psnr_db", "miou")
@@ -115,8 +116,10 @@ def _modules() -> list[Any]:
     return [module for path, module in list(sys.modules.items()) if path.startswith("ggslam.")]
 
 
-def run(sequence: SequenceRequest, change: Change, least: list[str], base: dict[str, Any] | None) -> dict[str, Any]:
-    """One run in this process; a row of the table. It is scored unless it is the unchanged run `base`."""
+def run(
+    sequence: SequenceRequest, change: Change, least: list[str], base: dict[str, Any] | None, scored: bool
+) -> dict[str, Any]:
+    """One run in this process; a row of the table. What equals the unchanged run `base` has its scores."""
     start = time.perf_counter()
     row: dict[str, Any] = {"recording": sequence.path.name, "number": change.name, "value": change.value}
     try:
@@ -130,7 +133,7 @@ def run(sequence: SequenceRequest, change: Change, least: list[str], base: dict[
             row["hash"] = hash_of(out)
             if base is not None and base["hash"] == row["hash"]:
                 row |= {name: base[name] for name in SCORES}
-            else:
+            elif scored:
                 row |= scores(score_run(outcome.folder, sequence.open(), SilentObserver(), lpips=False))
     except (GgslamError, ArithmeticError, ValueError, IndexError, RuntimeError) as error:
         row["error"] = f"{type(error).__name__}: {error}"[:120]
@@ -158,18 +161,18 @@ class Table:
     """Rows in a CSV file."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.rows = path, []
+        self.path, self.rows = path, list[dict[str, str]]()
         if path.exists():
             with path.open(newline="") as stream:
                 self.rows = list(csv.DictReader(stream))
 
-    def row(self, recording: str, name: str, value: Any) -> dict[str, Any] | None:
+    def row(self, recording: str, name: str, value: Any) -> dict[str, str] | None:
         """A run that was made before."""
         key = (recording, name, str(value))
         return next((r for r in self.rows if (r["recording"], r["number"], r["value"]) == key), None)
 
-    def add(self, row: dict[str, Any]) -> None:
-        """Appends a row to the file."""
+    def add(self, row: dict[str, Any]) -> dict[str, str]:
+        """Appends a row to the file; returns it as it is read again."""
         begin = not self.path.exists()
         with self.path.open("a", newline="") as stream:
             writer = csv.DictWriter(stream, COLUMNS)
@@ -177,12 +180,13 @@ class Table:
                 writer.writeheader()
             writer.writerow(row)
         self.rows.append({name: "" if row.get(name) is None else str(row[name]) for name in COLUMNS})
+        return self.rows[-1]
 
     def is_idle(self, recording: str, name: str) -> bool:
         """Whether no value of a number changed a recording's run."""
-        base, made = self.row(recording, BASE, ""), [r for r in self.rows if r["recording"] == recording]
-        mine = [r for r in made if r["number"] == name]
-        return base is not None and bool(mine) and all(r["hash"] == base["hash"] for r in mine)
+        base = self.row(recording, BASE, "")
+        mine = [row for row in self.rows if (row["recording"], row["number"]) == (recording, name)]
+        return base is not None and bool(mine) and all(row["hash"] in ("", base["hash"]) for row in mine)
 
 
 def print_table(table: Table) -> None:
@@ -206,22 +210,24 @@ def _difference(table: Table, row: dict[str, Any], name: str) -> float:
     return float(row[name]) - float(base[name]) if base and row[name] and base[name] else 0.0
 
 
-def measure(arguments: argparse.Namespace, table: Table, say: Callable[[str], None]) -> None:
+def measure(arguments: argparse.Namespace, table: Table, stop: StopRequest, say: Callable[[str], None]) -> None:
     """Makes the runs that the table lacks."""
     changes = [*setting_changes(arguments.names, arguments.internal), *constant_changes(arguments.constants)]
-    done: list[str] = []
+    used: set[str] = set()
     for recording in arguments.recordings:
         path, _, scale = recording.partition("@")
         sequence = SequenceRequest(Path(path), stop=arguments.stop, stride=arguments.stride, scale=float(scale or 1))
         own = sequence.path.name
         for change in [Change(BASE, ""), *changes]:
-            used = arguments.screen and any(not table.is_idle(name, change.name) for name in done)
-            if (used and change.name != BASE) or table.row(own, change.name, change.value) is not None:
+            if arguments.screen and change.name in used:
                 continue
-            row = run(sequence, change, arguments.set, table.row(own, BASE, ""))
-            table.add(row)
-            say(" ".join(f"{row.get(name, '')}" for name in COLUMNS))
-        done.append(own)
+            base, row = table.row(own, BASE, ""), table.row(own, change.name, change.value)
+            if row is None:
+                row = table.add(run(sequence, change, arguments.set, base, base is None or not arguments.screen))
+                stop.raise_if_any()
+                say(" ".join(row.values()))
+            if base is not None and row["hash"] not in ("", base["hash"]):
+                used.add(change.name)
 
 
 def main() -> None:
@@ -239,7 +245,8 @@ def main() -> None:
     arguments = parser.parse_args()
     table = Table(arguments.csv)
     if not arguments.print:
-        measure(arguments, table, lambda line: print(line, flush=True))
+        with stop_on_request() as stop:
+            measure(arguments, table, stop, lambda line: print(line, flush=True))
     print_table(table)
 
 
