@@ -60,8 +60,8 @@ class IdentitySettings(IdentityTuning):
     enabled: bool = setting(True, basic=True)
     """Learn objects from masks (`masks.source`)."""
     schedule: Literal["sampled", "dense", "votes"] = "sampled"
-    """sampled: train on sampled pixels of views rendered for colour anyway; dense: on all pixels of rendered identity
-    images, as published; votes: count, without training."""
+    """How identities are learned. sampled: on sampled pixels of views rendered for colour anyway; dense: on all pixels
+    of rendered identity images, as published; votes: by counting, without training."""
     final_passes: int = setting(4, 0, 10**4)
     """Passes over all keyframes after the last frame that train identities only."""
     neighbours: NeighbourSettings = field(default_factory=NeighbourSettings)

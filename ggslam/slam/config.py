@@ -71,8 +71,8 @@ class Config:
     sh_degree: int = setting(0, 0, 3, basic=True)
     """Degree of the spherical harmonics that describe a Gaussian's colour; 0: one colour from all sides."""
     tracker: Literal["gicp", "features"] = setting("gicp", basic=True)
-    """gicp: G-ICP against the points of the keyframes. features: edge and plane features within a time budget per
-    frame, with G-ICP where they fail."""
+    """How frames are located. gicp: G-ICP against the points of the keyframes; features: edges and planes within a time
+    budget per frame, and G-ICP where they fail."""
     realtime_fps: float = setting(0.0, 0, 1e4, "frames/s", basic=True)
     """0: process every frame in turn. Otherwise frames arrive at this rate, as from a camera, and tracker and mapper
     run in parallel."""

@@ -36,7 +36,8 @@ class LoopSettings(LoopTuning):
     enabled: bool = setting(True, basic=True)
     """Close loops, and relocate lost frames among all keyframes."""
     confirmations: int = setting(2, 1, 100)
-    """Consecutive keyframes that must find the same correction before a loop is closed."""
+    """Consecutive keyframes that must find the same correction before a loop is closed. More reject false loops, but
+    close true ones later."""
     activity: ActivitySettings = field(default_factory=ActivitySettings)
     revisits: RevisitSettings = field(default_factory=RevisitSettings)
     places: PlaceSettings = field(default_factory=PlaceSettings)
