@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 
 from ggslam.system.array_forms import Form, Points64, check_indices
+from ggslam.system.savable import savable
 from ggslam.system.settings import setting, tuning_class
 
 _SHARE = 8
@@ -40,6 +41,7 @@ class ActivitySettings:
     """Maximum number of active keyframes; an eighth more until some are deactivated together."""
 
 
+@savable(not_saved="settings", check="check")
 class ActiveKeyframes:
     """Keeps the set of active keyframes as the camera moves.
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ggslam.scene.poses import so3_log
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 from ggslam.system.settings import setting, settings_class, tuning_class
 
 
@@ -45,6 +46,7 @@ class RevisitSettings(RevisitTuning):
     """Compare keyframes with older ones that are still tracked against, and correct the drift between them."""
 
 
+@savable(not_saved="settings")
 class Revisits:
     """Remembers how far the camera went, and which keyframes were compared.
 

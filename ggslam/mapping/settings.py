@@ -75,7 +75,7 @@ class RateTuning:
 class LearningRates(RateTuning):
     """Adam step sizes of each group of parameters.
 
-    Steps of means, quaternions and colours shrink with the root of a Gaussian's updates (`fall_updates`): a new Gaussian
+    Steps of means, quaternions and colours shrink with the root of a Gaussian's updates (`fall_updates`): a new one
     settles fast, an old one averages over many views. Standard deviations and opacities keep their steps after a few
     longer ones (`young_updates`), because shrinking or larger steps there cost depth accuracy.
     """

@@ -23,6 +23,7 @@ from ggslam.objects.settings import AssociationSettings, CleaningSettings, Geome
 from ggslam.objects.table import Observation, Supervision
 from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.frame import Frame
+from ggslam.system.savable import savable
 from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
 
 _LARGE = 160
@@ -65,6 +66,7 @@ class MaskSettings(MaskTuning):
             raise Conflict("model", "expected an ONNX file, because masks.source is model, found none")
 
 
+@savable(not_saved="settings _segment")
 class ObjectMasks:
     """Gives each keyframe its object mask.
 

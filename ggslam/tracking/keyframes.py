@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.scene.poses import separation
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.system.settings import setting, settings_class, tuning_class
 
 
@@ -29,6 +30,7 @@ class LocatedFrame(Protocol):
         """Of the frame's points, metres."""
 
 
+@savable()
 class KeyframeKind(enum.Enum):
     """Why a frame is a keyframe."""
 
@@ -62,6 +64,7 @@ class KeyframeSettings(KeyframeTuning):
     """A frame becomes a keyframe after a turn by this angle."""
 
 
+@savable(not_saved="settings")
 class KeyframePolicy:
     """Decides frame by frame; remembers the last keyframe.
 
