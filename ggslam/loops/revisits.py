@@ -32,8 +32,6 @@ class RevisitTuning:
     """Both cameras and both view centres lie within this many times the mean of the median depths."""
     turned: float = setting(40.0, 0, 180, "deg")
     """Largest angle between the viewing directions."""
-    rest: int = setting(0, 0, 10**6, "keyframes")
-    """Keyframes skipped after a comparison that failed."""
     min_witnesses: int = setting(8, 3, 10**5)
     """Matches that must agree with an expected pose."""
 
@@ -81,8 +79,8 @@ class Revisits:
         self._tied_at[old] = max(self._tied_at[old], self._way[new])
 
     def pause(self) -> None:
-        """The newest keyframe was compared in vain."""
-        self._rests_until = len(self._way) + self.settings.rest
+        """The newest keyframe was compared in vain, and is not compared again."""
+        self._rests_until = len(self._way)
 
     def candidates(self, median_depth_m: float) -> np.ndarray:
         """Numbers of the keyframes that the newest is worth to be compared with, rising."""

@@ -57,8 +57,6 @@ class RateTuning:
     20."""
     sh_rest: float = setting(5e-4, 0, 10)
     """Step of the other coefficients of a colour."""
-    features: float = setting(1e-2, 0, 10)
-    """Step of a feature vector."""
     beta1: float = setting(0.9, 0, 0.9999)
     """Decay rate of the first moment."""
     beta2: float = setting(0.99, 0, 0.99999)

@@ -27,7 +27,7 @@ from ggslam.system.atomic import write_text
 from ggslam.system.foreign import given_path, read_foreign_text
 from ggslam.system.overrides import with_overrides
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
-from ggslam.system.settings import changed_tuning, setting, settings_class, tuning_class, walk
+from ggslam.system.settings import changed_tuning, setting, settings_class, tuning_class, tuning_note, walk
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.settings import TrackerSettings
@@ -53,6 +53,10 @@ class EvaluationSettings(EvaluationTuning):
         """Whether the frame is kept for scoring."""
         every = self.held_out_every
         return every > 0 and frame_index % every == self.held_out_offset % every
+
+
+RETIRED = ("loops.revisits.rest", "mapping.rates.features")
+"""Internal numbers that earlier versions had and that changed no run; files and overrides may still name them."""
 
 
 @settings_class(frozen=True)
@@ -109,7 +113,7 @@ def _plain(value: Any) -> Any:
 
 
 def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config:
-    """The settings from nested dictionaries; what is not named keeps its default.
+    """The settings from nested dictionaries; what is not named keeps its default, and retired names are skipped.
 
     Raises:
         ConfigError: an unknown name (the nearest known one is suggested) or a value of the wrong type or range.
@@ -118,6 +122,8 @@ def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config
         raise ConfigError(f"{origin}: top level: expected names with values, found {values!r}")
     if unnamed := [name for name in values if not isinstance(name, str)]:
         raise ConfigError(f"{origin}: unknown setting {unnamed[0]}")
+    if retired := _retired_in(values):
+        values = _without(set(retired), values)
     try:
         return Config(**values)
     except ConfigError as error:
@@ -136,16 +142,43 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
     Raises:
         ConfigError: naming the file and the setting.
     """
-    values: dict[str, Any] = {}
-    origin = "settings"
+    values, origin = _read_preset(preset_or_file)
     if preset_or_file is not None:
-        path = given_path(preset_or_file, ConfigError)
-        if not path.suffix and str(preset_or_file) in presets():
-            path = presets()[str(preset_or_file)]
-        values, origin = _read_yaml(path), str(path)
         config_from_dict(values, origin)
     with_overrides(overrides, values)
     return config_from_dict(values, "`overrides`" if overrides else origin)
+
+
+def settings_notes(
+    config: Config, preset_or_file: str | Path | None = None, overrides: Sequence[str] | None = None
+) -> list[str]:
+    """What a user is told of settings that were given to `load_config`: internal ones, and those without effect."""
+    retired = _retired_in(with_overrides(overrides, _read_preset(preset_or_file)[0]))
+    notes = [tuning_note(config), f"has no effect any more: {', '.join(retired)}" if retired else ""]
+    return [note for note in notes if note]
+
+
+def _retired_in(values: dict[str, Any]) -> list[str]:
+    """Retired names among nested settings."""
+    found = []
+    for path in RETIRED:
+        *groups, name = path.split(".")
+        inner: Any = values
+        for group in groups:
+            inner = inner.get(group) if isinstance(inner, dict) else None
+        if isinstance(inner, dict) and name in inner:
+            found.append(path)
+    return found
+
+
+def _read_preset(preset_or_file: str | Path | None) -> tuple[dict[str, Any], str]:
+    """What a preset or file says, and its place."""
+    if preset_or_file is None:
+        return {}, "settings"
+    path = given_path(preset_or_file, ConfigError)
+    if not path.suffix and str(preset_or_file) in presets():
+        path = presets()[str(preset_or_file)]
+    return _read_yaml(path), str(path)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,16 @@ import pytest
 import yaml
 
 from ggslam.errors import ConfigError
-from ggslam.slam.config import Config, config_from_dict, config_to_dict, load_config, presets, save_config
+from ggslam.slam.config import (
+    RETIRED,
+    Config,
+    config_from_dict,
+    config_to_dict,
+    load_config,
+    presets,
+    save_config,
+    settings_notes,
+)
 from ggslam.system.settings import walk_public
 
 
@@ -33,6 +43,22 @@ def test_files_with_all_settings_are_read(tmp_path: Path) -> None:
     config = load_config(None, ["mapping.rates.beta1=0.8"])
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(config_to_dict(config)))
     assert load_config(tmp_path / "config.yaml") == config
+
+
+def test_retired_names_are_read_and_told_of(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("loops: {revisits: {rest: 3}, confirmations: 4}")
+    overrides = ["mapping.rates.features=0.5", "mapping.rates.beta1=0.8"]
+    config = load_config(mine, overrides)
+    usual = Config()
+    assert config.loops == dataclasses.replace(usual.loops, confirmations=4)
+    assert config.mapping.rates == dataclasses.replace(usual.mapping.rates, beta1=0.8)
+    internal, retired = settings_notes(config, mine, overrides)
+    assert "mapping.rates.beta1" in internal and "features" not in internal
+    assert all(name in retired for name in RETIRED)
+    assert settings_notes(load_config("fast-cpu"), "fast-cpu") == []
+    with pytest.raises(ConfigError):
+        load_config(None, ["loops.revisits.rests=3"])
 
 
 def test_defaults_survive_the_dictionary() -> None:
