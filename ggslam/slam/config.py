@@ -122,7 +122,7 @@ def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config
         raise ConfigError(f"{origin}: top level: expected names with values, found {values!r}")
     if unnamed := [name for name in values if not isinstance(name, str)]:
         raise ConfigError(f"{origin}: unknown setting {unnamed[0]}")
-    if retired := _retired_in(values):
+    if retired := _find_retired(values):
         values = _without(set(retired), values)
     try:
         return Config(**values)
@@ -153,12 +153,12 @@ def settings_notes(
     config: Config, preset_or_file: str | Path | None = None, overrides: Sequence[str] | None = None
 ) -> list[str]:
     """What a user is told of settings that were given to `load_config`: internal ones, and those without effect."""
-    retired = _retired_in(with_overrides(overrides, _read_preset(preset_or_file)[0]))
+    retired = _find_retired(with_overrides(overrides, _read_preset(preset_or_file)[0]))
     notes = [tuning_note(config), f"has no effect any more: {', '.join(retired)}" if retired else ""]
     return [note for note in notes if note]
 
 
-def _retired_in(values: dict[str, Any]) -> list[str]:
+def _find_retired(values: dict[str, Any]) -> list[str]:
     """Retired names among nested settings."""
     found = []
     for path in RETIRED:
