@@ -37,7 +37,7 @@ HelpSetting = Annotated[
     str | None,
     typer.Option(
         "--help-setting", metavar="NAME|all", callback=_print_named, is_eager=True,
-        help="Print every setting with NAME in its name, or all of them, and exit.",
+        help="Print the settings with NAME in their names, or all of them, and exit.",
     ),
 ]  # fmt: skip
 
@@ -52,9 +52,9 @@ def print_settings(part: str | None) -> None:
         ConfigError: no setting has such a name.
     """
     from ggslam.slam.config import Config  # imports torch: only when needed
-    from ggslam.system.settings import walk
+    from ggslam.system.settings import walk_public
 
-    known = list(walk(Config))
+    known = walk_public(Config)
     chosen = [one for one in known if (one.declaration.basic if part is None else part.lower() in one.path)]
     if not chosen:
         raise ConfigError(f"--help-setting {part}: no setting has this in its name")

@@ -122,9 +122,14 @@ def submaps(
 def _make(request: SubmapsRequest) -> None:
     from ggslam.jobs.changes.store_visits import add_run
     from ggslam.jobs.submaps.fill import make_store
+    from ggslam.jobs.submaps.settings import StoreSettings
+    from ggslam.submaps.settings import SubmapSettings
+    from ggslam.system.settings import tuning_note
 
     with progress_bar() as bar:
         observer = ProgressObserver(bar)
+        if note := tuning_note(StoreSettings(SubmapSettings(**request.settings))):
+            observer.note(note)
         make_store(request, observer, partial(add_run, observer=observer))
 
 

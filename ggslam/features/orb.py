@@ -13,21 +13,21 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.array_forms import ColorImage, DepthImage, Form, Points32, Pose
 from ggslam.system.savable import savable
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, tuning_class
 
 
-@settings_class(frozen=True)
+@tuning_class(frozen=True)
 class FeatureSettings:
-    """How many features, and when matches make a pose."""
+    """Numbers of ORB features and of the poses that their matches give."""
 
     count: int = setting(1000, 1, 10**5)
-    """Features of a view at most."""
+    """Maximum number of features of a view."""
     max_hamming: int = setting(64, 0, 256, "bits")
-    """The largest distance of two descriptors that match, of 256."""
+    """Largest distance of two matching descriptors, of 256 bits."""
     reprojection: float = setting(2.0, 0.01, 1e3, "px")
-    """RANSAC's inlier distance in pixels of a 320-pixel-wide image."""
+    """Inlier distance of RANSAC in a 320-pixel-wide image."""
     min_inliers: int = setting(12, 6, 10**5)
-    """Matches that agree on a pose at least; else there is none."""
+    """Matches that must agree on a pose."""
 
     def limit(self, camera: Camera) -> float:
         """`reprojection` in pixels of a camera's images."""

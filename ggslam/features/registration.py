@@ -17,7 +17,7 @@ import numpy as np
 from ggslam.features.orb import Landmarks
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import fit_similarity, inverse
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, tuning_class
 
 FEWEST = 6
 """Matches below which nothing is tried."""
@@ -25,21 +25,20 @@ _ALIKE_CONSTANT, _ALIKE_SHARE = 0.03, 0.1
 """Two matched points lie as far apart in both views, to so many metres plus this share."""
 
 
-@settings_class(frozen=True)
+@tuning_class(frozen=True)
 class RegistrationSettings:
-    """When matches agree with a pose."""
+    """Numbers of registering two views by their matches."""
 
     max_hamming: int = setting(64, 0, 256, "bits")
-    """The largest distance of two descriptors that match, of 256."""
+    """Largest distance of two matching descriptors, of 256 bits."""
     hypotheses: int = setting(400, 1, 10**5)
-    """Triples of matches that are tried."""
+    """Triples of matches tried."""
     reprojection: float = setting(2.5, 0.01, 1e3, "px")
-    """Inlier distance in pixels of a 320-pixel-wide image."""
+    """Inlier distance in a 320-pixel-wide image."""
     depth_constant: float = setting(0.025, 1e-4, 10, "m")
-    """Constant part of the inlier distance in depth, constant + square z^2: three standard deviations of two
-    structured-light measurements, and a feature's reach."""
+    """Constant part of the inlier distance in depth, constant + square z^2."""
     depth_square: float = setting(0.008, 0, 10, "1/m")
-    """Square part of the inlier distance in depth, see `depth_constant`."""
+    """Quadratic part of the inlier distance in depth, constant + square z^2."""
 
 
 @dataclass(frozen=True)

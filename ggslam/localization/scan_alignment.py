@@ -21,7 +21,7 @@ from ggslam.localization.localizer import ANY_NORMAL
 from ggslam.localization.surface import SCAN_TARGET, Surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import orthonormalize, se3_exp, separation, transform_points
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.scan_points import ScanSettings, scan_points
@@ -52,20 +52,24 @@ _AROUND = (0.5, -0.5)
 """Shares of the reach by which further starts lie beside the guess, along two directions on the ground."""
 
 
+@tuning_class(frozen=True)
+class SearchTuning:
+    """Numbers of the search for a pose."""
+
+    turn_deg: float = setting(12.0, 0, 180, "deg")
+    """Initial poses turned by this angle either way about the vertical are tried too."""
+    voxel: float = setting(1.0, 1e-3, 100, "m")
+    """One point is used per cube of this edge in the search."""
+    min_structure: float = setting(0.42, 0, 1)
+    """Least share of matches among the points that constrain the weakest direction of motion."""
+
+
 @settings_class(frozen=True)
-class SearchSettings:
-    """How a scan is located whose start pose is far off: the first one, and those that were lost."""
+class SearchSettings(SearchTuning):
+    """How a scan is located whose initial pose is far off: the first one, and those that were lost."""
 
     reach: float = setting(2.4, 0, 100, "m")
-    """Edge of the widest voxels: starts so far off converge mostly. 0: no search."""
-    turn_deg: float = setting(12.0, 0, 180, "deg")
-    """Starts turned by this either way about the ground's normal are tried, too."""
-    voxel: float = setting(1.0, 1e-3, 100, "m")
-    """Of the points in a cube with this edge one is used, until the map's own voxels take over."""
-    min_structure: float = setting(0.42, 0, 1)
-    """Share that must match of the points that tell one place from another along the least seen direction of motion
-    (matched to surfaces across it, or not matched), unless nearly all points match, which makes the pose
-    degenerate."""
+    """Largest distance, roughly, from which a search converges; 0: no search."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from ggslam.localization.level import about_z, between, floor_height, level_axes
 from ggslam.localization.surface import Surface
 from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.submaps.settings import GridAxes
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus
 
 _TURNS_DEG = np.arange(-9.0, 10.0, 3.0)
@@ -52,30 +52,36 @@ _RING = np.radians(0.5)
 _NO_FLOOR = "the scan shows no floor (the sensor's z axis has to point up)"
 
 
-@settings_class(frozen=True)
-class ScanLookUpSettings:
-    """How a scan is looked up, and when what was found is believed."""
+@tuning_class(frozen=True)
+class ScanLookUpTuning:
+    """Numbers of looking a scan up in a whole map."""
 
     candidates: int = setting(10, 1, 1000)
-    """Places that are tried, the likeliest first."""
+    """Places tried, the likeliest first."""
     more: int = setting(4, 0, 1000)
-    """After one that matches well so many are tried, to see whether another does, too."""
+    """Places tried after one that matches well."""
     apart: float = setting(1.5, 0, 1e4, "m")
-    """Of places nearer to each other with about the same azimuth the likeliest is tried."""
-    min_fit: float = setting(0.55, 0, 1)
-    """Share of what stands upright in the scan that lies on surfaces of the map."""
+    """Of places closer than this with about the same heading the likeliest is tried."""
     max_through: float = setting(0.15, 0, 1)
-    """Share of the map's surfaces in view that the scan may look through."""
+    """Largest share of the map's surfaces in view that the scan may look through."""
     margin: float = setting(0.05, 0, 1)
-    """The score of a pose, its fit times what is not looked through, is this much above every other one's."""
+    """Least lead of the best pose's score over every other."""
     margin_missing: float = setting(0.4, 0, 10)
-    """And this much times what the score is short of 1: what does not match here may be as it is elsewhere."""
+    """Factor on what the score lacks to 1, added to `margin`."""
     min_structure: int = setting(40, 0, 10**6)
-    """Squares of half a metre, seen from above, that what stands upright in the scan takes up at least."""
+    """Least number of half-metre squares, from above, with upright structure."""
     few: int = setting(8, 0, 1000)
-    """With fewer places to compare with a map tells little of how much a scan matches elsewhere."""
+    """With fewer places `few_fit` applies."""
     few_fit: float = setting(0.75, 0, 1)
-    """Then this much of what stands upright must lie on surfaces of the map."""
+    """Least share of upright structure on surfaces of the map if there are few places."""
+
+
+@settings_class(frozen=True)
+class ScanLookUpSettings(ScanLookUpTuning):
+    """How a scan is looked up in the whole map and when the result is accepted."""
+
+    min_fit: float = setting(0.55, 0, 1)
+    """Least share of the upright structure of a scan that lies on surfaces of the map."""
 
 
 @dataclass(frozen=True)

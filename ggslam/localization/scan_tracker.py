@@ -14,7 +14,7 @@ from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.surface import Surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, orthonormalize
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget
 from ggslam.tracking.scan_points import ScanSettings
 from ggslam.tracking.settings import AlignSettings
@@ -26,9 +26,17 @@ _DOUBTFUL = 2.5
 of points under which it counts as not seen: the ends of voxels and noise tell that much along a plain corridor."""
 
 
+@tuning_class(frozen=True)
+class ScanTrackerTuning:
+    """Numbers of locating scans."""
+
+    min_counted: int = setting(200, 6, 10**6)
+    """A scan is lost if the map can contain fewer of its points."""
+
+
 @settings_class(frozen=True)
-class ScanTrackerSettings:
-    """How scans are located."""
+class ScanTrackerSettings(ScanTrackerTuning):
+    """How laser scans are located."""
 
     scan: ScanSettings = field(default_factory=ScanSettings)
     """Which of their points are used."""
@@ -39,9 +47,7 @@ class ScanTrackerSettings:
     search: SearchSettings = field(default_factory=SearchSettings)
     """How a scan is located whose start is far off."""
     min_overlap: float = setting(0.5, 0, 0.9)
-    """Under this share of points that match, of those that the map can contain, the scan is lost."""
-    min_counted: int = setting(200, 6, 10**6)
-    """Points that the map can contain; with fewer the scan is lost."""
+    """A scan is lost if less than this share of the points that the map can contain matches it."""
 
 
 class ScanTracker:

@@ -17,31 +17,28 @@ import numpy as np
 
 from ggslam.system.array_forms import Form, Points64, check_indices
 from ggslam.system.savable import savable
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, tuning_class
 
 _SHARE = 8
 """Of the active keyframes so small a part is put aside at least: the cost of gathering the others goes with them."""
 
 
-@settings_class(frozen=True)
+@tuning_class(frozen=True)
 class ActivitySettings:
-    """When keyframes are put aside and taken back."""
+    """Numbers of the set of active keyframes, whose points are tracked against."""
 
     forget_after: float = setting(5.0, 0, 1e6)
-    """A keyframe is put aside when the camera has travelled this many times the median depth since it looked at the
-    keyframe's surface last."""
+    """A keyframe is deactivated after the camera has travelled this many times the median depth since it last saw its
+    surface."""
     near: float = setting(1.0, 0, 1e3)
-    """The camera looks at a keyframe's surface if the middles of what both see are nearer than this many times the
-    mean of their median depths."""
+    """A keyframe's surface is seen if the centres of both views lie within this many times the mean of their median
+    depths."""
     batch: int = setting(8, 1, 10**6)
-    """Keyframes are put aside so many at a time, or an eighth of the active ones where that is more: each time the
-    surface is gathered anew."""
+    """Keyframes deactivated together, or an eighth of the active ones if that is more."""
     spread: int = setting(3, 0, 10**6)
-    """A keyframe near the camera is taken back if one of so many before or after it is active: neighbours in time lie
-    right to each other."""
+    """A keyframe near the camera is reactivated if one of this many before or after it is active."""
     most: int = setting(400, 8, 10**6)
-    """So many keyframes are active at most, and an eighth more until some are put aside together: a camera that walks
-    the same way again and again needs no more of them, and gathering their surface takes no longer in a long run."""
+    """Maximum number of active keyframes; an eighth more until some are deactivated together."""
 
 
 @savable(not_saved="settings", check="check")

@@ -16,30 +16,32 @@ import numpy as np
 from ggslam.scene.poses import so3_log
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
+
+
+@tuning_class(frozen=True)
+class RevisitTuning:
+    """Numbers of the comparison of keyframes with older active ones."""
+
+    gap: int = setting(15, 1, 10**6, "keyframes")
+    """Least distance in keyframes to an older one."""
+    least_way: float = setting(1.0, 0, 1e6)
+    """Least way of the camera since the last comparison, as a multiple of the median depth; a turn by one radian counts
+    as 1 m."""
+    near: float = setting(0.6, 0, 1e3)
+    """Both cameras and both view centres lie within this many times the mean of the median depths."""
+    turned: float = setting(40.0, 0, 180, "deg")
+    """Largest angle between the viewing directions."""
+    min_witnesses: int = setting(8, 3, 10**5)
+    """Matches that must agree with an expected pose."""
 
 
 @settings_class(frozen=True)
-class RevisitSettings:
-    """When keyframes are compared with old ones that the tracker relies on as well."""
+class RevisitSettings(RevisitTuning):
+    """When keyframes are compared with older ones that are still tracked against."""
 
     enabled: bool = setting(True)
-    """Whether they are."""
-    gap: int = setting(15, 1, 10**6, "keyframes")
-    """Old are those so many keyframes ago."""
-    least_way: float = setting(1.0, 0, 1e6)
-    """And those from which the camera has gone this many times the median depth since they were compared; a turn by
-    one radian counts as a metre."""
-    near: float = setting(0.6, 0, 1e3)
-    """And those that saw about the same: both cameras, and what lies in the middle of their images, are nearer than
-    this many times the mean of the median depths."""
-    turned: float = setting(40.0, 0, 180, "deg")
-    """And in about the same direction."""
-    rest: int = setting(0, 0, 10**6, "keyframes")
-    """After a comparison that failed, so many keyframes are compared with none."""
-    min_witnesses: int = setting(8, 3, 10**5)
-    """Feature matches that agree with a pose which is expected already: that of the tracker, or one moved by a
-    correction that waits to be confirmed."""
+    """Compare keyframes with older ones that are still tracked against, and correct the drift between them."""
 
 
 @savable(not_saved="settings")
@@ -77,8 +79,8 @@ class Revisits:
         self._tied_at[old] = max(self._tied_at[old], self._way[new])
 
     def pause(self) -> None:
-        """The newest keyframe was compared in vain."""
-        self._rests_until = len(self._way) + self.settings.rest
+        """The newest keyframe was compared in vain, and is not compared again."""
+        self._rests_until = len(self._way)
 
     def candidates(self, median_depth_m: float) -> np.ndarray:
         """Numbers of the keyframes that the newest is worth to be compared with, rising."""

@@ -6,57 +6,62 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Literal
 
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
 
 
-@settings_class(frozen=True)
+@tuning_class(frozen=True)
 class NeighbourSettings:
-    """The 3-D regularisation: a Gaussian's class distribution shall be like those of its nearest neighbours."""
+    """Numbers of the 3-D regularisation: similar class distributions of neighbouring Gaussians."""
 
     weight: float = setting(1.0, 0, 1e6)
-    """l_obj3d. 0: none."""
+    """Weight l_obj3d; 0: none."""
     value: float = setting(2.0, 0, 1e6)
-    """l_val: L_obj3d = (l_val / C) mean KL(P_j || Q_j)."""
+    """Factor l_val of L_obj3d = (l_val / C) mean KL(P_j || Q_j)."""
     every: int = setting(5, 1, 10**6)
     """In every n-th identity step."""
     samples: int = setting(400, 1, 10**6)
     """Gaussians drawn each time."""
     neighbours: int = setting(5, 1, 100)
-    """Nearest Gaussians that each is compared with."""
+    """Nearest Gaussians compared with each."""
     growth: float = setting(0.2, 0, 1e6)
-    """The index of neighbours is built anew when the map has grown by this share, or when Gaussians were removed."""
+    """The index of neighbours is rebuilt when the map has grown by this share or lost Gaussians."""
 
 
-@settings_class(frozen=True)
-class IdentitySettings:
-    """How the Gaussians learn which object they belong to."""
+@tuning_class(frozen=True)
+class IdentityTuning:
+    """Numbers of learning objects."""
 
-    enabled: bool = setting(True, basic=True)
-    """Learn objects when there are masks, or segments to be had (`masks.source`)."""
-    schedule: Literal["sampled", "dense", "votes"] = "sampled"
-    """sampled: cross-entropy on sampled pixels of the view that is rendered for its colours anyway; dense: on all
-    pixels of rendered identity images, as published; votes: count only, learn nothing."""
     every: int = setting(7, 1, 10**6)
-    """An identity step in every n-th mapping iteration."""
-    final_passes: int = setting(4, 0, 10**4)
-    """After the last frame all keyframes are visited so many times more for identity alone, with falling steps: what
-    was inserted last has hardly been trained by then."""
+    """An identity step in every n-th training step."""
     pixels: int = setting(2048, 1, 10**7)
     """Pixels sampled in a step."""
     balance: float = setting(0.5, 0, 1)
-    """An object of n pixels gets a share of the sample that goes with n^(1 - balance): 0 as they come, 1 all alike."""
+    """Shares of objects in a sample, from 0 (by area) to 1 (all equal)."""
     boundary: float = setting(0.5, 0, 1)
-    """Share of the sample that is drawn at the boundaries of objects."""
+    """Share of the sample taken at boundaries of objects."""
     detach: bool = True
-    """Identity gradients do not reach geometry and opacity. False needs the dense schedule."""
+    """Keep gradients of identity from geometry and opacity; false needs the dense schedule."""
     initialisation: Literal["votes", "random"] = "votes"
-    """votes: a new Gaussian begins with the code of the object it was first seen on; random: (uniform - 0.5) / C0."""
+    """votes: a new Gaussian starts with the code of the object it is seen on; random: (uniform - 0.5) / C0."""
     rate: float = setting(0.05, 0, 10)
-    """Adam's step for identity vectors."""
+    """Adam's step of identity vectors."""
     classifier_rate: float = setting(5e-4, 0, 10)
-    """Adam's step for the classifier."""
+    """Adam's step of the classifier."""
     weight: float = setting(0.1, 0, 1e6)
-    """l_obj, weight of the cross-entropy beside colour and depth."""
+    """Weight l_obj of the cross-entropy against colour and depth."""
     min_confidence: float = setting(0.5, 0, 1)
-    """A Gaussian whose most probable object is less probable belongs to none."""
+    """A Gaussian belongs to no object if its most probable object is less probable than this."""
+
+
+@settings_class(frozen=True)
+class IdentitySettings(IdentityTuning):
+    """How Gaussians learn which object they belong to."""
+
+    enabled: bool = setting(True, basic=True)
+    """Learn objects from masks (`masks.source`)."""
+    schedule: Literal["sampled", "dense", "votes"] = "sampled"
+    """How identities are learned. sampled: on sampled pixels of views rendered for colour anyway; dense: on all pixels
+    of rendered identity images, as published; votes: by counting, without training."""
+    final_passes: int = setting(4, 0, 10**4)
+    """Passes over all keyframes after the last frame that train identities only."""
     neighbours: NeighbourSettings = field(default_factory=NeighbourSettings)

@@ -534,7 +534,8 @@ class Mapper(ABC):
         r = self.settings.rates
         young = r.young_factor
         decay = (1 / young) ** (1 / max(1, r.young_updates)) if young > 1 else 1.0
-        rates = {name: rate_factor * getattr(r, name) * (young if name in _YOUNG else 1) for name in ADAM_GROUPS}
+        trained = [name for name in ADAM_GROUPS if name != "features"]
+        rates = {name: rate_factor * getattr(r, name) * (young if name in _YOUNG else 1) for name in trained}
         if self.pixel_m > 0:
             rates["means"] = min(rates["means"], rate_factor * r.means_px * self.pixel_m)
         if self.identity is not None:

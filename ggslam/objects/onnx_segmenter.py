@@ -12,34 +12,40 @@ from ggslam.errors import ConfigError, MissingDependency
 from ggslam.objects.mask_painting import distinct_masks, paint_segments
 from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Letterbox, MaskCandidates, mask_candidates, yolo_candidates
 from ggslam.system.foreign import open_foreign
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
 
 IMAGENET_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
 IMAGENET_DEVIATION = np.array((0.229, 0.224, 0.225), np.float32)
 _INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
+@tuning_class(frozen=True)
+class OnnxSegmenterTuning:
+    """Numbers of running a segmentation model."""
+
+    overlap: float = setting(0.7, 0, 1)
+    """Of two masks with a larger intersection over union the one with the lower score is dropped."""
+    min_area: float = setting(5e-4, 0, 1)
+    """Segments below this share of the image are dropped."""
+    max_masks: int = setting(300, 1, 65535)
+    """Masks of the highest scores that are used."""
+    threads: int = setting(0, 0, 1024)
+    """Threads of the model; 0: chosen by onnxruntime."""
+
+
 @settings_class(frozen=True)
-class OnnxSegmenterSettings:
-    """How a model is fed and which of its masks are believed."""
+class OnnxSegmenterSettings(OnnxSegmenterTuning):
+    """How a segmentation model is run and which of its masks are used."""
 
     detection_score: float = setting(0.25, 0, 1)
-    """Lowest class score of a detection (YOLO family)."""
+    """Least class score of a detection (YOLO family)."""
     mask_quality: float = setting(0.7, 0, 1)
-    """Lowest score of a mask (SAM family: the intersection over union that the model predicts for it)."""
-    overlap: float = setting(0.7, 0, 1)
-    """Of two masks whose intersection over union is above this, the one with the lower score goes."""
-    min_area: float = setting(5e-4, 0, 1)
-    """Segments smaller than this share of the image are left out."""
-    max_masks: int = setting(300, 1, 65535)
-    """So many masks of the highest scores are looked at."""
+    """Least predicted intersection over union of a mask (SAM family)."""
     input_size: int = setting(640, 32, 8192, "px")
-    """Width and height of the model's input in pixels, if the model leaves them open."""
+    """Width and height of the model's input if the model does not fix them."""
     pixels: Literal["unit", "imagenet"] = "unit"
-    """What a model with real numbers as input expects: values from 0 to 1, or these less ImageNet's mean, divided by
-    its standard deviation."""
-    threads: int = setting(0, 0, 1024)
-    """Threads of the model; 0: as many as onnxruntime likes."""
+    """Input of a model that takes real numbers. unit: values from 0 to 1; imagenet: those normalised by ImageNet's mean
+    and standard deviation."""
 
 
 class OnnxSegmenter:

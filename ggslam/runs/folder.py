@@ -8,7 +8,7 @@
     map_cells.json   of a run whose memory was limited: which rows of map.ply lie in which cell
     points.ply       coloured points of the surface, metres; points_grid.ply: the same in integer grid cells
     places.npz       what another recording needs to start in this map
-    config.yaml      all settings; sequence.json: where the recording was and how it was read
+    config.yaml      the settings; sequence.json: where the recording was and how it was read
     timing.json      seconds by part; steps.csv: the same, memory, Gaussians and losses step by step
     metrics.json     scores; renders/: pictures; report.html: all of it to look at; ground_truth.txt: true poses for it
     verdict.json     how good the run is, told by its own figures

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every setting in one typed tree. Presets are YAML files in configs/; unknown names and impossible values are refused.
 
-The settings of a part are declared beside the part (`ggslam/tracking`, `ggslam/mapping`), see
-`ggslam/system/settings.py`; `Config` puts them together.
+Public settings are what users turn; the others are internal tuning, see `ggslam/system/settings.py`. The settings of a
+part are declared beside the part (`ggslam/tracking`, `ggslam/mapping`); `Config` puts them together.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import field
 from importlib import resources
 from pathlib import Path
@@ -28,7 +28,7 @@ from ggslam.system.atomic import write_text
 from ggslam.system.foreign import given_path, read_foreign_text
 from ggslam.system.overrides import with_overrides
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import changed_tuning, setting, settings_class, tuning_class, tuning_note, walk
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.settings import TrackerSettings
@@ -42,19 +42,29 @@ class OldNameWarning(FutureWarning):
     """A setting was given by the name that it had in an earlier version."""
 
 
+@tuning_class(frozen=True)
+class EvaluationTuning:
+    """Which frames are held out."""
+
+    held_out_offset: int = setting(4, 0, 10**9, "frames")
+    """First held-out frame, modulo `held_out_every`; the first keyframe is never held out."""
+
+
 @settings_class(frozen=True)
-class EvaluationSettings:
-    """What is kept away from training, so that it can be scored honestly."""
+class EvaluationSettings(EvaluationTuning):
+    """Frames that are held out from training, to score the map on views it has not seen."""
 
     held_out_every: int = setting(8, 0, 10**9, "frames", basic=True)
-    """Every n-th frame is tracked but never a keyframe and never trained on; 0: none."""
-    held_out_offset: int = setting(4, 0, 10**9, "frames")
-    """The first frame held out, modulo `held_out_every`; the first keyframe never is."""
+    """Every n-th frame is tracked but never becomes a keyframe and is never trained on; 0: none."""
 
     def is_held_out(self, frame_index: int) -> bool:
         """Whether the frame is kept for scoring."""
         every = self.held_out_every
         return every > 0 and frame_index % every == self.held_out_offset % every
+
+
+RETIRED = ("loops.revisits.rest", "mapping.rates.features")
+"""Internal numbers that earlier versions had and that changed no run; files and overrides may still name them."""
 
 
 @settings_class(frozen=True)
@@ -64,25 +74,26 @@ class Config:
     is_root: ClassVar[bool] = True
     """Errors name settings by their path from here."""
     seed: int = setting(0, 0, 2**63 - 1, basic=True)
-    """Of every random draw. A synchronous run on one machine repeats bit for bit."""
+    """Seed of every random draw. A synchronous run on one machine repeats bit for bit."""
     threads: int = setting(0, 0, 1024, basic=True)
-    """Threads of the compiled core; 0: the processors this process may use."""
+    """Threads of the compiled core; 0: all processors this process may use."""
     device: Literal["auto", "cpu", "cuda"] = setting("cpu", basic=True)
-    """Where map and keyframes are kept, trained and tracked: cuda: an NVIDIA GPU (compiled by nvcc when first used);
-    auto: that if it can be had and memory is not limited, else cpu."""
+    """Where the map and its keyframes are stored, trained and tracked. cuda: an NVIDIA GPU (nvcc compiles the kernels
+    on first use); auto: the GPU if there is one and `memory_limit_mb` is 0, else the CPU."""
     sh_degree: int = setting(0, 0, 3, basic=True)
-    """Spherical-harmonic degree of the colours."""
+    """Degree of the spherical harmonics that describe a Gaussian's colour; 0: one colour from all sides."""
     tracker: Literal["gicp", "edges_planes"] = setting("gicp", basic=True)
-    """gicp: G-ICP against the keyframes' points; edges_planes: edges and planes in a budget of time, and G-ICP where
-    they do not convince."""
+    """How frames are located. gicp: G-ICP against the points of the keyframes; edges_planes: edges and planes within a
+    time budget per frame, and G-ICP where they fail."""
     realtime_fps: float = setting(0.0, 0, 1e4, "frames/s", basic=True)
-    """0: synchronous. Otherwise frames arrive at this rate like from a camera; tracker and mapper run side by side."""
+    """0: process every frame in turn. Otherwise frames arrive at this rate, as from a camera, and tracker and mapper
+    run in parallel."""
     refine_iterations: int = setting(-1, -1, 10**7, basic=True)
-    """Optimisation steps after the last frame, see `mapping.average_last`; 0: none; -1: 1.2 for each one before and
-    ten for each keyframe at least, which gains two decibels (0.4 at a camera's pace; 0.7 on a GPU and where memory is
-    limited)."""
+    """Training steps after the last frame; 0: none. -1: automatic: 1.2 x the steps so far, at least 10 per keyframe
+    (0.4 x in real time, 0.7 x on a GPU or with a memory limit). Gains about 2 dB."""
     memory_limit_mb: float = setting(0.0, 0, 1e9, "MB", basic=True)
-    """Resident memory of the run: what does not fit of map and keyframes is kept on disk; 0: no limit."""
+    """Resident memory the run may use: parts of the map and keyframe images that do not fit are moved to disk. 0: no
+    limit."""
     tracking: TrackerSettings = field(default_factory=TrackerSettings)
     edges_planes: FeatureTrackerSettings = field(default_factory=FeatureTrackerSettings)
     keyframes: KeyframeSettings = field(default_factory=KeyframeSettings)
@@ -110,7 +121,7 @@ def _plain(value: Any) -> Any:
 
 
 def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config:
-    """The settings from nested dictionaries; what is not named keeps its default.
+    """The settings from nested dictionaries; what is not named keeps its default, and retired names are skipped.
 
     Raises:
         ConfigError: an unknown name (the nearest known one is suggested) or a value of the wrong type or range.
@@ -119,6 +130,8 @@ def config_from_dict(values: dict[str, Any], origin: str = "settings") -> Config
         raise ConfigError(f"{origin}: top level: expected names with values, found {values!r}")
     if unnamed := [name for name in values if not isinstance(name, str)]:
         raise ConfigError(f"{origin}: unknown setting {unnamed[0]}")
+    if retired := _find_retired(values):
+        values = _without(set(retired), values)
     try:
         return Config(**with_new_names(values)[0])
     except ConfigError as error:
@@ -161,18 +174,45 @@ def load_config(preset_or_file: str | Path | None = None, overrides: Sequence[st
     Raises:
         ConfigError: naming the file and the setting.
     """
-    values: dict[str, Any] = {}
-    origin = "settings"
+    values, origin = _read_preset(preset_or_file)
     if preset_or_file is not None:
-        path = given_path(preset_or_file, ConfigError)
-        if not path.suffix and str(preset_or_file) in presets():
-            path = presets()[str(preset_or_file)]
-        values, origin = _read_yaml(path), str(path)
         config_from_dict(values, origin)
     with_overrides(overrides, values)
     for said in with_new_names(values)[1]:
         warnings.warn(said, OldNameWarning, stacklevel=2)
     return config_from_dict(values, "`overrides`" if overrides else origin)
+
+
+def settings_notes(
+    config: Config, preset_or_file: str | Path | None = None, overrides: Sequence[str] | None = None
+) -> list[str]:
+    """What a user is told of settings that were given to `load_config`: internal ones, and those without effect."""
+    retired = _find_retired(with_overrides(overrides, _read_preset(preset_or_file)[0]))
+    notes = [tuning_note(config), f"has no effect any more: {', '.join(retired)}" if retired else ""]
+    return [note for note in notes if note]
+
+
+def _find_retired(values: dict[str, Any]) -> list[str]:
+    """Retired names among nested settings."""
+    found = []
+    for path in RETIRED:
+        *groups, name = path.split(".")
+        inner: Any = values
+        for group in groups:
+            inner = inner.get(group) if isinstance(inner, dict) else None
+        if isinstance(inner, dict) and name in inner:
+            found.append(path)
+    return found
+
+
+def _read_preset(preset_or_file: str | Path | None) -> tuple[dict[str, Any], str]:
+    """What a preset or file says, and its place."""
+    if preset_or_file is None:
+        return {}, "settings"
+    path = given_path(preset_or_file, ConfigError)
+    if not path.suffix and str(preset_or_file) in presets():
+        path = presets()[str(preset_or_file)]
+    return _read_yaml(path), str(path)
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
@@ -186,5 +226,16 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def save_config(config: Config, path: Path) -> None:
-    """Writes all settings, defaults included, as YAML."""
-    write_text(path, yaml.safe_dump(config_to_dict(config), sort_keys=False))
+    """Writes the public settings, defaults included, and the internal ones that differ from their defaults, as YAML."""
+    left_out = {one.path for one in walk(Config) if one.internal} - set(changed_tuning(config))
+    write_text(path, yaml.safe_dump(_without(left_out, config_to_dict(config)), sort_keys=False))
+
+
+def _without(paths: Set[str], values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings less some; groups that become empty go, too."""
+    kept: dict[str, Any] = {}
+    for name, value in values.items():
+        inner = _without(paths, value, f"{prefix}{name}.") if isinstance(value, dict) else value
+        if prefix + name not in paths and inner != {}:
+            kept[name] = inner
+    return kept

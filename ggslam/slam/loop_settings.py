@@ -8,29 +8,36 @@ from dataclasses import field
 from ggslam.loops.activity import ActivitySettings
 from ggslam.loops.revisits import RevisitSettings
 from ggslam.loops.settings import GraphSettings, PlaceSettings, VerificationSettings
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
 
 
-@settings_class(frozen=True)
-class LoopSettings:
-    """When loops are looked for, and when they are believed."""
+@tuning_class(frozen=True)
+class LoopTuning:
+    """Numbers of loop closing."""
 
-    enabled: bool = setting(True, basic=True)
-    """Whether loops are closed and lost frames are looked up among all keyframes."""
     candidates: int = setting(3, 1, 1000)
-    """Old keyframes that are tried for a new one, and for a frame that is lost, the likeliest first."""
-    confirmations: int = setting(2, 1, 100)
-    """A loop is closed when so many keyframes in a row have found the same correction."""
+    """Old keyframes tried for a new keyframe or a lost frame, the likeliest first."""
     confirmation_gap: int = setting(5, 1, 10**6, "keyframes")
-    """In a row: no more than so many keyframes apart."""
+    """Largest distance between keyframes that confirm the same correction."""
     agreement_m: float = setting(0.05, 0, 1e3, "m")
-    """Two corrections are the same if they move the camera to places nearer than this and within `agreement_deg`."""
+    """Two corrections agree if they move the camera to positions within this distance and `agreement_deg`."""
     agreement_deg: float = setting(2.0, 0, 180, "deg")
-    """Two corrections are the same if they turn the camera to directions nearer than this and within `agreement_m`."""
+    """Two corrections agree if they turn the camera to within this angle and `agreement_m`."""
     neighbourhood: int = setting(3, 0, 1000, "keyframes")
     """Keyframes before and after an old one whose points make its local map."""
     repair_iterations: int = setting(40, 0, 10**6)
-    """Optimisation steps after a closure, on the keyframes at both of its ends."""
+    """Training steps after a closure, on the keyframes at both ends of the loop."""
+
+
+@settings_class(frozen=True)
+class LoopSettings(LoopTuning):
+    """When loops are searched for and when they are accepted."""
+
+    enabled: bool = setting(True, basic=True)
+    """Close loops, and relocate lost frames among all keyframes."""
+    confirmations: int = setting(2, 1, 100)
+    """Consecutive keyframes that must find the same correction before a loop is closed. More reject false loops, but
+    close true ones later."""
     activity: ActivitySettings = field(default_factory=ActivitySettings)
     revisits: RevisitSettings = field(default_factory=RevisitSettings)
     places: PlaceSettings = field(default_factory=PlaceSettings)

@@ -24,33 +24,37 @@ from ggslam.objects.table import Observation, Supervision
 from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.frame import Frame
 from ggslam.system.savable import savable
-from ggslam.system.settings import Conflict, setting, settings_class
+from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
 
 _LARGE = 160
 """Gaussians of an object that one look is enough for, if it had no chance of more."""
 Source = Literal["auto", "recording", "geometry", "model", "none"]
 
 
+@tuning_class(frozen=True)
+class MaskTuning:
+    """Numbers of object masks."""
+
+    min_repeat: float = setting(0.35, 0, 1)
+    """Objects found on a smaller share of the segmented keyframes that show their place are dropped as noise."""
+    min_gaussians: int = setting(8, 0, 10**9)
+    """Objects with fewer Gaussians are dropped as noise."""
+
+
 @settings_class(frozen=True)
-class MaskSettings:
-    """Where object masks come from and what is done to them."""
+class MaskSettings(MaskTuning):
+    """Where object masks come from."""
 
     source: Source = setting("auto", basic=True)
-    """auto: `model` if one is named, else the recording's masks if it has any, else geometry; none: no objects."""
+    """auto: the model if `masks.model` is given, else the recording's masks if it has any, else geometry. none: no
+    objects."""
     model: str = setting("", basic=True)
-    """ONNX file of a segmentation model (YOLO-seg or SAM family); needs the extra [masks]."""
+    """ONNX file of a segmentation model (YOLO-seg or SAM family). Needs the extra [masks]."""
     every: int = setting(6, 1, 10**6)
-    """Frames that a segmenter lets pass at least: a fast camera's keyframes come sooner, and all the map gets labels
-    from those that are segmented."""
+    """Minimum gap, in frames, between two segmented frames."""
     min_views: int = setting(3, 1, 10**6)
-    """Objects that a segmenter or association found on fewer keyframes are noise, but for those of 160 Gaussians
-    or more that were found whenever they could be. Runs of less than ten keyframes for each of these views ask for
-    less."""
-    min_repeat: float = setting(0.35, 0, 1)
-    """Objects that a segmenter or association found on a smaller share of the segmented keyframes that show their place
-    are noise, too."""
-    min_gaussians: int = setting(8, 0, 10**9)
-    """Objects with fewer Gaussians that a segmenter or association found are noise, too."""
+    """Objects found on fewer keyframes are dropped as noise, except those of 160 Gaussians or more that were found
+    wherever they could be. Runs of less than ten keyframes per view ask for less."""
     cleaning: CleaningSettings = field(default_factory=CleaningSettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
     geometry: GeometricSettings = field(default_factory=GeometricSettings)

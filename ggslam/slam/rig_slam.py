@@ -78,5 +78,5 @@ def _loops_for(cameras: int, loops: LoopSettings) -> LoopSettings:
     return replace(
         loops, confirmation_gap=n * loops.confirmation_gap, neighbourhood=min(1000, n * loops.neighbourhood),
         activity=replace(activity, batch=n * activity.batch, spread=n * activity.spread, most=n * activity.most),
-        revisits=replace(revisits, gap=n * revisits.gap, rest=n * revisits.rest),
+        revisits=replace(revisits, gap=n * revisits.gap),
     )  # fmt: skip

@@ -3,29 +3,33 @@
 
 from __future__ import annotations
 
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
+
+
+@tuning_class(frozen=True)
+class PagingTuning:
+    """Numbers of moving parts of the map to disk."""
+
+    cell: float = setting(2.0, 0.1, 1e4, "m")
+    """Edge of the cells that move to disk together."""
+    keep_radius: float = setting(3.0, 0, 1e6, "m")
+    """Cells with centres closer to the camera than this stay in memory."""
+    view_range: float = setting(12.0, 0.1, 1e6, "m")
+    """Cells farther from the camera than this are not rendered."""
+    view_margin: float = setting(1.1, 1, 100)
+    """A tile of a view needs the map up to its deepest measurement times this plus `view_spare`."""
+    view_spare: float = setting(0.3, 0, 1e6, "m")
+    """Depth added to what `view_margin` allows."""
+    images: float = setting(0.25, 0.01, 0.9)
+    """Share of the budget for keyframe images and points."""
+    slack: float = setting(0.1, 0, 0.9)
+    """Share of the Gaussians' budget that is freed beyond need."""
 
 
 @settings_class(frozen=True)
-class PagingSettings:
-    """How a run keeps to its memory limit. Without a limit (`memory_limit_mb` 0) none of this has any effect."""
+class PagingSettings(PagingTuning):
+    """How a run keeps to `memory_limit_mb`; without a limit none of this has an effect."""
 
-    cell: float = setting(2.0, 0.1, 1e4, "m")
-    """Edge of the cells that Gaussians move to disk by; finer cells follow the view more closely."""
-    keep_radius: float = setting(3.0, 0, 1e6, "m")
-    """Cells whose centres are nearer to the camera than this stay in memory, seen or not."""
-    view_range: float = setting(12.0, 0.1, 1e6, "m")
-    """Farther than this from the camera the map is not needed to render a view."""
-    view_margin: float = setting(1.1, 1, 100)
-    """A part of the view (a tile of the image) needs the map up to the deepest that was measured in it times this, and
-    `view_spare`."""
-    view_spare: float = setting(0.3, 0, 1e6, "m")
-    """Added to what `view_margin` allows. Gaussians behind what is measured are hidden by what lies before them; where
-    nothing was measured, nothing is trained but colour."""
     budget_mb: float = setting(0.0, 0, 1e9, "MB")
-    """What map and keyframe images may take; 0: the memory limit less what the program itself was measured to need.
-    With a number of one's own, a run repeats bit for bit; measured ones differ a little between runs."""
-    images: float = setting(0.25, 0.01, 0.9)
-    """Share of the budget for the images and points of keyframes; the last used ones are kept in it."""
-    slack: float = setting(0.1, 0, 0.9)
-    """When Gaussians must go, this share of their budget is freed beyond need, so that it does not happen each time."""
+    """Memory for map and keyframe images; 0: automatic: `memory_limit_mb` minus the measured use of the program. With a
+    fixed budget a run repeats bit for bit."""

@@ -1,14 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """How settings are declared: once, with range, unit, level and text, and checked whenever a value is given.
 
+    @tuning_class(frozen=True)
+    class PhotometricTuning:
+        \"\"\"Numbers of the photometric alignment.\"\"\"
+
+        surface_sigma: float = setting(0.002, 1e-5, 1, "m")
+        \"\"\"Least noise of the geometry at 1 m.\"\"\"
+
     @settings_class(frozen=True)
-    class PhotometricSettings:
+    class PhotometricSettings(PhotometricTuning):
         \"\"\"The photometric part of the alignment.\"\"\"
 
-        shrink: int = setting(2, 1, 16)
-        \"\"\"Images are this many times smaller.\"\"\"
-        surface_sigma: float = setting(0.002, 1e-5, 1, "m")
-        \"\"\"Noise of the geometry at 1 m, at least.\"\"\"
+        mode: Literal["never", "auto"] = "auto"
+        \"\"\"When grey values are used.\"\"\"
+
+Fields of a settings class are public: what a user turns, documented and kept. Fields of a tuning class are internal:
+help and docs do not list them and a later version may drop them. Both are given and checked in the same way.
 
 Such a class is a frozen dataclass that pydantic checks: the constructor, `dataclasses.replace` and the file of settings
 refuse the same values with the same sentence. The string below a field is its text. Checks of several fields together
@@ -38,6 +46,8 @@ T = TypeVar("T")
 _UNKNOWN = "unknown setting"
 _DECLARATION = "ggslam"
 """Key of the declaration in a field's metadata."""
+_INTERNAL = "__internal_fields__"
+"""Attribute of a tuning class: names of its fields."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +87,15 @@ class Conflict(ValueError):
 
 if TYPE_CHECKING:
     from dataclasses import dataclass as settings_class
+    from dataclasses import dataclass as tuning_class
 else:
 
     def settings_class(*, frozen: Literal[True]) -> Callable[[type[T]], type[T]]:
         """Makes a class a frozen dataclass whose values are checked against their declarations.
 
         Wrong values raise ConfigError, which names class and field (the dotted path alone, if the class has a true
-        `is_root`). Dictionaries become the settings classes that they stand for.
+        `is_root`). Dictionaries become the settings classes that they stand for; what they do not name keeps the
+        default that it has in this class.
         """
 
         def declare(kind: type[T]) -> type[T]:
@@ -98,7 +110,7 @@ else:
                     return make(self)
                 import pydantic_core
 
-                validator = _validator(checked)
+                validator, values = _validator(checked), _on_defaults(checked, values)
                 try:
                     validator.validate_python(pydantic_core.ArgsKwargs(arguments, values), self_instance=self)
                 except pydantic_core.ValidationError as error:
@@ -111,6 +123,43 @@ else:
             return checked
 
         return declare
+
+    def tuning_class(*, frozen: Literal[True]) -> Callable[[type[T]], type[T]]:
+        """Makes a settings class whose own fields are internal; a settings class may inherit from it."""
+
+        def declare(kind: type[T]) -> type[T]:
+            made = settings_class(frozen=frozen)(kind)
+            setattr(made, _INTERNAL, frozenset(inspect.get_annotations(kind)) | internal_fields(made))
+            return made
+
+        return declare
+
+
+def internal_fields(kind: type) -> frozenset[str]:
+    """Names of the fields of a class that come from tuning classes."""
+    return frozenset().union(*(vars(base).get(_INTERNAL, ()) for base in kind.__mro__))
+
+
+def _on_defaults(kind: type, values: dict[str, Any]) -> dict[str, Any]:
+    """Values in which each group that is given as a dictionary is completed by its defaults in `kind`, which may differ
+    from those of the group's class."""
+    factories = {field.name: field.default_factory for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    complete = dict(values)
+    for name, given in values.items():
+        factory = factories.get(name, dataclasses.MISSING)
+        usual = None if factory is dataclasses.MISSING else factory()
+        if isinstance(given, dict) and dataclasses.is_dataclass(usual):
+            complete[name] = _on_group(usual, given)
+    return complete
+
+
+def _on_group(usual: Any, given: dict[str, Any]) -> dict[str, Any]:
+    complete = {field.name: getattr(usual, field.name) for field in dataclasses.fields(usual)}
+    for name, value in given.items():
+        group = complete.get(name)
+        is_group = isinstance(value, dict) and dataclasses.is_dataclass(group)
+        complete[name] = _on_group(group, value) if is_group else value
+    return complete
 
 
 @functools.cache
@@ -146,11 +195,12 @@ def _unknown(path: list[Any], kind: type) -> str:
     for name in path[:-1]:
         kind = group_of(typing.get_type_hints(kind)[name]) or kind
     prefix, name = "".join(f"{part}." for part in path[:-1]), str(path[-1])
-    known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
+    hidden = internal_fields(kind)
+    known = [field.name for field in dataclasses.fields(kind) if field.name not in hidden]  # type: ignore[arg-type]
     longer = sorted((k for k in known if len(name) > 3 and k.startswith(name)), key=len)
     near = longer or difflib.get_close_matches(name, known, 1)
     hint = f"did you mean {prefix}{near[0]}?" if near else f"known: {', '.join(prefix + k for k in known)}"
-    return f"{_UNKNOWN} {prefix}{name}; {hint}"
+    return f"{_UNKNOWN} {prefix}{name}" + f"; {hint}" * bool(known)
 
 
 def _values_at(path: list[Any], kind: type) -> str:
@@ -171,6 +221,7 @@ class Known:
         default: its default in the settings that were walked.
         text: what it does, one line.
         declaration: its range, unit and level.
+        internal: whether it is tuning, which help and docs do not list.
     """
 
     path: str
@@ -178,6 +229,7 @@ class Known:
     default: Any
     text: str
     declaration: Declaration
+    internal: bool = False
 
     @property
     def choices(self) -> tuple[Any, ...]:
@@ -217,7 +269,7 @@ def group_of(kind: Any) -> type | None:
 
 
 def walk(kind: type, values: Any = None, prefix: str = "") -> Iterator[Known]:
-    """All settings of a class and of the groups in it, in their order.
+    """All settings of a class and of the groups in it, internal ones among them, in their order.
 
     Args:
         kind: the class.
@@ -225,23 +277,54 @@ def walk(kind: type, values: Any = None, prefix: str = "") -> Iterator[Known]:
         prefix: of the paths.
     """
     values = kind() if values is None else values
-    types, texts = typing.get_type_hints(kind), texts_of(kind)
+    types, texts, hidden = typing.get_type_hints(kind), texts_of(kind), internal_fields(kind)
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]
         path, value, declared = prefix + field.name, getattr(values, field.name), types[field.name]
         group = group_of(declared)
         if not dataclasses.is_dataclass(value):
             declaration = field.metadata.get(_DECLARATION, Declaration())
-            yield Known(path, declared, value, texts.get(field.name, ""), declaration)
+            yield Known(path, declared, value, texts.get(field.name, ""), declaration, field.name in hidden)
         if group is not None:
             yield from walk(group, value, f"{path}.")
 
 
+def walk_public(kind: type) -> list[Known]:
+    """The settings that users turn, see `walk`."""
+    return [one for one in walk(kind) if not one.internal]
+
+
+def changed_tuning(settings: Any) -> list[str]:
+    """Paths of the internal settings that differ from the defaults."""
+    kind = type(settings)
+    usual = {one.path: one.default for one in walk(kind)}
+    return [one.path for one in walk(kind, settings) if one.internal and one.default != usual.get(one.path)]
+
+
+def tuning_note(settings: Any) -> str:
+    """What a user is told who has changed internal settings; empty: there are none."""
+    if not (names := changed_tuning(settings)):
+        return ""
+    which, it = ("an internal setting", "it") if len(names) == 1 else ("internal settings", "them")
+    return f"{which}, used as given, but a later version may drop {it}: {', '.join(names)}"
+
+
 @functools.cache
 def texts_of(kind: type) -> Mapping[str, str]:
-    """What the string below each field of a class says, by the field's name; one line each."""
+    """What the string below each field of a class, or of one that it inherits from, says, by the field's name; one line
+    each."""
+    texts: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        if dataclasses.is_dataclass(base):
+            texts |= _own_texts(base)
+    return texts
+
+
+@functools.cache
+def _own_texts(kind: type) -> Mapping[str, str]:
     body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
     assert isinstance(body, ast.ClassDef)
-    texts, name = {}, ""
+    texts: dict[str, str] = {}
+    name = ""
     for node in body.body:
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
             if name:

@@ -11,7 +11,7 @@ import numpy as np
 from ggslam.scene.poses import separation
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
-from ggslam.system.settings import setting, settings_class
+from ggslam.system.settings import setting, settings_class, tuning_class
 
 
 class LocatedFrame(Protocol):
@@ -41,21 +41,27 @@ class KeyframeKind(enum.Enum):
     """Enough frames or motion since the last keyframe: the mapper wants the view."""
 
 
+@tuning_class(frozen=True)
+class KeyframeTuning:
+    """Numbers of the choice of keyframes."""
+
+    min_gap: int = setting(2, 0, 10**6, "frames")
+    """Least distance of such a keyframe to the last one, unless overlap falls below 3/4 of `min_overlap`."""
+
+
 @settings_class(frozen=True)
-class KeyframeSettings:
-    """Limits. What counts as overlap already scales with depth noise (`AlignSettings.overlap_*`), motion with depth."""
+class KeyframeSettings(KeyframeTuning):
+    """When a frame becomes a keyframe."""
 
     min_overlap: float = setting(0.8, 0, 1)
-    """A tracking keyframe is made when less of the frame than this matches the target."""
-    min_gap: int = setting(2, 0, 10**6, "frames")
-    """Tracking keyframes come at least this many frames after the last keyframe unless overlap falls under 3/4 of the
-    limit: where part of every frame matches nothing (clutter at the depth camera's edge), each frame would be one."""
+    """A frame becomes a keyframe if less than this share of its points matches the surface tracked against."""
     max_gap: int = setting(5, 1, 10**9, "frames")
-    """A mapping keyframe is made after this many frames without a keyframe."""
+    """A frame becomes a keyframe at the latest after this many frames without one. 4 instead of 5 gains 0.1 to 0.3 dB
+    for a quarter more keyframes."""
     max_translation: float = setting(0.1, 0, 1e9)
-    """A mapping keyframe is made after a motion of this many times the median depth."""
+    """A frame becomes a keyframe after a motion of this many times the median depth."""
     max_rotation_deg: float = setting(10.0, 0, 360, "deg")
-    """A mapping keyframe is also made after a turn by this."""
+    """A frame becomes a keyframe after a turn by this angle."""
 
 
 @savable(not_saved="settings")

@@ -15,14 +15,14 @@ counts the distance to the plane."""
 
 @settings_class(frozen=True)
 class ScanSettings:
-    """How points are taken from a scan."""
+    """How points are sampled from a scan."""
 
     voxel: float = setting(0.2, 1e-3, 100, "m")
-    """Of the points in a cube with this edge one is used; near surfaces then count no more than far ones."""
+    """One point is used per cube of this edge, so that near surfaces count no more than far ones."""
     nearest: float = setting(0.3, 0, 1e4, "m")
-    """Nearer points are not used."""
+    """Nearer points are ignored."""
     farthest: float = setting(60.0, 1e-3, 1e6, "m")
-    """Farther points are not used."""
+    """Farther points are ignored."""
 
     def __post_init__(self) -> None:
         if self.nearest >= self.farthest:

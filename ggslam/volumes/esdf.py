@@ -31,10 +31,10 @@ _MOST_VOXELS = 2000
 
 @settings_class(frozen=True)
 class FieldSettings:
-    """What the distance field holds."""
+    """The Euclidean distance field."""
 
     max_distance: float = setting(2.0, 1e-3, 100, "m")
-    """Distances are computed up to this; farther voxels have this distance and no gradient."""
+    """Largest distance computed; farther voxels have this distance and no gradient."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from ggslam.system.settings import Conflict, setting, settings_class
+from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
 
 
 def log_odds(probability: float) -> float:
@@ -15,26 +15,31 @@ def log_odds(probability: float) -> float:
     return float(np.float32(math.log(probability / (1.0 - probability))))
 
 
-@settings_class(frozen=True)
-class OccupancySettings:
-    """How a scan changes the map. The probabilities are OctoMap's by default (Hornung et al., "OctoMap", Autonomous
-    Robots 2013)."""
+@tuning_class(frozen=True)
+class OccupancyTuning:
+    """Numbers of an occupancy map."""
 
     probability_hit: float = setting(0.7, 0.501, 0.999)
-    """Occupancy that one scan with a point in the voxel speaks for."""
+    """Occupancy of a voxel that contains a point, from one scan alone."""
     probability_miss: float = setting(0.4, 0.001, 0.499)
-    """Occupancy that one scan whose rays pass the voxel speaks for."""
+    """Occupancy of a voxel that a ray passes, from one scan alone."""
     probability_minimum: float = setting(0.1192, 0.001, 0.499)
-    """Clamping: a voxel is never more sure to be free than this, so that the map can follow a change in few scans."""
+    """Lower bound of a voxel's occupancy, so that changes show within a few scans."""
     probability_maximum: float = setting(0.971, 0.501, 0.999)
-    """Clamping: nor more sure to be occupied than this."""
-    probability_occupied: float = setting(0.5, 0.001, 0.999)
-    """A voxel is occupied from this probability on."""
+    """Upper bound of a voxel's occupancy, so that changes show within a few scans."""
     quantize: bool = True
-    """One ray per occupied voxel, to its centre. False: one per point, OctoMap's plain update."""
+    """Cast one ray per occupied voxel instead of one per point."""
     last_voxel: bool = True
-    """Rays that are cut at the range free the voxel they end in, too, if they go on behind it. OctoMap leaves that
-    voxel as it is (False), so that what was once seen there stays for ever."""
+    """Rays cut at the range free the voxel they end in; false as in OctoMap."""
+
+
+@settings_class(frozen=True)
+class OccupancySettings(OccupancyTuning):
+    """How a scan updates the occupancy map. The probabilities are OctoMap's (Hornung et al., "OctoMap", Autonomous
+    Robots 2013)."""
+
+    probability_occupied: float = setting(0.5, 0.001, 0.999)
+    """A voxel counts as occupied from this probability on."""
 
     def __post_init__(self) -> None:
         if not self.probability_minimum <= self.probability_occupied <= self.probability_maximum:

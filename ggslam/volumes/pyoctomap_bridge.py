@@ -63,8 +63,9 @@ def from_octomap(tree: Any, context: NativeContext | None = None, quantize: bool
         FormatError: the tree cannot be read.
     """
     settings = OccupancySettings(
-        tree.getProbHit(), tree.getProbMiss(), tree.getClampingThresMin(), tree.getClampingThresMax(),
-        tree.getOccupancyThres(), quantize, last_voxel=False,
+        probability_hit=tree.getProbHit(), probability_miss=tree.getProbMiss(),
+        probability_minimum=tree.getClampingThresMin(), probability_maximum=tree.getClampingThresMax(),
+        probability_occupied=tree.getOccupancyThres(), quantize=quantize, last_voxel=False,
     )  # fmt: skip
     if tree.size() == 0:
         return OccupancyMap(tree.getResolution(), settings, context)

@@ -6,41 +6,44 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ggslam.geometry.scene_size import voxel_times
-from ggslam.system.settings import Conflict, setting, settings_class
+from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
 
 _LARGEST_VOXEL, _FARTHEST, _LEAST_MAX_WEIGHT, _LEAST_FREE_WEIGHT = 1.0, 1000.0, 1.0, 0.1
 
 
+@tuning_class(frozen=True)
+class TsdfTuning:
+    """Numbers of fusing depth."""
+
+    max_weight: float = setting(16.0, _LEAST_MAX_WEIGHT, 1000)
+    """Largest weight of a voxel, in measurements from 1 m."""
+    max_free_weight: float = setting(1.0, _LEAST_FREE_WEIGHT, 1000)
+    """Largest weight of a voxel in free space, small so that new things appear soon."""
+    free_share: float = setting(0.9, 0.1, 1)
+    """An empty block is free if all depth lies behind it and this share of its pixels has depth."""
+    edge_voxels: float = setting(2.0, 0.1, 100, "voxels")
+    """Depth is not interpolated over an edge of more than this many voxels and 2 % of the depth."""
+    clearing: float = setting(0.5, 0, 0.99)
+    """Share of its weight that a voxel loses each time depth clearly looks through it: removed things vanish within a
+    few frames; 0: they are averaged away."""
+    decay: float = setting(0.95, 0.01, 1)
+    """Factor on all weights per decay, see `decay_every`."""
+
+
 @settings_class(frozen=True)
-class TsdfSettings:
+class TsdfSettings(TsdfTuning):
     """How depth is fused."""
 
     voxel: float = setting(0.02, 1e-3, _LARGEST_VOXEL, "m", basic=True)
-    """Edge of a voxel; unless set, larger in scenes larger than rooms (median depth above 6 m)."""
+    """Edge of a voxel; half of it makes four times as many near surfaces. The default grows in scenes larger than rooms
+    (median depth above 6 m)."""
     truncation_voxels: float = setting(4.0, 2, 32, "voxels")
-    """Distances are kept up to this many voxels on either side of a surface."""
-    max_weight: float = setting(16.0, _LEAST_MAX_WEIGHT, 1000)
-    """A voxel's weight grows to this at most, in measurements from 1 m: how many of them new ones are averaged with."""
-    max_free_weight: float = setting(1.0, _LEAST_FREE_WEIGHT, 1000)
-    """The same for voxels of free space, so that what appears in it is taken over soon."""
+    """Distances are stored up to this many voxels on both sides of a surface."""
     min_depth: float = setting(0.1, 0, 100, "m")
-    """Nearer depth is not fused."""
+    """Nearer depth is ignored."""
     max_depth: float = setting(7.0, 0.1, _FARTHEST, "m", basic=True)
-    """Farther depth makes no surface: all before it is free, up to this far. Unless set, farther in scenes larger than
+    """Farther depth makes no surface but frees the space up to this range. The default grows in scenes larger than
     rooms."""
-    free_share: float = setting(0.9, 0.1, 1)
-    """A block without voxels becomes free throughout if all depth seen through it lies behind it, and at least this
-    share of its pixels have depth. Else it gets voxels, if it is not known yet, until all of them were seen."""
-    edge_voxels: float = setting(2.0, 0.1, 100, "voxels")
-    """Where the four pixels around a projected voxel differ by more than this many voxels and 2 % of the depth, the
-    nearest of them is taken instead of interpolating across the edge."""
-    clearing: float = setting(0.5, 0, 0.99)
-    """A voxel that depth now passes by more than the truncation, and by more than half of it farther than the voxel's
-    distance tells, loses this share of its weight first, so that what was taken away goes in a few frames. Where not
-    all pixels around pass it by 3 % of the depth more, depth and pose may be at fault instead: the measurement counts
-    3 % of the voxel's weight at most. 0: it is outvoted frame by frame."""
-    decay: float = setting(0.95, 0.01, 1)
-    """Weights are multiplied by this at every call of `TsdfMap.decay`."""
 
     def __post_init__(self) -> None:
         if self.min_depth >= self.max_depth:

@@ -44,7 +44,7 @@ def tsdf_to_bytes(tsdf: TsdfMap) -> bytes:
     order = np.lexsort(blocks.coordinates.T)
     coordinates, dense = blocks.coordinates[order], blocks.dense[order]
     voxels = tsdf.read(coordinates[dense])
-    names = [field.name for field in dataclasses.fields(TsdfSettings)]
+    names = sorted(field.name for field in dataclasses.fields(TsdfSettings))
     place = {_ORIGIN: tsdf.origin} if tsdf.origin.any() else {}
     return arrays_to_bytes(
         version=np.array(_VERSION),

@@ -86,13 +86,16 @@ def length(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return (node.end_lineno or node.lineno) - start + 1
 
 
-def settings_without_range() -> tuple[int, list[str]]:
-    """How many settings there are, and those whose number is not bounded or whose text is missing."""
+def settings() -> tuple[list[str], list[str], list[str]]:
+    """Paths of the public settings, of the internal ones, and of those whose number has no range or whose text is
+    missing."""
+    from ggslam.jobs.localize.settings import LocalizeSettings
     from ggslam.slam.config import Config
     from ggslam.system.settings import walk
 
-    known = list(walk(Config))
-    return len(known), [one.path for one in known if not one.text or (one.is_number and not one.range())]
+    known = list({one.path: one for kind in (LocalizeSettings, Config) for one in walk(kind)}.values())
+    public, internal = ([one.path for one in known if one.internal is internal] for internal in (False, True))
+    return public, internal, [one.path for one in known if not one.text or (one.is_number and not one.range())]
 
 
 def raw_json_reads() -> list[str]:
@@ -131,13 +134,15 @@ def main() -> None:
     for floor in plan.FLOORS:
         print("  ".join(f"{room} {rooms[room]}" for room in sorted(floor)))
     found = list(functions())
-    count, unbounded = settings_without_range()
+    public, internal, unbounded = settings()
     counted = {
         "imports that run up": upward_imports(),
         "circles": circles(),
         "modules at the root": sorted(path.name for path in PACKAGE.glob("*.py")),
         f"functions over {LONGEST} lines": [place for place, node in found if length(node) > LONGEST],
-        f"settings without a range, of {count}": unbounded,
+        "settings, public": public,
+        "settings, internal": internal,
+        "settings without a range": unbounded,
         "functions named by a bare participle": [place for place, node in found if is_bare_participle(node.name)],
         "raw read_json outside records": raw_json_reads(),
         "files read past the door": strays()[0],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes docs/settings.md: every setting with its default, range and meaning, as the settings classes declare them.
+"""Writes docs/settings.md: every public setting with its default, range and meaning, as its class declares them.
 
     python scripts/tools/make_settings_reference.py            # writes the page
     python scripts/tools/make_settings_reference.py --check    # exit code 1 if the page is not up to date
@@ -16,7 +16,7 @@ from typing import Any
 
 from ggslam.jobs.localize.settings import LocalizeSettings
 from ggslam.slam.config import Config, presets
-from ggslam.system.settings import Known, group_of, walk
+from ggslam.system.settings import Known, group_of, walk_public
 
 PAGE = Path(__file__).parents[2] / "docs" / "settings.md"
 
@@ -39,9 +39,15 @@ refine_iterations: 1000
 ```
 
 Names that do not exist and values out of their range are refused before a run begins, with their path:
-`tracking.photometric.shrink: expected 1 to 16, found 0`. Every run writes all settings, with their values, to
-`config.yaml` in its folder. `ggslam run --help-settings` prints the table below, `--help-setting all` every setting,
+`tracking.points.count: expected 50 to 1000000, found 0`. Every run writes its settings to `config.yaml` in its folder.
+`ggslam run --help-settings` prints the settings worth knowing first, `--help-setting all` all of this page,
 `--help-setting depth` those with "depth" in their names. In Python: `Config(mapping={{"iterations_per_frame": 8}})`.
+
+The settings worth knowing first are {basic}.
+
+Besides these {count} settings there are internal numbers, declared as *tuning* beside the code that uses them.
+`python scripts/benchmarks/bench_sensitivity.py` measures what they change. A YAML file or `--set` may name them, too;
+the run then notes that a later version may drop them. `config.yaml` lists those that differ from their defaults.
 """
 
 
@@ -108,11 +114,11 @@ def sections(kind: type, known: list[Known]) -> list[str]:
 
 def page() -> str:
     """The whole page."""
-    known = list(walk(Config))
-    stored = [one for one in walk(LocalizeSettings) if not one.path.startswith("tracking.")]
-    parts = [_INTRODUCTION.format(presets=", ".join(f"`{name}`" for name in presets()))]
-    parts += ["## The ones to know", "", table(one for one in known if one.declaration.basic)]
-    parts += ["Those below are for experts, all of them by their groups.", ""]
+    known = walk_public(Config)
+    stored = [one for one in walk_public(LocalizeSettings) if not one.path.startswith("tracking.")]
+    basic = ", ".join(f"`{one.path}`" for one in known if one.declaration.basic)
+    names = ", ".join(f"`{name}`" for name in presets())
+    parts = [_INTRODUCTION.format(presets=names, basic=basic, count=len(known) + len(stored))]
     parts += sections(Config, known)
     parts += [_STORED, *sections(LocalizeSettings, stored)]
     return "\n".join(parts)

@@ -11,7 +11,7 @@ STEP = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 def walked(steps: int, step: np.ndarray = STEP, **settings: float) -> Revisits:
     """A camera that made so many keyframes, ten centimetres apart."""
-    revisits = Revisits(RevisitSettings(**{"gap": 5, "least_way": 0.95, "rest": 2, **settings}))
+    revisits = Revisits(RevisitSettings(**{"gap": 5, "least_way": 0.95, **settings}))
     for _ in range(steps):
         revisits.add(step)
     return revisits
@@ -39,10 +39,10 @@ def test_what_was_compared_is_near() -> None:
     assert revisits.candidates(1.0).tolist() == [4, 5, 6, 7, 8, 9, 10]  # about the middle of the way from 0 to 14
 
 
-def test_after_a_failure_there_is_rest() -> None:
+def test_what_was_compared_in_vain_is_not_compared_again() -> None:
     revisits = walked(14)
+    assert len(revisits.candidates(1.0)) > 0
     revisits.pause()
     assert revisits.candidates(1.0).tolist() == []
-    for expected in (0, 0, 7):
-        revisits.add(STEP)
-        assert len(revisits.candidates(1.0)) == expected
+    revisits.add(STEP)
+    assert len(revisits.candidates(1.0)) > 0

@@ -27,8 +27,11 @@ SETTINGS = {
     "no colour without depth": LossSettings(no_depth_weight=0.0),
     "some colour without depth": LossSettings(no_depth_weight=0.3, dssim_weight=0.5),
     "opacity": LossSettings(opacity_weight=0.7),
-    "all": LossSettings(0.4, 2.0, "normalised", 0.1, "charbonnier", 0.02, 0.6, 0.3),
-}
+    "all": LossSettings(
+        dssim_weight=0.4, depth_weight=2.0, depth_kind="normalised", minimum_alpha=0.1, color_kind="charbonnier",
+        charbonnier_epsilon=0.02, no_depth_weight=0.6, opacity_weight=0.3,
+    ),
+}  # fmt: skip
 SIZES = [(37, 53), (7, 9), (1, 1), (130, 33), (64, 64), (11, 200)]
 
 

@@ -43,8 +43,11 @@ LOSSES = {
     "charbonnier": LossSettings(color_kind="charbonnier", charbonnier_epsilon=0.01, dssim_weight=0.0),
     "normalised depth": LossSettings(depth_kind="normalised", minimum_alpha=0.3),
     "no colour without depth": LossSettings(no_depth_weight=0.0),
-    "all": LossSettings(0.4, 2.0, "normalised", 0.1, "charbonnier", 0.02, 0.6, 0.3),
-}
+    "all": LossSettings(
+        dssim_weight=0.4, depth_weight=2.0, depth_kind="normalised", minimum_alpha=0.1, color_kind="charbonnier",
+        charbonnier_epsilon=0.02, no_depth_weight=0.6, opacity_weight=0.3,
+    ),
+}  # fmt: skip
 
 
 # --- image loss -----------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import yaml
 
 from ggslam.errors import ConfigError
 from ggslam.slam.config import (
+    RETIRED,
     Config,
     OldNameWarning,
     config_from_dict,
@@ -16,7 +18,9 @@ from ggslam.slam.config import (
     load_config,
     presets,
     save_config,
+    settings_notes,
 )
+from ggslam.system.settings import walk_public
 
 
 def test_round_trip_through_yaml(tmp_path: Path) -> None:
@@ -25,6 +29,37 @@ def test_round_trip_through_yaml(tmp_path: Path) -> None:
     again = load_config(tmp_path / "config.yaml")
     assert again == config
     assert again.seed == 7 and again.mapping.insertion.opacity == 0.25 and again.tracking.points.count == 4000
+
+
+def test_a_file_holds_public_settings_and_changed_internal_ones(tmp_path: Path) -> None:
+    config = load_config(None, ["tracking.align.min_matches=77", "loops.graph.turn_length=2.5"])
+    save_config(config, tmp_path / "config.yaml")
+    assert load_config(tmp_path / "config.yaml") == config
+    written = leaves(yaml.safe_load((tmp_path / "config.yaml").read_text()))
+    public = {one.path for one in walk_public(Config) if not one.path.startswith("tracking.noise.")}
+    assert written.keys() == public | {"tracking.align.min_matches", "loops.graph.turn_length"}
+
+
+def test_files_with_all_settings_are_read(tmp_path: Path) -> None:
+    config = load_config(None, ["mapping.rates.beta1=0.8"])
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config_to_dict(config)))
+    assert load_config(tmp_path / "config.yaml") == config
+
+
+def test_retired_names_are_read_and_told_of(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("loops: {revisits: {rest: 3}, confirmations: 4}")
+    overrides = ["mapping.rates.features=0.5", "mapping.rates.beta1=0.8"]
+    config = load_config(mine, overrides)
+    usual = Config()
+    assert config.loops == dataclasses.replace(usual.loops, confirmations=4)
+    assert config.mapping.rates == dataclasses.replace(usual.mapping.rates, beta1=0.8)
+    internal, retired = settings_notes(config, mine, overrides)
+    assert "mapping.rates.beta1" in internal and "features" not in internal
+    assert all(name in retired for name in RETIRED)
+    assert settings_notes(load_config("fast-cpu"), "fast-cpu") == []
+    with pytest.raises(ConfigError):
+        load_config(None, ["loops.revisits.rests=3"])
 
 
 def test_defaults_survive_the_dictionary() -> None:

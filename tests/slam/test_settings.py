@@ -16,20 +16,28 @@ import yaml
 
 from ggslam.coding.settings import AttributeSettings, CodecSettings
 from ggslam.errors import ConfigError
+from ggslam.jobs.localize.settings import LocalizeSettings
 from ggslam.localization.frames import LookUpSettings
-from ggslam.localization.scan_tracker import ScanTrackerSettings
 from ggslam.objects.inpainting import InpaintSettings
 from ggslam.objects.membership import MembershipSettings
 from ggslam.slam.config import Config, config_to_dict, load_config
-from ggslam.submaps.settings import SubmapSettings
 from ggslam.synthetic.world_scanner import Scanner
-from ggslam.system.settings import Known, walk
+from ggslam.system.settings import (
+    Known,
+    changed_tuning,
+    setting,
+    settings_class,
+    tuning_class,
+    tuning_note,
+    walk,
+    walk_public,
+)
 from ggslam.tracking.settings import DepthNoise, PhotometricSettings
 from ggslam.volumes.safety import Braking
 
 OTHERS = (
-    AttributeSettings, CodecSettings, LookUpSettings, ScanTrackerSettings, InpaintSettings, MembershipSettings,
-    SubmapSettings, Scanner, Braking,
+    AttributeSettings, CodecSettings, LookUpSettings, LocalizeSettings, InpaintSettings, MembershipSettings, Scanner,
+    Braking,
 )  # fmt: skip
 """Settings classes that are not in `Config`."""
 ALL = [(kind, one) for kind in (Config, *OTHERS) for one in walk(kind)]
@@ -62,9 +70,78 @@ def beyond(one: Known) -> list[float]:
     return [math.nextafter(low, -math.inf), math.nextafter(high, math.inf), math.nan, math.inf, -math.inf]
 
 
-def test_how_many_there_are() -> None:
-    assert sum(kind is Config for kind, _ in ALL) > 280
-    assert 15 <= sum(one.declaration.basic for _, one in ALL) <= 25
+def test_few_of_them_are_public() -> None:
+    public = {one.path for kind in (Config, LocalizeSettings) for one in walk_public(kind)}
+    assert 60 <= len(public) <= 90
+    basic = {one.path for _, one in ALL if one.declaration.basic}
+    assert 15 <= len(basic) <= 25 and basic <= public
+
+
+@settings_class(frozen=True)
+class Inner:
+    """A group."""
+
+    depth: float = setting(1.0, 0, 10, "m")
+    """Depth of the group."""
+    width: float = setting(2.0, 0, 10, "m")
+    """Width of the group."""
+
+
+@tuning_class(frozen=True)
+class OuterTuning:
+    """Internal numbers."""
+
+    hidden: int = setting(3, 0, 10)
+    """An internal number."""
+    group: Inner = dataclasses.field(default_factory=lambda: Inner(depth=5.0))
+
+
+@settings_class(frozen=True)
+class Outer(OuterTuning):
+    """Settings with internal numbers."""
+
+    shown: int = setting(4, 0, 10)
+    """A public number."""
+
+
+def test_settings_inherit_their_tuning() -> None:
+    outer = dataclasses.replace(Outer(shown=1), hidden=7)
+    assert (outer.shown, outer.hidden, outer.group) == (1, 7, Inner(5.0, 2.0))
+    assert [one.path for one in walk(Outer) if one.internal] == ["hidden"]
+    assert {one.path: one.text for one in walk(Outer)}["hidden"] == "An internal number."
+    assert changed_tuning(outer) == ["hidden"] and tuning_note(Outer(shown=1)) == ""
+    with pytest.raises(ConfigError):
+        Outer(hidden=11)
+
+
+def test_a_group_keeps_the_defaults_of_the_whole() -> None:
+    assert Outer(group={"width": 9.0}).group == Inner(5.0, 9.0)  # type: ignore[arg-type]
+    given = load_config(None, ["mapping.loss.dssim_weight=0.1", "volumes.occupancy.probability_occupied=0.6"])
+    usual = Config()
+    assert given.mapping.loss == dataclasses.replace(usual.mapping.loss, dssim_weight=0.1)
+    assert given.volumes.occupancy == dataclasses.replace(usual.volumes.occupancy, probability_occupied=0.6)
+
+
+def test_internal_settings_are_given_and_told_of() -> None:
+    told = 0
+    for one in walk(Config):
+        if not one.internal or not one.is_number:
+            continue
+        value = one.declaration.high if one.default != one.declaration.high else one.declaration.low
+        try:
+            config = build(Config, one.path, value)
+        except ConfigError:
+            continue  # contradicts another one
+        assert changed_tuning(config) == [one.path] and one.path in tuning_note(config)
+        told += 1
+    assert told > 200
+
+
+def test_unknown_names_are_answered_by_public_ones() -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(None, ["tracking.points.min_neighbour=0.5"])
+    hint = str(caught.value).partition(";")[2]
+    assert "tracking.points.min_neighbours" not in hint
 
 
 @pytest.mark.parametrize("pair", ALL, ids=name)
@@ -87,7 +164,7 @@ def test_each_number_has_a_range_that_holds(pair: tuple[type, Known]) -> None:
     for value in beyond(one):
         with pytest.raises(ConfigError) as caught:
             build(kind, one.path, value)
-        path = one.path if kind is Config else f"{kind.__name__}.{one.path}"
+        path = one.path if getattr(kind, "is_root", False) else f"{kind.__name__}.{one.path}"
         assert str(caught.value) == f"{path}: expected {one.range()}, found {value}"
 
 
@@ -133,7 +210,8 @@ def test_groups_are_made_from_dictionaries() -> None:
             {"mapping": {"iterations": 3}},
             "unknown setting mapping.iterations; did you mean mapping.iterations_per_frame?",
         ),
-        ({"loops": {"places": {"fern": 3}}}, "unknown setting loops.places.fern; did you mean loops.places.ferns?"),
+        ({"loops": {"confirmation": 3}}, "unknown setting loops.confirmation; did you mean loops.confirmations?"),
+        ({"loops": {"places": {"fern": 3}}}, "unknown setting loops.places.fern"),
         ({"loops": 3}, "loops: expected names with values, found 3"),
         ({"seed": 2.5}, "seed: expected a whole number, 0 to 9223372036854775807, found 2.5"),
         (

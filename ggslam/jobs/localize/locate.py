@@ -43,6 +43,7 @@ from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.settings import tuning_note
 from ggslam.tracking.settings import TargetSettings
 
 GIVEN = "given"
@@ -103,6 +104,8 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     if request.start_pose is not None and request.no_start_pose:
         raise ConfigError("`start_pose` and `no_start_pose`: one of them")
     chosen = localize_settings(request.overrides)
+    if note := tuning_note(chosen.settings):
+        observer.note(note)
     out = request.out or Path("localized") / request.sequence.path.resolve().name
     with ExitStack() as opened:
         recording = _open_recording(request)

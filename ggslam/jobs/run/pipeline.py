@@ -36,7 +36,7 @@ from ggslam.sequences import Sequence
 from ggslam.sequences.live import LiveSequence
 from ggslam.sequences.rig import RigSequence
 from ggslam.sequences.verdicts import Verdict
-from ggslam.slam.config import Config, load_config
+from ggslam.slam.config import Config, load_config, settings_notes
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import reason_against_saving
 from ggslam.system.folder_lock import folder_lock
@@ -128,6 +128,8 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     if earlier is not None and out.resolve() in ancestors(earlier):
         raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
     observer = observer or SilentObserver()
+    for note in settings_notes(config, request.config, request.overrides):
+        observer.note(note)
     verdicts = check_depth(sequence, observer) if request.check else None
     folder = RunFolder.create(out, overwrite=request.overwrite)
     with stop_on_request() as stop, folder_lock(folder.path):

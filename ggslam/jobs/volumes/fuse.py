@@ -21,7 +21,7 @@ from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, Surface,
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
-from ggslam.slam.config import Config, config_to_dict, load_config
+from ggslam.slam.config import Config, config_to_dict, load_config, settings_notes
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.opencv import opencv_errors
@@ -152,6 +152,8 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     is_run = (request.source / MARKER).is_file()
     _check(request, is_run)
     config = _config(request)
+    for note in [] if request.live else settings_notes(config, request.config, request.overrides):
+        observer.note(note)  # a live run tells of them itself
     onto = None if request.onto is None else load_tsdf(request.onto)
     maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
     source: FrameSource | None = None
