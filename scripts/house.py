@@ -78,6 +78,27 @@ def circles() -> list[str]:
     return []
 
 
+ONLY_FOR_USERS = {"ggslam.volumes.raycast"}
+"""Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it."""
+
+
+def unused_modules() -> list[str]:
+    """Modules that are reached neither from the command line nor from the public face: tests may need them, users do
+    not."""
+    seen: set[str] = set()
+    pending = ["ggslam.__main__", "ggslam", *ONLY_FOR_USERS]
+    while pending:
+        name = pending.pop()
+        if name not in seen:
+            seen.add(name)
+            pending += [other for other in plan.imports(name) if other in plan.modules()]
+            pending += [name.rpartition(".")[0]] if "." in name else []  # a package is loaded before its modules
+            nodes = ast.walk(ast.parse(plan.modules()[name].read_text()))
+            texts = [node.value for node in nodes if isinstance(node, ast.Constant)]
+            pending += [text for text in texts if text in plan.modules()]  # started as a process of its own
+    return sorted(set(plan.modules()) - seen)
+
+
 def length(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """Lines of a function without its docstring."""
     body = node.body
@@ -135,6 +156,7 @@ def main() -> None:
     counted = {
         "imports that run up": upward_imports(),
         "circles": circles(),
+        "modules that nothing uses": unused_modules(),
         "modules at the root": sorted(path.name for path in PACKAGE.glob("*.py")),
         f"functions over {LONGEST} lines": [place for place, node in found if length(node) > LONGEST],
         f"settings without a range, of {count}": unbounded,

@@ -6,6 +6,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 import house  # noqa: E402
 
@@ -19,6 +21,12 @@ def test_functions_are_short_and_well_named() -> None:
 def test_records_are_read_by_records_and_settings_have_ranges() -> None:
     assert house.raw_json_reads() == []
     assert house.settings_without_range()[1] == []
+
+
+def test_every_module_serves_a_command_or_the_public_face(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert house.unused_modules() == []
+    monkeypatch.setattr(house, "ONLY_FOR_USERS", set())
+    assert "ggslam.volumes.raycast" in house.unused_modules()
 
 
 def test_it_knows_what_it_looks_for() -> None:

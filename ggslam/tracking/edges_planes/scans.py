@@ -166,18 +166,6 @@ def plain_features(planes: Tensor, edges: Tensor, plane_sigmas: Tensor, edge_sig
     )
 
 
-def split_features(
-    planes: np.ndarray, edges: np.ndarray, noise: DepthNoise, device: torch.device | str = "cpu"
-) -> ScanFeatures:
-    """Features of a scan that is already split: points on planes [P, 3] and on edges [E, 3], metres."""
-    p, e = (torch.from_numpy(np.ascontiguousarray(a, np.float32)).to(device) for a in (planes, edges))
-
-    def sigmas(points: Tensor) -> Tensor:
-        return noise.constant + noise.square * points.square().sum(1)
-
-    return plain_features(p, e, sigmas(p), sigmas(e))
-
-
 class _PixelLines:
     """Rows and, after them, columns of an image as scan lines of one length; short ones end in missing points."""
 
