@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import yaml
+from worlds.scanner import Scanner
 
 from ggslam.coding.settings import AttributeSettings, CodecSettings
 from ggslam.errors import ConfigError
@@ -22,7 +23,6 @@ from ggslam.objects.inpainting import InpaintSettings
 from ggslam.objects.membership import MembershipSettings
 from ggslam.slam.config import Config, config_to_dict, load_config
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.synthetic.world_scanner import Scanner
 from ggslam.system.settings import Known, walk
 from ggslam.tracking.settings import DepthNoise, PhotometricSettings
 from ggslam.volumes.safety import Braking

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ggslam.synthetic.world import World, cast_rays
 from ggslam.system.settings import setting, settings_class
+from worlds.world import World, cast_rays
 
 
 @dataclass(frozen=True)
