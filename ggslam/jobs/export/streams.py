@@ -54,8 +54,8 @@ def stream_run(
 def stream_store(path: Path, out: Path, min_opacity: float = 0.0, observer: Observer | None = None) -> str:
     """Writes the Gaussians of a grid store as streamed SOG, cell by cell; arguments and errors as of `stream_run`."""
     with GridStore.open(path) as store:
-        keys = [key for key in store.cells() if GAUSSIANS in store.cell(key).parts]
-        count = sum(store.cell(key).parts[GAUSSIANS].count for key in keys)
+        counts = store.counts(GAUSSIANS)
+        keys, count = list(counts), sum(counts.values())
         if not count:
             raise RunFolderError(f"{path}: no cell of the store has Gaussians; nothing to export")
 
