@@ -32,12 +32,12 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import numpy as np
 from worlds.cloud import cloud_tiles
 from worlds.plan import make_world
+from worlds.pose_graph import read_pose_graph
 from worlds.scanner import Scanner
 from worlds.walk import walk
 from worlds.world import World, cast_rays
 
 from ggslam.formats.cloud_files import read_cloud_file
-from ggslam.formats.raw_points import read_pose_graph
 from ggslam.localization.level import about_z
 from ggslam.localization.localizer import Localization, Localizer
 from ggslam.localization.map_picture import picture_of_store

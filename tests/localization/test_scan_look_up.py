@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from worlds.cloud import cloud_tiles
 from worlds.plan import make_world
+from worlds.pose_graph import read_pose_graph
 from worlds.scanner import Scanner
 from worlds.walk import walk
 from worlds.world import World, cast_rays
 
 from ggslam.errors import ConfigError
-from ggslam.formats.raw_points import read_pose_graph, read_raw_points
+from ggslam.formats.raw_points import read_raw_points
 from ggslam.localization.level import about_z, floor_height, level_turn
 from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
 from ggslam.localization.map_picture import picture_of_store
