@@ -38,7 +38,7 @@ class WatchedSlam(Slam):
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
         super().__init__(*arguments, **named)
-        self._corrections = _WatchedCorrections(self)
+        self.corrections = _WatchedCorrections(self)
 
     def first_views(self) -> float:
         """Mean PSNR of the keyframes of the first frames, dB, each from its own pose."""

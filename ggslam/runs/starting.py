@@ -72,7 +72,7 @@ def start_in_map(slam: Slam, folder: RunFolder, growing: bool) -> None:
     if growing:
         keyframes = _with_images(folder, keyframes, objects is not None and objects.supervision == "masks")
     slam.growing = growing
-    slam.adopt(gaussians, keyframes, objects)
+    slam.load_map(gaussians, keyframes, objects)
 
 
 def _load(

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import groupby
 from pathlib import Path
 from typing import Any, SupportsIndex
 
@@ -218,9 +217,18 @@ def one_camera(sequence: Sequence, what: str) -> Sequence:
 
 
 def by_instant(frames: Iterable[Frame]) -> Iterator[list[Frame]]:
-    """The frames of a rig's recording, in order, those of one instant together."""
-    for _, together in groupby(frames, lambda frame: frame.instant):
-        yield list(together)
+    """The frames of a recording, in order: those of one instant of a rig together, others at once and alone."""
+    together: list[Frame] = []
+    for frame in frames:
+        if together and frame.instant != together[0].instant:
+            yield together
+            together = []
+        together.append(frame)
+        if frame.instant is None:
+            yield together
+            together = []
+    if together:
+        yield together
 
 
 def open_rig(

@@ -12,18 +12,41 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.slam.frame_clock import FrameClock
 from ggslam.slam.result import StepReport
+from ggslam.slam.schedules import NewKeyframe, Schedule
 from ggslam.slam.slam import Slam
 from ggslam.system.opencv import opencv_errors
-from ggslam.tracking.tracker import TrackingResult
 
 MAX_WAITING = 8
 """While so many keyframes wait for the mapper no more are made, so that memory stays bounded."""
+
+
+class _InAnotherThread(Schedule):
+    """Keyframes wait for the mapper's thread, which trains by itself.
+
+    Args:
+        jobs: that it takes them from.
+        beside: context for work beside the mapper's.
+    """
+
+    def __init__(self, jobs: queue.Queue[NewKeyframe | None], beside: AbstractContextManager[object]) -> None:
+        self._jobs, self._beside = jobs, beside
+
+    def begin_step(self) -> None:
+        self.takes_keyframes = self._jobs.qsize() < MAX_WAITING  # and no fewer will wait until this one is put in
+
+    def beside_mapping(self) -> AbstractContextManager[object]:
+        return self._beside
+
+    def map(self, slam: Slam, keyframes: Sequence[NewKeyframe], frames: int) -> None:
+        for keyframe in keyframes:
+            self._jobs.put(keyframe)
 
 
 class RealtimeSlam:
@@ -38,12 +61,13 @@ class RealtimeSlam:
     def __init__(self, slam: Slam, frames_per_second: float, live: bool = False) -> None:
         self.slam, self.live = slam, live
         self.period = 1.0 / frames_per_second
-        self._jobs: queue.Queue[tuple[Frame, TrackingResult, int] | None] = queue.Queue()
+        self._jobs: queue.Queue[NewKeyframe | None] = queue.Queue()
         self._mapper_error: BaseException | None = None
-        self._beside_mapper = slam.mapper.beside_others()
+        slam.schedule = _InAnotherThread(self._jobs, slam.mapper.beside_others())
         # The kernels of one context take turns; the tracker must not wait for the mapper's.
         slam.mapper.is_live = slam.color_poses.live = True  # the map changes meanwhile
-        slam.tracker.context = slam.movers.context = NativeContext(slam.context.threads, slam.context.instruction_set)
+        slam.tracker.context = NativeContext(slam.context.threads, slam.context.instruction_set)
+        slam.filters.use_context(slam.tracker.context)
 
     def run(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
         """Processes all frames; `report` is called for each. Errors of either thread are raised here."""
@@ -66,36 +90,15 @@ class RealtimeSlam:
                 if not slam.frames:
                     self._first(frame, report)
                 else:
-                    report(frame, self._step(frame))
+                    report(frame, slam.step(frame))
             if self._mapper_error is not None:
                 return
 
     def _first(self, frame: Frame, report: Callable[[Frame, StepReport], None]) -> None:
         """Nothing can be tracked before there is a map: the clock starts when the first keyframe is in."""
-        report(frame, self._step(frame))
+        report(frame, self.slam.step(frame))
         while self.slam.tracker.target is None and self._mapper_error is None and self._jobs.unfinished_tasks:
             time.sleep(1e-3)
-
-    def _step(self, frame: Frame) -> StepReport:
-        slam, start = self.slam, time.perf_counter()
-        slam.times.start()
-        frame = slam.receive(frame)
-        slam.takes_keyframes = self._jobs.qsize() < MAX_WAITING  # and no fewer will wait until this one is put in
-        with self._beside_mapper:
-            tracking = slam.track(frame)
-        frame = slam.without_movers(frame)
-        for early in slam.take_early():
-            self._jobs.put((*early, slam.moves_followed))
-        is_keyframe = slam.takes_keyframes and slam.wants_keyframe(frame, tracking)
-        if is_keyframe:
-            slam.poses.add_keyframe(tracking.T_world_camera)
-            self._jobs.put((frame, tracking, slam.moves_followed))
-        slam.poses.add(frame, tracking)
-        if not is_keyframe:
-            slam.color_poses.note(frame, tracking)
-        slam.times.stop()
-        seconds = time.perf_counter() - start
-        return slam.note_step(is_keyframe, seconds)
 
     # --- mapper's thread ---------------------------------------------------------------------------------------------
 
@@ -116,7 +119,7 @@ class RealtimeSlam:
             return True
         if job is None:
             return False
-        with opencv_errors(f"frame {job[0].index}"):
-            slam.insert(*job)
+        with opencv_errors(f"frame {job.frame.index}"):
+            slam.map_keyframe(job)
         self._jobs.task_done()
         return True

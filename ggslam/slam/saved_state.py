@@ -56,24 +56,28 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.sequences.moving_pixels import MovingPixels
-from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.color_poses import ColorPoses
 from ggslam.slam.config import Config
-from ggslam.slam.depth_edges import DepthEdges
-from ggslam.slam.earlier_views import EarlierViews
+from ggslam.slam.filter_chain import FilterChain
+from ggslam.slam.filters.camera_fixtures import CameraFixtures
+from ggslam.slam.filters.depth_edges import DepthEdges
+from ggslam.slam.filters.earlier_views import EarlierViews
+from ggslam.slam.filters.movers import MoverFilter
+from ggslam.slam.filters.shutter_times import ShutterTimes
+from ggslam.slam.frame_locator import FrameLocator
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.left_parts import LeftPart, LeftParts
 from ggslam.slam.loop_closing import LoopCloser, LoopEvent, _Found
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
+from ggslam.slam.map_removal import MapRemoval
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.slam.part_start import PartStart
 from ggslam.slam.result import LearnedObjects, SlamTimes, TrackedFrame
 from ggslam.slam.rig_clock import RigClock
+from ggslam.slam.rig_locator import RigLocator
 from ggslam.slam.rig_slam import RigSlam
-from ggslam.slam.run_movers import RunMovers
 from ggslam.slam.run_objects import RunObjects
-from ggslam.slam.shutter_times import ShutterTimes
 from ggslam.slam.slam import Slam
 from ggslam.slam.step_log import StepLog
 from ggslam.system.object_tree import Keeper, Kept, Rule, Rules, describe, restore
@@ -143,7 +147,7 @@ def check_state(slam: Slam) -> None:
             raise FormatError(f"keyframe {number}: not of this recording")
     if not all(view.fits() for view in slam.movers.detector.views):
         raise FormatError("views of what may move: not of their camera")
-    if not slam.earlier_views.check():
+    if not slam.filters.get(EarlierViews).check():
         raise FormatError("views of the map that the run began with: not of their cameras")
     slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
@@ -229,20 +233,29 @@ def _names(*names: str) -> frozenset[str]:
     return frozenset(names)
 
 
+_LOCATOR_PARTS = (
+    "_config", "_surface", "_masks", "_tracker", "_loops", "_pager", "_policy", "_poses", "_filters",
+)  # fmt: skip
+
 RULES: Rules = {
     **dict.fromkeys(_settings_classes(Config) - {Config}, Rule(checked=True)),
-    Slam: _but("camera", "config", "context", "pager", "_notes", "_on_device", after=_fit_to_scene),
+    Slam: _but("camera", "config", "context", "pager", "start_notes", "schedule", after=_fit_to_scene),
     RigSlam: _but(
-        "camera", "rig", "config", "context", "pager", "_notes", "_on_device", "_engine", after=_fit_to_scene,
+        "camera", "rig", "config", "context", "pager", "start_notes", "schedule", after=_fit_to_scene,
         check=RigSlam.check,
     ),
     SlamTimes: _but("_started", growing=_names("tracking_by_frame"), after=_go_on),
     ColorPoses: _but("mapper", "poses", "state", growing=_names("images")),
+    EarlierViews: _but("context"),
     FramePoses: Rule(growing=_names("frames"), check=FramePoses.check),
-    MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "_publishing"),
+    MapCorrections: _but("_surface", "_mapper", "_pager", "_masks", "publishing"),
     MapParts: _but("_mapper", "_poses", "_corrections", "_loops"),
     RunObjects: _but("_masks"),
-    RunMovers: _but("_reads_masks", "_margin", "context"),
+    FrameLocator: _but(*_LOCATOR_PARTS),
+    RigLocator: _but(*_LOCATOR_PARTS, "_rig", "_engine"),
+    MapRemoval: _but("_surface", "_mapper", "_publishing", "is_paged"),
+    FilterChain: Rule(),
+    MoverFilter: _but("_reads_masks", "_margin", "context"),
     MoverDetector: _but("settings"),
     MoverTracks: _but("recent"),
     MoverSurface: _but("_tree"),
@@ -300,7 +313,7 @@ RULES: Rules = {
          KeyframeSampler, MeanMap, PoseAdam, ExposureAdam, KeyframeExposures, IdentityTimes, IdentityClassifier,
          LearnedObjects, Observation, Associator, ConsistencyJudge, PairEvidence, _Pair, Fragment, FragmentMemory,
          BoundingPlanes, BoundingPlane,
-         ShutterTimes, RigClock, EarlierViews, EarlierView, FramePoints,
+         ShutterTimes, RigClock, EarlierView, FramePoints,
          LeftParts, Frame),
         Rule(),
     ),

@@ -6,13 +6,16 @@
     for frame in sequence.stream():
         slam.step(frame)
     result = slam.finish()
+
+`Slam._step` and `Slam.map_keyframe` are the algorithm, in seven steps. Every way of running uses them: a rig of cameras
+has another `locator`, a GPU and real time another `schedule`.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +23,6 @@ import numpy as np
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
-from ggslam.features.orb import FeatureView
 from ggslam.geometry.scene_size import scene_scale
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
@@ -30,36 +32,31 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
-from ggslam.slam.camera_fixtures import CameraFixtures
 from ggslam.slam.color_poses import ColorPoses
 from ggslam.slam.config import Config
-from ggslam.slam.depth_edges import DepthEdges
-from ggslam.slam.earlier_views import EarlierViews
+from ggslam.slam.filter_chain import FilterChain
+from ggslam.slam.filters.frame_filter import FilterContext
+from ggslam.slam.filters.movers import MoverFilter
+from ggslam.slam.frame_locator import FrameLocator, Located
 from ggslam.slam.frame_poses import FramePoses
-from ggslam.slam.left_parts import LeftParts
-from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
-from ggslam.slam.part_start import PartStart, pose_apart
-from ggslam.slam.parts import check_arguments, device_name, make_parts
+from ggslam.slam.map_removal import MapRemoval
+from ggslam.slam.parts import RunParts, check_arguments, make_parts
 from ggslam.slam.result import LearnedObjects, SlamResult, SlamTimes, StepReport, TrackedFrame
-from ggslam.slam.run_movers import RunMovers
+from ggslam.slam.run_end import refine, result_of
 from ggslam.slam.run_objects import RunObjects
-from ggslam.slam.saved_places import saved_places_to_bytes
-from ggslam.slam.shutter_times import ShutterTimes
+from ggslam.slam.schedules import BesideTraining, NewKeyframe, Schedule
 from ggslam.slam.step_log import StepLog
-from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.settings import DepthNoise
-from ggslam.tracking.still_camera import still_notes
-from ggslam.tracking.tracker import TrackingResult, TrackingStatus
+from ggslam.tracking.tracker import TrackingStatus
 
 TRIM_EVERY = 8
-"""Keyframes: the C library keeps a fifth of a run's memory for itself that once held arrays; asking for it back takes
-milliseconds."""
+"""Keyframes after which the C library gives back the memory that it keeps, a fifth of a run's; takes milliseconds."""
 
 
 class Slam:
@@ -84,7 +81,6 @@ class Slam:
     scale: float
     _noise: DepthNoise | None
     dropped_frames: list[int]
-    _early: list[tuple[Frame, TrackingResult]]
     refine_iterations: int
 
     def __init__(
@@ -97,8 +93,9 @@ class Slam:
         parts = make_parts(camera, self.config, has_masks, paging, library, compact=extra_loss is None)
         self.context, self.masks, self.tracker, self.surface = parts.context, parts.masks, parts.tracker, parts.surface
         self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
-        self._notes, self._on_device = parts.notes, parts.on_device
-        if extra_loss is not None and self._on_device:
+        self.start_notes = parts.notes
+        """What the user should know of the parts that the settings chose."""
+        if extra_loss is not None and parts.on_device:
             raise ConfigError("a loss of your own (extra_loss) needs device: cpu; on a GPU kernels compute the losses")
         self.mapper.extra_loss = extra_loss
         self.policy = KeyframePolicy(self.config.keyframes)
@@ -107,25 +104,33 @@ class Slam:
         self.poses = FramePoses()
         self.dropped_frames = []
         self.refine_iterations = 0
+        """Steps of the final refinement so far."""
         self.times = SlamTimes()
         self.steps = StepLog()
         self.growing = True
         """Whether keyframes are made and the map is trained; off: frames are located in the map as it is."""
-        self._corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
-        self._parts = MapParts(self.mapper, self.poses, self._corrections, self.loops)
-        self._moves_followed = 0
+        made_of = FilterContext(self.config, self.context)
+        self.chains = self._make_filters(made_of)
+        """Filters of the frames, by `Frame.camera_number`."""
+        self.filters = FilterChain.join(self.chains)
+        """All of them, each once."""
+        self.locator = self._make_locator(parts)
+        self.schedule: Schedule = BesideTraining() if parts.on_device else Schedule()
+        self.corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
+        self.removal = MapRemoval(self.surface, self.mapper, self.pager, self.corrections.publishing)
+        self.parts = MapParts(self.mapper, self.poses, self.corrections, self.loops)
+        self.objects = RunObjects(self.masks)
+        self.moves_followed = 0
+        """How many corrections of the map the newest tracked pose knows of."""
         self._noise = None
-        self._objects = RunObjects(self.masks)
-        self.color_poses = ColorPoses(self.mapper, self.poses, self.tracker.state)
-        self._depth_edges, self._shutters, self._fixtures = DepthEdges(), ShutterTimes(), CameraFixtures()
-        self.earlier_views = EarlierViews()
-        self.part_start, self.left_parts = PartStart(), LeftParts()
-        self._early = []
-        self.takes_keyframes = True
-        """Whether the next keyframe would be taken now; in real time none is while too many wait."""
-        self.movers = RunMovers(self.config.movers, self.config.masks.source in ("auto", "recording"), self.context)
 
-    def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
+    def _make_filters(self, made_of: FilterContext) -> list[FilterChain]:
+        return [FilterChain.make_all(made_of)]
+
+    def _make_locator(self, parts: RunParts) -> FrameLocator:
+        return FrameLocator(self.config, parts, self.policy, self.poses, self.filters)
+
+    def load_map(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
         """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost
         until `loops` finds it.
 
@@ -139,7 +144,7 @@ class Slam:
         """
         if self.pager is not None:
             raise ConfigError("memory_limit_mb: a run that starts in the map of another (`map`) has no limit of memory")
-        self._objects.learned, self.poses.keyframes_made = objects, len(keyframes)
+        self.objects.learned, self.poses.keyframes_made = objects, len(keyframes)
         self.mapper.adopt(gaussians, keyframes)
         if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:
             self.mapper.identity = None
@@ -151,41 +156,200 @@ class Slam:
     # --- the loop ----------------------------------------------------------------------------------------------------
 
     def step(self, frame: Frame) -> StepReport:
-        """Track, maybe insert a keyframe, train.
+        """Track one frame, maybe make a keyframe of it, train.
 
         Raises:
             SequenceError: the frame is of another camera, or not what `Frame` says.
-        OpenCvError: OpenCV refused its images.
+            OpenCvError: OpenCV refused its images.
         """
-        with opencv_errors(f"frame {frame.index}"):
-            return self._step(frame)
+        return self.step_together([frame])[0]
 
-    def _step(self, frame: Frame) -> StepReport:
+    def step_together(self, frames: Sequence[Frame]) -> list[StepReport]:
+        """The same for the frames of one instant, of different cameras of a rig.
+
+        Args:
+            frames: `Frame.camera_number` and `Frame.instant` say of which camera and when.
+
+        Returns:
+            What the step did, for each frame; what it took besides its length is the first one's.
+        """
+        with opencv_errors(f"frame {frames[0].index}"):
+            return self._step(frames)
+
+    def _step(self, frames: Sequence[Frame]) -> list[StepReport]:
         start = time.perf_counter()
         self.times.start()
-        frame = self.receive(frame)
-        tracking = self.track(frame)
-        frame = self.without_movers(frame)
-        for early in self.take_early():
-            self.insert(*early, self.moves_followed)
-        is_keyframe = self.wants_keyframe(frame, tracking)
-        if is_keyframe:
-            self.tracker.target = None  # the surface may be made anew; the next frame gets what it is then
-            if self._on_device:
-                self._insert_beside_training(frame, tracking)
-            else:
-                self.insert(frame, tracking, self.moves_followed)
-            self.poses.add_keyframe(tracking.T_world_camera)
-            if len(self.mapper.keyframes) % TRIM_EVERY == 0:
-                trim()
-        self.poses.add(frame, tracking)
-        if not (is_keyframe and self._on_device):
-            self._train_step(is_keyframe)
-        if not is_keyframe:
-            self.color_poses.note(frame, tracking)
+        self.schedule.begin_step()
+
+        # 1. Clean the frames: no depth that hangs between two surfaces, was taken at another time than the colour, or
+        #    shows what is fixed to the camera.
+        cleaned = [self.clean(frame) for frame in frames]
+
+        # 2. Track: follow what closed loops have corrected, then align the frames' points to the map (G-ICP). A lost
+        #    camera is looked for at all known places, or begins a new part of the map.
+        with self.schedule.beside_mapping():
+            located = self.track(cleaned)
+
+        # 3. Decide whether the frames become keyframes: those that show enough that the map does not.
+        chosen = self._choose_keyframes(located)
+        self._note_poses(located, chosen)
+
+        # 4. to 7. Map the keyframes and train: `map_keyframe` and `train`, at once or in another thread.
+        new = [*located.early, *((located.frames[k], located.tracked[k]) for k in chosen)]
+        self.schedule.map(self, [NewKeyframe(*one, self.moves_followed) for one in new], len(frames))
+
         self.times.stop()
+        seconds = (time.perf_counter() - start) / len(frames)
+        return [self._report(k in chosen, seconds, k - len(frames)) for k in range(len(frames))]
+
+    def map_keyframe(self, new: NewKeyframe, train: Callable[[], None] | None = None) -> None:
+        """A keyframe goes into the map and into what the tracker aligns to; if it closes a loop, the map is corrected.
+
+        Args:
+            new: the keyframe.
+            train: the step's training, if that goes on while the points join the surface.
+        """
+        frame, tracking = new.frame, self.corrections.follow(new.tracking, new.moves_followed)
+        chain = self.chains[frame.camera_number]
+
+        # 4. Insert Gaussians where the map lacks what the keyframe shows, after removing what it looks through. Its
+        #    place and its points are prepared meanwhile, in other threads.
+        chain.before_insertion(self.removal, frame, tracking)
+        if self.loops is not None:
+            self.loops.begin(frame)
+        if train is None:
+            self.corrections.begin_points(tracking)
+        if self.pager is not None:
+            self.pager.prepare(tracking.T_world_camera, frame.depth)
+        before = self.map.count
+        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
+        added = self.map.count - before
+
+        # 5. Add its points to the measured surface that the next frames are aligned to.
+        self.corrections.add_points(tracking, train)
+
+        # 6. Remove what is fixed to the camera or has moved since; then close a loop, if the keyframe shows a known
+        #    place: the graph of keyframe poses is optimised, and the map moves with its keyframes.
+        chain.after_insertion(self.removal, frame)
+        if self.loops is not None:
+            correction = self.loops.add(frame, tracking)
+            if correction is not None:
+                self.corrections.apply(correction, self.loops)
+                self.filters.loop_closed()
+        if self.pager is not None:
+            self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
+
+    def train(self, frames: int, keyframes_before: int) -> None:
+        """The training of a step.
+
+        Args:
+            frames: of the step.
+            keyframes_before: how many keyframes there were before it.
+        """
+        # 7. Train the map on keyframes drawn at random: longer on the very first ones.
+        count, settings = len(self.mapper.keyframes), self.config.mapping
+        if count // TRIM_EVERY != keyframes_before // TRIM_EVERY:
+            trim()
+        if count and self.growing:
+            first = settings.first_frame_iterations * count
+            self.mapper.run(settings.iterations_per_frame * frames if keyframes_before else first)
+
+    # --- the tracker's steps -----------------------------------------------------------------------------------------
+
+    def clean(self, frame: Frame) -> Frame:
+        """The frame as the run uses it.
+
+        Raises:
+            SequenceError: the frame is of another camera, or not what `Frame` says.
+        """
+        check_frame(frame, self.cameras[frame.camera_number])
+        return self.chains[frame.camera_number].clean(frame)
+
+    def track(self, frames: list[Frame]) -> Located:
+        """Locates the frames of an instant, as `clean` gave them, and corrects them by what their poses tell."""
+        start = time.perf_counter()
+        self.follow_corrections()
+        for frame in frames:
+            self.mapper.note_valid(frame)
+        if not len(self.surface):
+            self.use_scale(scene_scale(np.concatenate([frame.depth.reshape(-1) for frame in frames])))
+        located = self.locator.locate(frames, self.growing, self.schedule.takes_keyframes)
+        self._set_noise(located.joint.median_depth_m)
+        judged = [
+            self.chains[frame.camera_number].located(frame, tracking, self.tracker.noise)
+            for frame, tracking in zip(located.frames, located.tracked, strict=True)
+        ]
+        if self.filters.expects_motion():
+            self.tracker.expect_motion()
         seconds = time.perf_counter() - start
-        return self.note_step(is_keyframe, seconds)
+        self.times.tracking_by_frame += [seconds / len(frames)] * len(frames)
+        self.times.tracking += seconds
+        return replace(located, frames=[frame for frame, _ in judged], tracked=[result for _, result in judged])
+
+    def follow_corrections(self) -> None:
+        """Everything that knows a pose of the camera goes along with corrections of the map made since the last frame.
+        """
+        published, moves = self.corrections.pending_moves(self.moves_followed)
+        self.moves_followed += len(moves)
+        for T_new_old in moves:
+            for holder in (self.tracker, self.filters, self.policy, self.poses):
+                holder.move(T_new_old)
+        target = self.locator.target(published)
+        if target is not None:
+            self.tracker.set_target(target)
+
+    def use_scale(self, scale: float) -> None:
+        """Fits tracker and mapper to a scene of this size; before the first keyframe."""
+        self.scale, self.tracker.settings = scale, scale_settings(self.config.tracking, scale)
+        self.mapper.settings = scale_mapping(self.config.mapping, scale)
+        self.surface.settings = self.tracker.settings.target
+
+    def _set_noise(self, median_depth: float) -> None:
+        """The mapper learns what the tracker says of the noise, on the first frame and whenever it says more."""
+        noise = self.tracker.noise
+        if noise is None or noise == self._noise:
+            return
+        if self._noise is not None or not self.mapper.keyframes:  # a map made before keeps what it was trained with
+            self.mapper.depth_sigma = noise.sigma(median_depth)
+        if median_depth > 0:
+            self.mapper.pixel_m = median_depth / self.camera.fx
+            self.mapper.depth_noise_px = noise.in_pixels(median_depth, self.camera.fx)
+        self._noise = noise
+
+    def _choose_keyframes(self, located: Located) -> list[int]:
+        """Which of the frames become keyframes: none of an instant that is lost or held out for scoring (but something
+        has to be the first), else all that can, or none."""
+        first = located.frames[0]
+        number = first.index if first.instant is None else first.instant
+        held_out = self.policy.kind is not None and self.config.evaluation.is_held_out(number)
+        if held_out or located.is_lost or not self.growing or not self.schedule.takes_keyframes:
+            return []
+        candidates = self.locator.keyframe_candidates(located)
+        if not candidates:
+            return []
+        least = min(located.tracked[k].overlap for k in candidates)
+        return candidates if self.policy.decide(number, replace(located.joint, overlap=least)) else []
+
+    def _note_poses(self, located: Located, chosen: list[int]) -> None:
+        """Poses are remembered relative to the newest keyframe, so that they move with it."""
+        for k in chosen:
+            self.poses.add_keyframe(located.tracked[k].T_world_camera)
+        for k, (frame, tracking) in enumerate(zip(located.frames, located.tracked, strict=True)):
+            self.poses.add(frame, tracking)
+            if k not in chosen:
+                self.locator.note(frame, tracking)
+
+    def _report(self, is_keyframe: bool, seconds: float, number: int) -> StepReport:
+        """What the step did that has just ended with frame `number` of `frames` and took `seconds`; `steps` remembers
+        it."""
+        loops_s = 0.0 if self.loops is None else self.loops.seconds
+        frame = self.frames[number]
+        report = self.steps.add(frame, is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count)
+        if frame.status != TrackingStatus.LOST.value:
+            report.T_world_camera = self.poses.as_tracked(frame)
+        return report
+
+    # --- what there is so far ----------------------------------------------------------------------------------------
 
     @property
     def frames(self) -> list[TrackedFrame]:
@@ -202,20 +366,26 @@ class Slam:
         """Of the frames, by `Frame.camera_number`."""
         return (self.camera,)
 
-    def note_step(self, is_keyframe: bool, seconds: float, number: int = -1) -> StepReport:
-        """What the step did that has just ended with frame `number` of `frames` and took `seconds`; `steps` remembers
-        it."""
-        loops_s = 0.0 if self.loops is None else self.loops.seconds
-        frame = self.frames[number]
-        report = self.steps.add(frame, is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count)
-        if frame.status != TrackingStatus.LOST.value:
-            report.T_world_camera = self.poses.as_tracked(frame)
-        return report
+    @property
+    def movers(self) -> MoverFilter:
+        """Knows what moves."""
+        return self.filters.get(MoverFilter)
+
+    @property
+    def color_poses(self) -> ColorPoses:
+        """Aligns frames to the map by colour."""
+        return self.locator.color_poses
 
     @property
     def gaussian_count(self) -> int:
         """Gaussians of the map, in memory and on disk."""
         return self.map.count + (0 if self.pager is None else self.pager.on_disk)
+
+    def pose_of(self, frame: TrackedFrame) -> np.ndarray:
+        """T_world_camera [4, 4] of a frame that was not lost, as far as is known by now."""
+        return self.poses.pose_of(frame, self.mapper.keyframes)
+
+    # --- the end of a run --------------------------------------------------------------------------------------------
 
     @property
     def refinement_steps(self) -> int:
@@ -228,275 +398,18 @@ class Slam:
     @opencv_errors("after the last frame")
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refinement_steps`), then the result. `progress(done, total)` is called now and then."""
-        self.settle_parts()
-        start, before = time.perf_counter() - self.times.refinement, self.mapper.times.iterations
-        begin, steps = self.refine_iterations, self.refinement_steps  # `begin`: by a run that was cut off
-
-        def note(done: int, total: int) -> None:
-            self.refine_iterations = begin + self.mapper.times.iterations - before
-            self.times.refinement = time.perf_counter() - start
-            if progress is not None:
-                progress(done, total)
-
-        try:
-            if steps:
-                if not begin:
-                    self.mapper.use_typical_exposure(at_end=True)
-                    self.color_poses.align_keyframes()
-                    self.mapper.drop_hidden()
-                self.mapper.refine(steps, note, begin)
-            self.color_poses.align_last(lambda: note(steps, steps))
-        finally:  # an interrupted refinement counts for what it did
-            self.refine_iterations = begin + self.mapper.times.iterations - before
-            self.times.refinement = time.perf_counter() - start
+        refine(self, progress)
         return self.result()
 
     def result(self) -> SlamResult:
         """What there is so far. The first call settles the objects: it is for the end."""
-        self.times.loops = self.loops.seconds if self.loops is not None else 0.0
-        self.mapper.end_refinement()
-        self.settle_parts()
-        objects = self._objects.settle(self.mapper, self.pager) if self.growing else self._objects.learned
-        cells = None if self.pager is None else self.pager.settle()
-        gaussians = self._parts.gaussians()
-        return SlamResult(
-            gaussians, self._parts.keyframes(), self._parts.frames(), self.times, self.mapper.times,
-            self.dropped_frames, self.refine_iterations, objects, self._parts.events(),
-            self._places(gaussians, cells), cells, None if self.pager is None else self.pager.report(),
-            [*self._notes, *still_notes(self.tracker.state.still.frames, len(self.frames)),
-             *self._fixtures.notes(), *self.movers.notes(len(self.frames)),
-             *self.earlier_views.notes(),
-             *([] if self.pager is None else self.pager.budget.notes)],
-            None if self.pager is None else self.pager.close, self.steps.to_csv(), device_name(self.map.device),
-            self.config, self.movers.pixels, self._parts.movers(self.movers.tracks.describe()),
-        )  # fmt: skip
+        return result_of(self)
 
-    def _places(self, gaussians: GaussianMap, cells: GaussianCells | None) -> bytes | None:
-        """Content of `places.npz`; None if the run looked for no loops and so remembers no places."""
-        if self.loops is None or not len(self.surface):
-            return None
-        parts = [gaussians] if cells is None else (part for _, part in cells.parts())
-        kept = self._parts.kept_numbers()
-        keyframes = [self.mapper.keyframes[k] for k in kept]
-        poses = np.stack([k.T_world_camera for k in keyframes])
-        noise = self.tracker.noise or DepthNoise()
-        cameras = [k.camera for k in keyframes] if len(self.cameras) > 1 else None
-        return saved_places_to_bytes(
-            self.camera, self.surface, self.loops, noise, self.scale, poses, parts, cameras, kept
-        )  # fmt: skip
-
-    def settle_parts(self) -> None:
+    def join_parts(self) -> None:
         """Makes one part of those that the recording fell into, see `MapParts`; when there are no more frames."""
-        self._parts.settle()
+        self.parts.settle()
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""
         if self.pager is not None:
             self.pager.close()
-
-    # --- its parts, also used by the real-time loop ------------------------------------------------------------------
-
-    def receive(self, frame: Frame) -> Frame:
-        """The frame as the run uses it: without depth that hangs between two surfaces, with depth as of the time of
-        colour, and without what is fixed to the camera.
-
-        Raises:
-            SequenceError: the frame is of another camera, or not what `Frame` says.
-        """
-        check_frame(frame, self.camera)
-        return self._fixtures.clean(self._shutters.bring(self._depth_edges.clean(frame)))
-
-    def track(self, frame: Frame) -> TrackingResult:
-        """Locates one frame, as `receive` gave it, against the current target; a lost one is looked up among all
-        keyframes."""
-        self.mapper.note_valid(frame)
-        start = time.perf_counter()
-        self._follow_moves()
-        if not len(self.surface):
-            self.use_scale(scene_scale(frame.depth))
-        expected = self.movers.expect(frame)
-        result = self.tracker.track(expected)
-        if result.status is TrackingStatus.LOST and self.loops is not None and self.tracker.target is not None:
-            found = self.loops.find(frame, result)
-            if found is None and self.left_parts.parts:
-                found = self.left_parts.find(expected, self.poses.anchor[0], self.tracker, self.loops)
-            if found is not None:
-                result, keyframe = found
-                self.poses.anchor_to(keyframe, self.loops.poses[keyframe])
-            else:
-                result = self._try_new_part(frame, result)
-        if result.status is not TrackingStatus.LOST:
-            self.part_start.forget()
-            self.left_parts.settle()
-        result = self.color_poses.align(frame, result)
-        located = None if result.status is TrackingStatus.LOST else result.T_world_camera
-        self._shutters.follow(located)
-        self._fixtures.follow(self.camera, located)
-        self._tell_noise(result.median_depth_m)
-        result = self.movers.look(frame, result, self.tracker.noise)
-        if self.movers.may_move:
-            self.tracker.be_wary()
-        self.times.tracking_by_frame.append(time.perf_counter() - start)
-        self.times.tracking += self.times.tracking_by_frame[-1]
-        return result
-
-    def _try_new_part(self, frame: Frame, lost: TrackingResult) -> TrackingResult:
-        """What tracking says of a lost frame that no place tells of: the same, or that a new part begins with it."""
-        loops, start = self.loops, self.part_start
-        wanted = self.tracker.settings.recovery.new_part_after > 0 and self.pager is None
-        if loops is None or not self.growing or not wanted:
-            return lost
-        start.watch(frame, lost, self.tracker, self.tracker.context)
-        if self.config.evaluation.is_held_out(frame.index) or not self.takes_keyframes:
-            return lost
-        if start.is_due(frame, self.tracker):
-            return self._begin_part(frame, lost, loops)
-        start.keep(frame, self.masks.active, self.config.keyframes.max_gap)
-        return lost
-
-    def _begin_part(self, frame: Frame, lost: TrackingResult, loops: LoopCloser) -> TrackingResult:
-        """A part of the map begins with the frames that were lost; what tracking says of the last of them."""
-        start, tracker = self.part_start, self.tracker
-        self.left_parts.leave(*self.poses.anchor, tracker)
-        T_world_first = pose_apart(lost.T_world_camera, self.surface.poses, tracker.settings.points.max_depth)
-        keyframe, first = self.poses.keyframes_made, start.first
-        begun = start.begin(keyframe, lost, self.surface, T_world_first, tracker.context)
-        loops.begin_part(begun.keyframes[0][0] if begun.keyframes else frame, first)
-        self.poses.locate_last(keyframe, begun.T_first_camera)
-        self.policy.begin_again()
-        for early, tracking in begun.keyframes:
-            self.policy.decide(early.index, tracking)
-            self.poses.add_keyframe(tracking.T_world_camera)
-        self._early = begun.keyframes
-        T = begun.T_world_camera
-        return tracker.begin_part(FeatureView(frame.color, frame.depth, T), lost.points, T)
-
-    def take_early(self) -> list[tuple[Frame, TrackingResult]]:
-        """Keyframes to insert before the frame that was tracked last: of those that a part begins with. `poses` knows
-        them."""
-        early, self._early = self._early, []
-        return early
-
-    def without_movers(self, frame: Frame) -> Frame:
-        """The frame that was tracked last as the map gets it: without depth where something moves."""
-        return self.movers.clean(frame)
-
-    def _tell_noise(self, median_depth: float) -> None:
-        """The mapper learns what the tracker says of the noise, on the first frame and whenever it says more."""
-        noise = self.tracker.noise
-        if noise is None or noise == self._noise:
-            return
-        if self._noise is not None or not self.mapper.keyframes:  # a map made before keeps what it was trained with
-            self.mapper.depth_sigma = noise.sigma(median_depth)
-        if median_depth > 0:
-            self.mapper.pixel_m = median_depth / self.camera.fx
-            self.mapper.depth_noise_px = noise.in_pixels(median_depth, self.camera.fx)
-        self._noise = noise
-
-    def use_scale(self, scale: float) -> None:
-        """Fits tracker and mapper to a scene of this size; before the first keyframe."""
-        self.scale, self.tracker.settings = scale, scale_settings(self.config.tracking, scale)
-        self.mapper.settings = scale_mapping(self.config.mapping, scale)
-        self.surface.settings = self.tracker.settings.target
-
-    def _follow_moves(self) -> None:
-        """The tracker goes along with corrections of the map made since the last frame."""
-        waits = len(self.surface) <= self.part_start.keyframe
-        target, moves = self._corrections.news(self._moves_followed)
-        self._moves_followed += len(moves)
-        for T_new_old in moves:
-            self.tracker.move(T_new_old)
-            self._shutters.move(T_new_old)
-            self.movers.move(T_new_old)
-            self.policy.move(T_new_old)
-            self.poses.move(T_new_old)
-        if not waits:
-            self.part_start.target = None
-        elif self.part_start.target is not None:
-            target = self.part_start.target
-        if target is not None:
-            self.tracker.set_target(target)
-
-    @property
-    def moves_followed(self) -> int:
-        """How many corrections of the map the newest tracked pose knows of."""
-        return self._moves_followed
-
-    @property
-    def corrections(self) -> int:
-        """How many times a closed loop has moved the map."""
-        return len(self._corrections)
-
-    def pose_of(self, frame: TrackedFrame) -> np.ndarray:
-        """T_world_camera [4, 4] of a frame that was not lost, as far as is known by now."""
-        return self.poses.pose_of(frame, self.mapper.keyframes)
-
-    def wants_keyframe(self, frame: Frame, tracking: TrackingResult) -> bool:
-        """Whether the frame becomes a keyframe: never when lost, and never when held out for scoring (but something
-        has to be the first)."""
-        held_out = self.policy.kind is not None and self.config.evaluation.is_held_out(frame.index)
-        if held_out or tracking.status is TrackingStatus.LOST or not self.growing:
-            return False
-        return self.policy.decide(frame.index, tracking)
-
-    def _insert_beside_training(self, frame: Frame, tracking: TrackingResult) -> None:
-        """`insert` and the step's training: the keyframe's place is described, and its points join the surface, while
-        the host hands work to the GPU."""
-        if self.loops is not None:
-            self.loops.begin(frame)
-        tracking = self._corrections.follow(tracking, self.moves_followed)
-        self._take_out_outdated(frame, tracking)
-        self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
-        tracking.points.read()  # what waits for the GPU is done in this thread
-        with ThreadPoolExecutor(1, thread_name_prefix="surface") as beside:
-            added = beside.submit(self._corrections.add_points, tracking)
-            self._train_step(is_keyframe=True)
-            added.result()
-        self._clear_map(frame)
-        self._look_for_loops(frame, tracking)
-
-    def _train_step(self, is_keyframe: bool) -> None:
-        """The step's iterations, more of them right after the first keyframe."""
-        if self.mapper.keyframes and self.growing:
-            settings, first = self.config.mapping, is_keyframe and len(self.mapper.keyframes) == 1
-            self.mapper.run(settings.first_frame_iterations if first else settings.iterations_per_frame)
-
-    def insert(self, frame: Frame, tracking: TrackingResult, moves_followed: int) -> None:
-        """A keyframe goes into the map and into what the tracker aligns to; if it closes a loop, the map is corrected.
-
-        Args:
-            frame: of the keyframe.
-            tracking: where it is.
-            moves_followed: the corrections that this knows of.
-        """
-        tracking = self._corrections.follow(tracking, moves_followed)
-        self._take_out_outdated(frame, tracking)
-        if self.loops is not None:
-            self.loops.begin(frame)  # this and the surface are made beside what follows, which one thread alone does
-        self._corrections.begin_points(tracking)
-        if self.pager is not None:
-            self.pager.prepare(tracking.T_world_camera, frame.depth)
-        before = self.map.count
-        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
-        added = self.map.count - before
-        self._corrections.add_points(tracking)
-        self._clear_map(frame)
-        self._look_for_loops(frame, tracking)
-        if self.pager is not None:
-            self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
-
-    def _take_out_outdated(self, newest: Frame, tracking: TrackingResult) -> None:
-        """Takes out of the map that the run began with what the frame, about to become a keyframe, helps to tell."""
-        self._corrections.take_out_outdated(self.earlier_views, newest, tracking, self._noise, self.context)
-
-    def _clear_map(self, newest: Frame) -> None:
-        """Takes out what does not belong there, as far as the newest keyframe tells."""
-        self._corrections.leave_out(self._fixtures, newest)
-        self._corrections.take_out(self.movers, newest)
-
-    def _look_for_loops(self, frame: Frame, tracking: TrackingResult) -> None:
-        if self.loops is not None:
-            correction = self.loops.add(frame, tracking)
-            if correction is not None:
-                self._corrections.apply(correction, self.loops)
-                self.earlier_views.forget()

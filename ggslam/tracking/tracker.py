@@ -167,7 +167,7 @@ class Tracker(ABC):
         """Frames are aligned to `target` from the next one on."""
         self.state.target = target
 
-    def be_wary(self) -> None:
+    def expect_motion(self) -> None:
         """Something may move: near points are trusted less for a while, whoever they belong to."""
         self.state.motion.wary = self.settings.recovery.wary_frames
 

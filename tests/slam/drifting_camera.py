@@ -9,6 +9,7 @@ import numpy as np
 
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
+from ggslam.slam.schedules import NewKeyframe
 from ggslam.slam.slam import Slam
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise
@@ -33,10 +34,10 @@ def walk_with_drift(slam: Slam, frames: list[Frame], drift: np.ndarray, keyframe
     step = se3_exp(drift / len(order))
     assert slam.loops is not None
     for k, i in enumerate(order[:keyframes]):
-        slam._follow_moves()
+        slam.follow_corrections()
         T = slam.loops.poses[-1] @ inverse(truth[k - 1]) @ truth[k] @ step if k else np.eye(4)
         points = extract_points(frames[i].depth, slam.camera, slam.config.tracking.points, DepthNoise(), slam.context)
         tracking = TrackingResult(T, TrackingStatus.OK, 1.0, 0.0, "", points)
-        slam.insert(dataclasses.replace(frames[i], index=k), tracking, slam.moves_followed)
+        slam.map_keyframe(NewKeyframe(dataclasses.replace(frames[i], index=k), tracking, slam.moves_followed))
         slam.mapper.run(2)
     return np.array(truth)

@@ -15,7 +15,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, transform_points
 from ggslam.sequences import open_sequence
-from ggslam.slam.camera_fixtures import VIEWS, CameraFixtures, find_fixtures
+from ggslam.slam.filters.camera_fixtures import VIEWS, CameraFixtures, find_fixtures
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
 
@@ -148,12 +148,12 @@ def test_a_run_leaves_it_out(room: Path) -> None:
         color = np.where(part[..., None], np.uint8(200), given.color)
         slam.step(dataclasses.replace(given, color=color, depth=np.where(part, np.float32(0.2), given.depth)))
     result = slam.finish()
-    assert slam._fixtures.mask is not None and slam._fixtures.mask[part].mean() > 0.95
+    assert slam.filters.get(CameraFixtures).mask is not None and slam.filters.get(CameraFixtures).mask[part].mean() > 0.95
     assert any("fixed to the camera" in note for note in result.notes)
     means, birth = result.gaussians.means.numpy(), result.gaussians.birth_keyframe.numpy()
     assert len(result.keyframes) > 3
     for keyframe in result.keyframes:
-        assert not keyframe.depth[slam._fixtures.mask].any()
+        assert not keyframe.depth[slam.filters.get(CameraFixtures).mask].any()
         own = transform_points(means[birth == keyframe.index], keyframe.T_camera_world)
         assert len(own) == 0 or own[:, 2].min() > 0.3
         seen = transform_points(slam.surface.points([keyframe.index]), inverse(slam.surface.poses[keyframe.index]))

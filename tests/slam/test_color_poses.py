@@ -174,7 +174,7 @@ def test_what_hides_the_map_is_not_compared(room: Path, monkeypatch: pytest.Monk
     frame = sequence.frame(1)
     moving = np.zeros(frame.depth.shape, bool)
     moving[40:60, 50:90] = True
-    tracking = slam.track(slam.receive(frame))
+    tracking = slam.track([slam.clean(frame)]).joint
     slam.poses.add(frame, tracking)
     slam.color_poses.note(dataclasses.replace(frame, moving=moving), tracking)
     monkeypatch.setattr(color_poses, "align_view", lambda _grey, _rendered, _depth, alpha, *_: seen.append(alpha))
@@ -213,9 +213,9 @@ def test_a_pose_that_contradicts_the_tracker_is_not_believed(room: Path, monkeyp
     for shift, believed in ((1e-3, True), (0.5, False)):
         moved = se3_exp(np.array([shift, 0, 0, 0, 0, 0]))
         monkeypatch.setattr(color_poses, "align_view", lambda *_, moved=moved: moved)
-        frame = slam.receive(sequence.frame(1))
+        frame = slam.clean(sequence.frame(1))
         before, align = [], slam.color_poses.align
         monkeypatch.setattr(slam.color_poses, "align", lambda f, r, a=align, b=before: (b.append(r), a(f, r))[1])
-        found = slam.track(frame)
+        found = slam.track([frame]).joint
         assert np.allclose(found.T_world_camera, before[-1].T_world_camera @ inverse(moved if believed else np.eye(4)))
         slam.tracker.state.motion.velocity = np.eye(4)

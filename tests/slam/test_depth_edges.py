@@ -13,7 +13,7 @@ from ggslam.geometry.soft_edges import edge_sharpness, soft_edges
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.slam.config import load_config
-from ggslam.slam.depth_edges import DepthEdges
+from ggslam.slam.filters.depth_edges import DepthEdges
 from ggslam.slam.slam import Slam
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)

@@ -61,8 +61,8 @@ def test_what_was_carried_away_leaves_map_and_keyframes(carried_away: Slam) -> N
 
 def test_where_nothing_changed_all_stays() -> None:
     slam = two_visits(BOX)
-    assert slam.earlier_views.counted
-    assert slam.earlier_views.gaussians == 0 and not slam.earlier_views.notes()
+    assert slam.filters.get(EarlierViews).counted
+    assert slam.filters.get(EarlierViews).gaussians == 0 and not slam.filters.get(EarlierViews).notes()
     assert all(keyframe.moving is None for keyframe in slam.mapper.keyframes)
 
 
@@ -75,7 +75,7 @@ def test_what_stands_before_an_earlier_view_is_left_out_of_it() -> None:
     first = slam.mapper.keyframes[0]
     box = (picture(0, 0, BOX).color == RED).all(2)
     assert first.moving is not None and first.moving[box].mean() > 0.7 and first.moving[~box].mean() < 0.05
-    assert slam.earlier_views.gaussians == 0
+    assert slam.filters.get(EarlierViews).gaussians == 0
 
 
 def test_another_run_goes_on_bit_for_bit() -> None:

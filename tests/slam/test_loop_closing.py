@@ -32,6 +32,7 @@ from ggslam.sequences import open_sequence
 from ggslam.slam.config import Config, load_config
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.saved_places import PLACES_FILE
+from ggslam.slam.schedules import NewKeyframe
 from ggslam.slam.slam import Slam
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise
@@ -94,7 +95,7 @@ def test_a_loop_is_closed_and_everything_follows(
     view = CpuRasterizer(context=slam.context).forward(slam.map, slam.camera, last.T_camera_world, features=False)
     seen = (last.depth_m() > 0) & (view.alpha.numpy() > 0.7)
     assert np.abs(view.expected_depth.numpy() - last.depth_m())[seen].mean() < 0.05
-    slam._follow_moves()  # the tracker hears of it with the next frame
+    slam.follow_corrections()  # the tracker hears of it with the next frame
     assert slam.moves_followed == len(closed) and slam.tracker.target is slam.surface.target
 
 
@@ -111,7 +112,7 @@ def test_a_loop_within_the_view_is_closed(frames: list[Frame], unconfirmed: tupl
 def test_without_drift_old_keyframes_agree_and_nothing_moves(frames: list[Frame]) -> None:
     slam, truth = drifting(frames, IN_VIEW, drift=0.0)
     assert slam.loops is not None
-    assert {e.kind for e in slam.loops.events} == {"agreed"} and slam.corrections == 0
+    assert {e.kind for e in slam.loops.events} == {"agreed"} and len(slam.corrections) == 0
     np.testing.assert_allclose(slam.loops.poses, truth, atol=1e-9)
 
 
@@ -164,9 +165,9 @@ def test_a_keyframe_from_before_the_loss_that_comes_late_hangs_on_the_one_before
     last, count = loops.poses[-1].copy(), len(loops.poses)
     loops._found_at = (1000, 0)  # the tracker was lost and found at keyframe 0 by frame 1000
     late = TrackingResult(last, TrackingStatus.OK, 1.0, 0.0, "", points)
-    slam.insert(dataclasses.replace(frames[4], index=990), late, slam.moves_followed)
+    slam.map_keyframe(NewKeyframe(dataclasses.replace(frames[4], index=990), late, slam.moves_followed))
     assert loops.graph._tree.parents[count] == count - 1 and count not in loops.activity.active
-    slam.insert(dataclasses.replace(frames[4], index=1001), late, slam.moves_followed)
+    slam.map_keyframe(NewKeyframe(dataclasses.replace(frames[4], index=1001), late, slam.moves_followed))
     assert loops.graph._tree.parents[count + 1] == 0 and count + 1 in loops.activity.active
     assert loops._found_at is None
 

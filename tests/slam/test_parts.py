@@ -398,7 +398,7 @@ def test_in_real_time_a_part_begins_before_its_keyframes_are_mapped(back: Path) 
     live, waited = RealtimeSlam(slam, 30), 0
     for frame in frames:
         live._step(frame)
-        waited += slam.part_start.target is not None
+        waited += slam.locator.part_start.target is not None
         while live._jobs.qsize() and frame.index % 4 == 0:
             live._insert_next()
     while live._jobs.qsize():

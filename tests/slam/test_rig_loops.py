@@ -16,6 +16,7 @@ from ggslam.sequences.rig import RigSequence
 from ggslam.slam.config import load_config
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.rig_slam import RigSlam
+from ggslam.slam.schedules import NewKeyframe
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
@@ -46,8 +47,8 @@ def there_and_back(sequence: RigSequence, loops: LoopSettings, blind: int | None
     T_world_first = np.eye(4)
     for k, i in enumerate(order):
         moves = slam.moves_followed
-        slam._follow_moves()
-        for T_new_old in slam._corrections._moves[moves:]:
+        slam.follow_corrections()
+        for T_new_old in slam.corrections.moves[moves:]:
             T_world_first = T_new_old @ T_world_first
         T_world_first = T_world_first @ inverse(truth[k - 1]) @ truth[k] @ step if k else T_world_first
         for number in range(2):
@@ -59,7 +60,7 @@ def there_and_back(sequence: RigSequence, loops: LoopSettings, blind: int | None
             # The second camera is 10 ms late: where it was by the truth, seen from the first one.
             T_first_camera = inverse(first[k]) @ sequence.ground_truth[index]
             tracking = TrackingResult(T_world_first @ T_first_camera, TrackingStatus.OK, 1.0, 0.0, "", points)
-            slam.insert(frame, tracking, slam.moves_followed)
+            slam.map_keyframe(NewKeyframe(frame, tracking, slam.moves_followed))
         slam.mapper.run(2)
     return slam, truth
 

@@ -14,7 +14,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
-from ggslam.slam.shutter_times import ShutterTimes
+from ggslam.slam.filters.shutter_times import ShutterTimes
 from ggslam.slam.slam import Slam
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -53,14 +53,14 @@ def followed(delay: float, steps: int = 2) -> ShutterTimes:
     """A camera that has gone on at the same pace, its depth so many seconds late."""
     shutters = ShutterTimes()
     for k in range(steps):
-        shutters.bring(frame(wall_from(np.eye(4)), k, delay))
+        shutters.clean(frame(wall_from(np.eye(4)), k, delay))
         shutters.follow(se3_exp(k * 0.1 * np.array([0.2, 0.0, 0.1, 0.0, 0.3, 0.0])))
     return shutters
 
 
 def test_the_motion_of_the_last_frames_goes_on() -> None:
     shutters, late = followed(0.04), se3_exp(0.4 * np.array([0.02, 0.0, 0.01, 0.0, 0.03, 0.0]))
-    brought = shutters.bring(frame(wall_from(late), 2, 0.04))
+    brought = shutters.clean(frame(wall_from(late), 2, 0.04))
     seen = brought.depth > 0
     assert brought.depth_delay == 0 and np.abs(brought.depth - wall_from(np.eye(4)))[seen].max() < 0.012
     np.testing.assert_allclose(shutters.T_color_depth, late, atol=1e-6)
@@ -68,14 +68,14 @@ def test_the_motion_of_the_last_frames_goes_on() -> None:
 
 def test_frames_are_left_alone_without_delay_motion_or_cause() -> None:
     together, slow, lost, wide = frame(wall_from(np.eye(4)), 2, 0.0), followed(0.04), followed(0.04), followed(0.04)
-    assert followed(0.0).bring(together) is together
+    assert followed(0.0).clean(together) is together
     late = frame(wall_from(np.eye(4)), 2, 0.04)
     slow.motion = np.eye(4)
-    assert slow.bring(late) is late  # nothing moves
+    assert slow.clean(late) is late  # nothing moves
     lost.follow(None)
-    assert lost.bring(late) is late
-    assert wide.bring(far := frame(wall_from(np.eye(4)), 2, 0.09)) is far  # nearer to the next frame's colour
-    assert ShutterTimes().bring(late) is late
+    assert lost.clean(late) is late
+    assert wide.clean(far := frame(wall_from(np.eye(4)), 2, 0.09)) is far  # nearer to the next frame's colour
+    assert ShutterTimes().clean(late) is late
 
 
 def test_a_correction_of_the_map_is_no_motion() -> None:
@@ -83,7 +83,7 @@ def test_a_correction_of_the_map_is_no_motion() -> None:
     assert shutters.motion is not None
     before, move = shutters.motion.copy(), se3_exp(np.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
     shutters.move(move)
-    shutters.bring(frame(wall_from(np.eye(4)), 2, 0.0))
+    shutters.clean(frame(wall_from(np.eye(4)), 2, 0.0))
     shutters.follow(move @ se3_exp(2 * 0.1 * np.array([0.2, 0.0, 0.1, 0.0, 0.3, 0.0])))
     assert np.linalg.norm(shutters.motion[:3, 3]) < 2 * np.linalg.norm(before[:3, 3])
 
@@ -96,9 +96,9 @@ def test_a_run_knows_the_motion_of_its_frames(room: Path) -> None:
     ]
     slam = Slam(frames[0].camera, config, False)
     for given in frames[:2]:
-        assert slam.receive(given) is given  # how the camera moves is not known yet
+        assert slam.clean(given) is given  # how the camera moves is not known yet
         slam.step(given)
-    brought = slam.receive(frames[2])
+    brought = slam.clean(frames[2])
     one, other = (slam.pose_of(f) for f in slam.frames)
     expected = moved_depth(frames[2].depth, slam.camera, se3_exp(0.2 * se3_log(inverse(one) @ other)))
     assert brought.depth_delay == 0 and (brought.depth != frames[2].depth).mean() > 0.3

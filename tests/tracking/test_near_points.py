@@ -84,7 +84,7 @@ def test_a_wary_tracker_bounds_near_points_for_a_while(frames: list[Frame]) -> N
     surface = MeasuredSurface(settings.target, context)
     first = tracker.track(frames[0])
     tracker.set_target(surface.add(first.points.read(), first.T_world_camera))
-    tracker.be_wary()
+    tracker.expect_motion()
     bounded = []
     for frame in frames[1:6]:
         depth = with_passer_by(frame, 40)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -100,14 +100,6 @@ class SlamLoop:
             paced = RealtimeSlam(slam, self.config.realtime_fps, live=isinstance(sequence, LiveSequence))
             paced.run(frames, lambda *step: self._report(slam, *step))
             return
-        if isinstance(slam, RigSlam):
-            self._instants(slam, frames)
-            return
-        for frame in frames:
-            self._between_steps = False
-            self._report(slam, frame, slam.step(frame))
-
-    def _instants(self, slam: RigSlam, frames: Iterable[Frame]) -> None:
         for together in by_instant(frames):
             self._between_steps = False
             steps = slam.step_together(together)
@@ -129,7 +121,7 @@ class SlamLoop:
 
     def _refine(self, slam: Slam) -> SlamResult:
         self.saw_all = True
-        slam.settle_parts()
+        slam.join_parts()
         wanted = slam.refinement_steps
         if wanted:
             self.observer.begin("refine", wanted)

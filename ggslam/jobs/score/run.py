@@ -33,7 +33,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
 from ggslam.sequences.rig import RigSequence
-from ggslam.slam.camera_fixtures import CameraFixtures, find_fixtures
+from ggslam.slam.filters.camera_fixtures import CameraFixtures, find_fixtures
 from ggslam.system.atomic import make_folder, write_text
 from ggslam.system.csv_text import csv_text
 

@@ -43,8 +43,8 @@ class LiveVolumes:
         if slam.mapper.identity is not None:
             self._current = slam.mapper.identity.current
         start = time.perf_counter()
-        if slam.corrections > self._corrections:
-            self._corrections = slam.corrections
+        if len(slam.corrections) > self._corrections:
+            self._corrections = len(slam.corrections)
             self.maps.rebuild(self._views(slam.mapper.keyframes))
         if report.frame.status == TrackingStatus.LOST.value:
             return

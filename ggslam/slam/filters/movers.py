@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves in the frames of a run, kept out of tracking, map and places."""
+"""Finds what moves in the frames of a run and keeps it out of tracking, map and places."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.geometry.moved_depth import largest_shift
+from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.movers.detector import GROWN, MoverDetector, coarse_factor, grow
 from ggslam.movers.evidence import CoarseView, Margin
 from ggslam.movers.recent import RecentFrame
@@ -19,6 +20,8 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
+from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
+from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
@@ -31,9 +34,11 @@ SWIFT = 3.0
 first row and the last, if they are a thirtieth of a second apart."""
 DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
+LOOKED_BACK = 64
+"""So many of the latest keyframes are searched for what has moved since."""
 
 
-class RunMovers:
+class MoverFilter(FrameFilter):
     """Finds movers in each located frame, if the settings want it; else frames and results stay as they are.
 
     Args:
@@ -42,6 +47,8 @@ class RunMovers:
         context: that evidence is computed in; it may be replaced.
     """
 
+    order = 40
+    in_rigs = InRigs.SHARED  # switched off by the settings of a rig: frames of different cameras follow one another
     _before: tuple[float, Pose] | None
 
     def __init__(self, settings: MoverSettings, reads_masks: bool, context: NativeContext) -> None:
@@ -55,6 +62,12 @@ class RunMovers:
         self._before = None
         """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
 
+    @classmethod
+    def make(cls, made_of: FilterContext) -> MoverFilter:
+        """One as the settings want it."""
+        config = made_of.config
+        return cls(config.movers, config.masks.source in ("auto", "recording"), made_of.context)
+
     @property
     def active(self) -> bool:
         """Whether anything is looked for."""
@@ -65,8 +78,11 @@ class RunMovers:
         """What moves in the frame tracked last, bool [H, W]; None: nothing, as far as is known."""
         return self.detector.mask
 
-    @property
-    def may_move(self) -> bool:
+    def use_context(self, context: NativeContext) -> None:
+        """Evidence is computed in the tracker's thread, in this context."""
+        self.context = context
+
+    def expects_motion(self) -> bool:
         """Whether something in the frame tracked last moves, or may."""
         return self.detector.found is not None
 
@@ -74,10 +90,18 @@ class RunMovers:
         """The frame to locate: without depth where something is expected to move."""
         return self.detector.expect(frame) if self.active else frame
 
-    def look(self, frame: Frame, result: TrackingResult, noise: DepthNoise | None) -> TrackingResult:
-        """Finds what moves in a frame that was located; returns the result without points of it."""
+    def located(
+        self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
+    ) -> tuple[Frame, TrackingResult]:  # fmt: skip
+        """The frame without depth where something moves, which `Frame.moving` tells, and the result without points
+        of it."""
         if not self.active:
-            return result
+            return frame, result
+        result = self._look(frame, result, noise)
+        return self.detector.clean(frame), result
+
+    def _look(self, frame: Frame, result: TrackingResult, noise: DepthNoise | None) -> TrackingResult:
+        """Finds what moves in a frame that was located; returns the result without points of it."""
         noise = noise or DepthNoise()
         self._margin = _margin(self.detector.settings, noise)
         known = result.status not in DOUBTFUL
@@ -103,9 +127,18 @@ class RunMovers:
         shift = largest_shift(inverse(T_world_camera) @ before[1], frame.camera, depth_m)
         return shift > SWIFT * frame.camera.width * (frame.timestamp - before[0])
 
-    def clean(self, frame: Frame) -> Frame:
-        """The frame that `look` saw last without depth where something moves, which `Frame.moving` tells."""
-        return self.detector.clean(frame) if self.active else frame
+    def after_insertion(self, removal: MapRemoval, newest: Frame) -> None:
+        """Removes what was mapped before it began to move, as far as the newest frame, which has just become a
+        keyframe, looks through where it was."""
+        if not self.has_trail or removal.is_paged:
+            return
+        keyframes = removal.keyframes
+        latest, earlier = keyframes[-1], [k for k in keyframes[-1 - LOOKED_BACK : -1] if k.frame_index != ELSEWHERE]
+        views = [(k.depth_m(), k.T_world_camera, k.mask) for k in earlier]
+        gone = self.gone_since(views, newest, latest.T_world_camera)
+        parts = [(k, part) for k, part in zip(earlier, gone, strict=True) if part is not None]
+        if parts:
+            removal.drop_moved(parts)
 
     @property
     def has_trail(self) -> bool:

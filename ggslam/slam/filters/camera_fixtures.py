@@ -15,7 +15,11 @@ from ggslam.geometry.fixed_to_camera import compare_views, parts_with_seeds, shr
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
+from ggslam.slam.filters.frame_filter import FrameFilter
+from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import DepthImage, Form, Mask, Pose
+from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 COLUMNS = 80
 """Of the images that are compared, about."""
@@ -39,7 +43,7 @@ this share of the scene's distance: such depth is its flying pixels."""
 
 
 @dataclass
-class CameraFixtures:
+class CameraFixtures(FrameFilter):
     """Looks at the first located frames that are apart from one another.
 
     Attributes:
@@ -52,6 +56,8 @@ class CameraFixtures:
         latest: depth as compared, and pose, of the latest views.
     """
 
+    order = 30
+
     mask: Mask | None = None
     nearest: float = 0.0
     changes: int = 0
@@ -61,8 +67,10 @@ class CameraFixtures:
     latest: list[tuple[Annotated[np.ndarray, Form("f4", None, None)], Pose]] = field(default_factory=list)
     _depth: DepthImage | None = None
     """Of the frame at hand, as the camera gave it."""
+    _left_out: int = 0
+    """Of `changes`, those that the map knows of."""
 
-    def notes(self) -> list[str]:
+    def notes(self, frames: int) -> list[str]:
         """What the user should know."""
         if self.mask is None:
             return []
@@ -76,6 +84,21 @@ class CameraFixtures:
         valid = ~self.mask if frame.valid is None else frame.valid & ~self.mask
         fixed = self.mask | (frame.depth < self.nearest)
         return replace(frame, depth=np.where(fixed, np.float32(0), frame.depth), valid=valid)
+
+    def located(
+        self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
+    ) -> tuple[Frame, TrackingResult]:  # fmt: skip
+        """The same; what the frame shows may be compared with later ones."""
+        self.follow(frame.camera, None if result.status is TrackingStatus.LOST else result.T_world_camera)
+        return frame, result
+
+    def after_insertion(self, removal: MapRemoval, newest: Frame) -> None:
+        """Removes what has turned out to be fixed to the camera."""
+        if self.mask is None or (self.changes == self._left_out and not newest.depth[self.mask].any()):
+            return
+        self._left_out = self.changes
+        if not removal.is_paged:
+            removal.drop_pixels(self.mask, self.nearest)
 
     def follow(self, camera: Camera, T_world_camera: np.ndarray | None) -> None:
         """The frame that `clean` was asked about last was located at a pose [4, 4], or not (None)."""

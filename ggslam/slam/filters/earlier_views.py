@@ -24,7 +24,9 @@ from ggslam.movers.outdated import (
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points, turning_angle
-from ggslam.slam.run_movers import SURE
+from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
+from ggslam.slam.filters.movers import SURE
+from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult
@@ -39,22 +41,46 @@ SAMPLES = 5
 
 
 @dataclass
-class EarlierViews:
+class EarlierViews(FrameFilter):
     """What a run's own keyframes say of those of the map it began with.
 
     Attributes:
+        context: that evidence is computed in.
         views: of the earlier keyframes that were compared, by number.
         counted: T_world_camera [4, 4] of the keyframes whose evidence counts.
         gaussians: how many left the map.
+        noise: of the depth camera, as far as it is known.
     """
 
+    order = 50
+    in_rigs = InRigs.SHARED
+
+    context: NativeContext
     views: dict[int, EarlierView] = field(default_factory=dict)
     counted: list[Pose] = field(default_factory=list)
     gaussians: int = 0
+    noise: DepthNoise | None = None
+
+    @classmethod
+    def make(cls, made_of: FilterContext) -> EarlierViews:
+        """One that has compared nothing yet."""
+        return cls(made_of.context)
+
+    def located(
+        self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
+    ) -> tuple[Frame, TrackingResult]:  # fmt: skip
+        """The same; the noise is known from now on."""
+        self.noise = noise or self.noise
+        return frame, result
+
+    def before_insertion(self, removal: MapRemoval, newest: Frame, tracking: TrackingResult) -> None:
+        """Removes what the map that the run began with shows, and the newest frame and others before look through."""
+        found = self.look(removal.keyframes, newest, tracking)
+        if found:
+            self.gaussians += removal.drop_outdated(found)
 
     def look(
-        self, keyframes: Sequence[Keyframe], newest: Frame, tracking: TrackingResult, noise: DepthNoise | None,
-        context: NativeContext,
+        self, keyframes: Sequence[Keyframe], newest: Frame, tracking: TrackingResult
     ) -> list[tuple[Keyframe, OutdatedParts]]:  # fmt: skip
         """What turns out to be outdated with a frame that is about to become a keyframe.
 
@@ -62,9 +88,8 @@ class EarlierViews:
             keyframes: of the run so far.
             newest: the frame, without what moves in it.
             tracking: where it is; one that is not surely located says nothing.
-            noise: of the depth camera.
-            context: that it is computed in.
         """
+        noise, context = self.noise, self.context
         T_world_newest = tracking.T_world_camera
         if tracking.status not in SURE or noise is None or not self._is_new(T_world_newest):
             return []
@@ -89,13 +114,13 @@ class EarlierViews:
         found = [(k, self._find_outdated(k)) for k in near if self.views[k.index].fresh]
         return [(k, parts) for k, parts in found if parts is not None]
 
-    def forget(self) -> None:
-        """A loop was closed: what was said with keyframes where they are no more does not count."""
+    def loop_closed(self) -> None:
+        """Forgets evidence: what was said with keyframes where they are no more does not count."""
         self.counted.clear()
         for view in self.views.values():
             view.forget()
 
-    def notes(self) -> list[str]:
+    def notes(self, frames: int) -> list[str]:
         """What the user should know."""
         if not self.gaussians:
             return []

@@ -9,6 +9,7 @@ import numpy as np
 
 from ggslam.geometry.soft_edges import edge_sharpness, soft_edges
 from ggslam.scene.frame import Frame
+from ggslam.slam.filters.frame_filter import FrameFilter, InRigs
 
 SHARP = 0.4
 """Outlines are sharp if this share of the change lies between two neighbouring pixels, in the median."""
@@ -17,13 +18,16 @@ FEWEST, FRAMES = 200, 30
 
 
 @dataclass
-class DepthEdges:
+class DepthEdges(FrameFilter):
     """Finds out in the first frames whether outlines of depth are sharp, and drops slopes where they are not.
 
     Attributes:
         soft: whether they are slopes; None: not known yet.
         frames: looked at so far.
     """
+
+    order = 10
+    in_rigs = InRigs.PER_CAMERA
 
     soft: bool | None = None
     frames: int = 0

@@ -10,7 +10,10 @@ import numpy as np
 from ggslam.geometry.moved_depth import largest_shift, moved_depth
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
+from ggslam.slam.filters.frame_filter import FrameFilter, InRigs
 from ggslam.system.array_forms import Pose
+from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 LEAST_SHIFT = 0.5
 """Pixels by which depth and colour have to be apart in a corner of the image."""
@@ -21,7 +24,7 @@ LARGEST_SHARE = 0.6
 
 
 @dataclass
-class ShutterTimes:
+class ShutterTimes(FrameFilter):
     """Knows where the depth camera was when it took the last images: its motion is taken to go on.
 
     Attributes:
@@ -32,6 +35,9 @@ class ShutterTimes:
         T_world_depth: where the depth camera was before, None if it was not located; `time_before` when.
     """
 
+    order = 20
+    in_rigs = InRigs.PER_CAMERA
+
     motion: Pose | None = None
     interval: float = 0.0
     T_color_depth: Pose = field(default_factory=lambda: np.eye(4))
@@ -39,7 +45,7 @@ class ShutterTimes:
     T_world_depth: Pose | None = None
     time_before: float = 0.0
 
-    def bring(self, frame: Frame) -> Frame:
+    def clean(self, frame: Frame) -> Frame:
         """The frame with depth as of the time of its colour: itself if they are together, or hardly anything moves."""
         self.time, self.T_color_depth = frame.timestamp + frame.depth_delay, np.eye(4)
         if not frame.depth_delay or self.motion is None or not 0 < self.interval <= LONGEST_S:
@@ -54,8 +60,15 @@ class ShutterTimes:
         self.T_color_depth = T_color_depth
         return replace(frame, depth=moved_depth(frame.depth, frame.camera, T_color_depth), depth_delay=0.0)
 
+    def located(
+        self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
+    ) -> tuple[Frame, TrackingResult]:  # fmt: skip
+        """The same; the depth camera's motion up to this frame is known from now on."""
+        self.follow(None if result.status is TrackingStatus.LOST else result.T_world_camera)
+        return frame, result
+
     def follow(self, T_world_camera: np.ndarray | None) -> None:
-        """The frame was located at a pose [4, 4], or not (None)."""
+        """The frame that `clean` was asked about last was located at a pose [4, 4], or not (None)."""
         now = None if T_world_camera is None else T_world_camera @ self.T_color_depth
         self.motion = None
         if now is not None and self.T_world_depth is not None:

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When keyframes are mapped and the map is trained: after each frame, or beside the next ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ggslam.scene.frame import Frame
+from ggslam.tracking.tracker import TrackingResult
+
+if TYPE_CHECKING:
+    from ggslam.slam.slam import Slam
+
+
+@dataclass(frozen=True)
+class NewKeyframe:
+    """A frame that becomes a keyframe.
+
+    Attributes:
+        frame: as the run uses it.
+        tracking: where it is.
+        moves_followed: how many corrections of the map this pose knows of.
+    """
+
+    frame: Frame
+    tracking: TrackingResult
+    moves_followed: int
+
+
+class Schedule:
+    """Maps and trains after each frame: everything one after the other in one thread, so that runs repeat bit for bit.
+    """
+
+    takes_keyframes = True
+    """Whether a keyframe that is found now will be mapped."""
+
+    def begin_step(self) -> None:
+        """A step begins."""
+
+    def beside_mapping(self) -> AbstractContextManager[object]:
+        """Context in which frames are located."""
+        return nullcontext()
+
+    def map(self, slam: Slam, keyframes: Sequence[NewKeyframe], frames: int) -> None:
+        """Maps the keyframes of a step, and trains the map.
+
+        Args:
+            slam: the run.
+            keyframes: new ones; there may be none.
+            frames: of the step, by which the training is counted.
+        """
+        before = len(slam.mapper.keyframes)
+        if keyframes:
+            slam.tracker.target = None  # the surface may be made anew; the next frame gets what it is then
+        for keyframe in keyframes:
+            slam.map_keyframe(keyframe)
+        slam.train(frames, before)
+
+
+class BesideTraining(Schedule):
+    """The same on a GPU: the points of the last keyframe join the surface while the host hands the step's training to
+    the GPU."""
+
+    def map(self, slam: Slam, keyframes: Sequence[NewKeyframe], frames: int) -> None:
+        before = len(slam.mapper.keyframes)
+        if not keyframes:
+            slam.train(frames, before)
+            return
+        slam.tracker.target = None
+        for keyframe in keyframes[:-1]:
+            slam.map_keyframe(keyframe)
+        slam.map_keyframe(keyframes[-1], train=lambda: slam.train(frames, before))
