@@ -91,7 +91,7 @@ class GeometricSettings:
 
 
 @settings_class(frozen=True)
-class UnitingSettings:
+class SameObjectSettings:
     """When objects of two maps, or of both ends of a loop, are one thing."""
 
     voxel: float = setting(0.04, 1e-3, 10, "m")
