@@ -29,6 +29,11 @@ def test_every_module_serves_a_command_or_the_public_face(monkeypatch: pytest.Mo
     assert "ggslam.volumes.raycast" in house.unused_modules()
 
 
+def test_every_room_has_a_purpose() -> None:
+    assert "else" not in house.lines_by_purpose()
+    assert house.code_lines('"""Text."""\n\n# why\nx = 1  # so\ny = """a\nb"""\n') == 3
+
+
 def test_it_knows_what_it_looks_for() -> None:
     assert all(house.is_bare_participle(name) for name in ("kept", "_named", "sorted_again", "found_in"))
     assert not any(house.is_bare_participle(name) for name in ("keep", "needs", "string", "built_map", "_timing"))

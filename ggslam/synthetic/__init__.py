@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A generated recording: a furnished room (`scene`, `room`), a ring of rooms and corridors (`house`) or a long
-corridor (`corridor`), ray-cast (`raycast`) and written out (`writer`)."""
+"""A generated recording: a furnished room (`scene`, `room`), or a ring of rooms or a long corridor (`houses`), ray-cast
+(`raycast`) and written out (`writer`)."""
 
-from ggslam.synthetic.corridor import furnished_corridor
 from ggslam.synthetic.exposure import Shutter
-from ggslam.synthetic.house import ring_of_rooms
 from ggslam.synthetic.movers import MOVERS
 from ggslam.synthetic.raycast import RayCaster, RayImages
 from ggslam.synthetic.rig import write_synthetic_rig
@@ -26,9 +24,7 @@ __all__ = [
     "Shape",
     "Shutter",
     "camera_path",
-    "furnished_corridor",
     "furnished_room",
-    "ring_of_rooms",
     "write_synthetic_rig",
     "write_synthetic_sequence",
 ]

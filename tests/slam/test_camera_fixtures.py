@@ -15,8 +15,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, transform_points
 from ggslam.sequences import open_sequence
-from ggslam.slam.filters.camera_fixtures import VIEWS, CameraFixtures, find_fixtures
 from ggslam.slam.config import load_config
+from ggslam.slam.filters.camera_fixtures import VIEWS, CameraFixtures, find_fixtures
 from ggslam.slam.slam import Slam
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
