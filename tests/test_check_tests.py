@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `scripts/check_tests.py` breaks on purpose is still there to be broken."""
+"""What `scripts/tools/check_tests.py` breaks on purpose is still there to be broken."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "scripts"))
+sys.path.insert(0, str(ROOT / "scripts" / "tools"))
 from check_tests import FAULTS, Fault, applied  # noqa: E402
 
 

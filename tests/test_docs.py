@@ -33,7 +33,7 @@ def check_page(script: str) -> None:
     """Runs a script of ours with `--check`, in this process: another one would load everything again."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [script, "--check"])
-        runpy.run_path(str(ROOT / "scripts" / script), run_name="__main__")
+        runpy.run_path(str(ROOT / "scripts" / "tools" / script), run_name="__main__")
 
 
 @pytest.mark.long("every example of a page, in order")
@@ -93,7 +93,7 @@ def test_scripts_and_files_that_are_named_exist(page: Path) -> None:
     text = page.read_text()
     for name in re.findall(r"`((?:ggslam|scripts|examples|tests|configs)/[\w/.-]+)`", text):
         assert (ROOT / name).exists() or (ROOT / f"{name}.py").exists(), name
-    for command in re.findall(r"python (scripts/\w+\.py[^`]*)", text):
+    for command in re.findall(r"python (scripts/[\w/]+\.py[^`]*)", text):
         path, *words = command.split()
         source = (ROOT / path).read_text()
         assert [w for w in words if w.startswith("--") and f'"{w.strip("[],")}"' not in source] == [], command

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Disks that are really full or read-only, and folders that vanish, as scripts/fault_table.py lets them happen."""
+"""Disks that are really full or read-only, and folders that vanish, as fault_table.py lets them happen."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+SCRIPTS = Path(__file__).parents[1] / "scripts" / "tools"
 
 
 @pytest.fixture(scope="module")

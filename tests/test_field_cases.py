@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""scripts/field.py: what counts as met, and its tables."""
+"""scripts/benchmarks/field.py: what counts as met, and its tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+SCRIPTS = Path(__file__).parents[1] / "scripts" / "benchmarks"
 sys.path.insert(0, str(SCRIPTS))
 
 from field_cases import CASES, Between, Case, Ends, Outcome, Says, naming  # noqa: E402

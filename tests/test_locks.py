@@ -29,7 +29,7 @@ def test_every_line_names_a_version_and_a_sum() -> None:
 
 
 def test_the_locks_have_what_the_project_names() -> None:
-    script = ROOT / "scripts" / "make_locks.py"
+    script = ROOT / "scripts" / "tools" / "make_locks.py"
     done = subprocess.run([sys.executable, script, "--check"], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
 

@@ -19,7 +19,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, open_recording_of
 from ggslam.runs.records.metrics import MetricsRecord
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts" / "tools"))
 from scramble_masks import scramble_recording  # noqa: E402
 
 

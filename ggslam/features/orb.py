@@ -12,6 +12,7 @@ import numpy as np
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.array_forms import ColorImage, DepthImage, Form, Points32, Pose
+from ggslam.system.savable import savable
 from ggslam.system.settings import setting, settings_class
 
 
@@ -41,6 +42,7 @@ class Features:
     descriptors: np.ndarray
 
 
+@savable()
 @dataclass(frozen=True)
 class Landmarks:
     """Features with depth: all of a view that it takes to find a pose relative to it, without its images.
@@ -57,6 +59,7 @@ class Landmarks:
         return len(self.points)
 
 
+@savable(not_saved="_features")
 @dataclass
 class FeatureView:
     """A frame as the feature matcher needs it.

@@ -4,7 +4,7 @@
 Neighbours are merged in pairs, those first that differ least: in the manner of Ward (1963), a pair costs what a
 weighted variance grows by, of positions in units of the Gaussians' own size and of colours. The weight of a Gaussian
 is the area that it hides. In a round each Gaussian is merged with one other at most, so that levels get coarser
-everywhere. `scripts/bench_levels.py` compares this with other ways.
+everywhere. `scripts/benchmarks/bench_levels.py` compares this with other ways.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _COLOR_WEIGHT = 10.0
 _MATCHINGS = 6
 _SPREAD = 1.6
 """By this the distance of merged Gaussians counts more in their variance than a sum of both would have it: Gaussians of
-the right variance fall off too fast to leave no gaps to the next. Chosen by `scripts/bench_levels.py`."""
+the right variance fall off too fast to leave no gaps to the next. Chosen by `scripts/benchmarks/bench_levels.py`."""
 _MOST_OPAQUE = 0.99
 _LEAST_VARIANCE = 1e-12
 """Square metres."""

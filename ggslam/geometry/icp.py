@@ -3,7 +3,7 @@
 Multiple Range Images", 1992).
 
 For clouds that are compared once. The tracker aligns a frame to voxels of Gaussians instead, by compiled G-ICP, see
-`tracking.gicp`; `scripts/kdtree_gicp.py` is what that is measured against and shares nothing with either on purpose.
+`tracking.gicp`; `kdtree_gicp.py` is what that is measured against and shares nothing with either on purpose.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 """Declares the functions of a compiled library as its headers do, and refuses a library that was compiled from others.
 
 `core/` has the headers of the compiled core, `cuda/` those of the CUDA kernels, each with its Python mirror beside it;
-both are written by `scripts/make_native_mirrors.py`.
+both are written by `scripts/tools/make_native_mirrors.py`.
 """
 
 from __future__ import annotations

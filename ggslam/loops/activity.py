@@ -16,6 +16,7 @@ from typing import Annotated
 import numpy as np
 
 from ggslam.system.array_forms import Form, Points64, check_indices
+from ggslam.system.savable import savable
 from ggslam.system.settings import setting, settings_class
 
 _SHARE = 8
@@ -43,6 +44,7 @@ class ActivitySettings:
     the same way again and again needs no more of them, and gathering their surface takes no longer in a long run."""
 
 
+@savable(not_saved="settings", check="check")
 class ActiveKeyframes:
     """Keeps the set of active keyframes as the camera moves.
 

@@ -18,8 +18,10 @@ from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.uncertainty import adjoint, covariance_in_frame
 from ggslam.scene.poses import inverse, orthonormalize, se3_exp, se3_log
 from ggslam.system.array_forms import Covariance6, Pose
+from ggslam.system.savable import savable
 
 
+@savable()
 @dataclass(frozen=True)
 class Link:
     """Odometry or a closure: keyframe j seen from i at T_i_j [4, 4]; covariance [6, 6] of a left twist in frame i."""

@@ -11,8 +11,10 @@ from ggslam.errors import FormatError
 from ggslam.loops.uncertainty import covariance_in_frame
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.array_forms import Covariance6, Pose
+from ggslam.system.savable import savable
 
 
+@savable(growing="parents poses covariances steps", check="check")
 @dataclass
 class OdometryTree:
     """Odometry as dead reckoning: every node hangs on an earlier one.

@@ -11,8 +11,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from ggslam.system.array_forms import check_indices
+from ggslam.system.savable import savable
 
 
+@savable(check="check")
 @dataclass
 class KeyframeParts:
     """Which part each keyframe belongs to.

@@ -23,11 +23,13 @@ from ggslam.loops.settings import PlaceSettings
 from ggslam.loops.word_lists import WordLists
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, check_arrays
+from ggslam.system.savable import savable
 
 _SEED = 0
 _THUMBNAIL = (40, 30)
 
 
+@savable()
 @dataclass(frozen=True)
 class Place:
     """What a view is known by.
@@ -51,6 +53,10 @@ class PlaceMatch:
     score: float
 
 
+@savable(
+    not_saved="camera settings _bits _fern_pixels _fern_colors _fern_depths _lists", growing="_places",
+    after="list_again", check="check",
+)  # fmt: skip
 class PlaceIndex:
     """Keyframes by what they look like.
 

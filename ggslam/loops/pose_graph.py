@@ -24,6 +24,7 @@ from ggslam.loops.settings import GraphSettings
 from ggslam.loops.uncertainty import covariance_in_frame, covariance_of
 from ggslam.scene.poses import inverse, se3_log, so3_log
 from ggslam.system.array_forms import Pose, check_indices
+from ggslam.system.savable import savable
 
 _SHORTEST = 0.01
 """Metres: standing still counts as a path of this length, so that no motion is held to be exact."""
@@ -71,6 +72,7 @@ class GraphResult:
     seconds: float
 
 
+@savable(not_saved="settings", growing="loops", check="check")
 class PoseGraph:
     """Keyframe poses, linked by odometry and closures.
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ggslam.scene.poses import so3_log
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 from ggslam.system.settings import setting, settings_class
 
 
@@ -41,6 +42,7 @@ class RevisitSettings:
     correction that waits to be confirmed."""
 
 
+@savable(not_saved="settings")
 class Revisits:
     """Remembers how far the camera went, and which keyframes were compared.
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 
 FIRST_CLASSES = 100
 """Rows allocated to begin with."""
@@ -17,6 +18,7 @@ ROW_LENGTH = 4.0
 CODE_LENGTH = 2.0
 
 
+@savable(check="check")
 class ClassNumbers:
     """Which class each object id has: numbers from 0 on, without gaps."""
 

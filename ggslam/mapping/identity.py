@@ -34,6 +34,7 @@ from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.system.array_forms import Form, check_indices
+from ggslam.system.savable import savable
 
 POOL_STEPS = 4
 """Steps' worth of pixels that are drawn from a keyframe at once."""
@@ -48,6 +49,7 @@ IDS = 65536
 _OfEachId = Annotated[np.ndarray, Form("u2", IDS)]
 
 
+@savable()
 @dataclass
 class IdentityTimes:
     """Seconds spent so far."""

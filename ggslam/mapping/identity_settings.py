@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of identity learning. `scripts/bench_identity.py` shows what the choices are worth."""
+"""Settings of identity learning. `scripts/benchmarks/bench_identity.py` shows what the choices are worth."""
 
 from __future__ import annotations
 

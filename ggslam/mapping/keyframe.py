@@ -14,6 +14,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.system.array_forms import ColorImage, Form, IdImage, Mask, MaybeNan, Pose
+from ggslam.system.savable import savable
 
 ELSEWHERE = -1
 """Frame index of keyframes that are of another recording than the run's: of the map that it began with."""
@@ -29,6 +30,7 @@ _IMAGES = ("color", "depth", "mask", "moving")
 Exposure = Annotated[np.ndarray, Form("f8", 3, 2, finite=True)]
 
 
+@savable(fixed="color depth mask moving", check="check")
 @dataclass
 class Keyframe:
     """Images are kept as integers: 8 bytes a pixel less than floats, for every keyframe of a long recording.
@@ -122,6 +124,7 @@ def depth_unit_for(depth: np.ndarray) -> float:
     return unit
 
 
+@savable()
 class PoseAdam:
     """Adam on the 6-D twist of one keyframe's pose (left perturbation in the camera frame, translation first)."""
 

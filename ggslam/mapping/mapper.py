@@ -33,6 +33,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.array_forms import Mask
+from ggslam.system.savable import savable
 
 BOUND_EVERY = 4
 """Iterations after which sizes and colours are bounded: free colours overshoot (13 % of a young map's Gaussians, by up
@@ -59,6 +60,7 @@ _YOUNG = ("log_scales", "opacity_logits", "sh_rest")
 """Groups whose first steps are longer."""
 
 
+@savable()
 @dataclass
 class MapperTimes:
     """Seconds spent so far in each part, and how often."""
@@ -79,6 +81,7 @@ class MapperTimes:
         return 1e3 * (self.forward + self.loss + self.backward + self.identity) / max(1, self.iterations)
 
 
+@savable()
 @dataclass
 class LossSums:
     """Sums over all steps so far of the terms of the loss, see `LossValues`: the loss itself, colour (L1), SSIM

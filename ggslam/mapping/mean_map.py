@@ -14,10 +14,12 @@ import torch
 
 from ggslam.rendering.types import PARAMETERS
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.savable import savable
 
 AVERAGED = tuple(name for name in PARAMETERS if name != "features")
 
 
+@savable()
 @dataclass
 class MeanMap:
     """Running mean of all parameters but the feature vectors.

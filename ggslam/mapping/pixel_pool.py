@@ -4,17 +4,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
 
 from ggslam.errors import FormatError
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 
 Array = TypeVar("Array", np.ndarray, torch.Tensor)
 
 
+@savable(save="state")
 @dataclass
 class PixelPool(Generic[Array]):
     """Pixels of one keyframe drawn for steps to come; arrays on the host or tensors on a device.
@@ -38,6 +40,10 @@ class PixelPool(Generic[Array]):
                 raise FormatError(f"pixels drawn ahead: {found}")
         if not 0 <= self.used <= len(self.pixels):
             raise FormatError(f"pixels drawn ahead: {self.used} of {len(self.pixels)} are used")
+
+    def state(self) -> dict[str, Any]:
+        """What is saved: the pixels that are left."""
+        return {"pixels": self.pixels[self.used :], "vote_weights": self.vote_weights[self.used :], "used": 0}
 
     def has(self, count: int) -> bool:
         """Whether so many pixels are left."""

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+from ggslam.system.savable import savable
+
 GOLDEN_RATIO = 0.6180339887498949
 
 
+@savable()
 class KeyframeSampler:
     """Low-discrepancy order: the t-th draw is keyframe floor(frac(t phi) n) of the n there are, phi the golden ratio.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the mapper. The defaults are one recipe for all recordings; scripts/bench_slam.py shows what it does."""
+"""Settings of the mapper. The defaults are one recipe for all recordings; bench_slam.py shows what it does."""
 
 from __future__ import annotations
 

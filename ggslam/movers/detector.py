@@ -24,6 +24,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.system.array_forms import Form, Mask
+from ggslam.system.savable import savable
 
 AGES = (1, 2, 4, 8, 16, 32, 48)
 """Each frame is compared with those so many frames before it."""
@@ -36,6 +37,7 @@ FEWEST_ROWS = 8
 """Rows and columns that the smaller images have at least, if the whole ones do."""
 
 
+@savable(not_saved="settings")
 @dataclass
 class MoverDetector:
     """Looks at located frames, each once and in their order.

@@ -23,6 +23,7 @@ from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.array_forms import DepthImage, Mask, Pose
+from ggslam.system.savable import savable
 
 SMOOTH = 2.5
 """Where depth varies by no more standard deviations of the camera than this its mean is compared."""
@@ -66,6 +67,7 @@ class Margin:
         return np.float32(self.constant) + np.float32(self.square) * z * z
 
 
+@savable(fixed="depth near far whole smooth")
 @dataclass(frozen=True)
 class CoarseView:
     """A located depth image, `factor` times smaller.

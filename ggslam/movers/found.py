@@ -9,10 +9,12 @@ from typing import Literal
 import numpy as np
 
 from ggslam.system.array_forms import Pose, Vector3
+from ggslam.system.savable import savable
 
 Kind = Literal["rigid", "not rigid", "unknown"]
 
 
+@savable()
 @dataclass(frozen=True)
 class MoverSight:
     """A mover in a frame.

@@ -22,6 +22,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.system.array_forms import Form, Mask
+from ggslam.system.savable import savable
 
 COLUMNS = 160
 """Pixels: width of the images that are compared, about; small things count."""
@@ -56,6 +57,7 @@ class OutdatedParts:
     hidden: np.ndarray
 
 
+@savable()
 @dataclass
 class EarlierView:
     """An earlier keyframe's depth, and what newer views say of its places.

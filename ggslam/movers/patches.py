@@ -10,6 +10,7 @@ import numpy as np
 from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.geometry.normals import estimate_normals, turn_toward
 from ggslam.scene.camera import Camera
+from ggslam.system.savable import savable
 
 MOST = 2000
 """Points: of more they are taken at regular distances."""
@@ -18,6 +19,7 @@ _OUTLYING = 3.0
 """Points so many times farther from the middle than half of them are of something else: masks are not exact."""
 
 
+@savable()
 @dataclass(frozen=True)
 class Patch(ColoredSurface):
     """Surface seen in one frame."""

@@ -13,6 +13,7 @@ from ggslam.movers.patches import Patch
 from ggslam.movers.surface import MoverSurface, PatchFit
 from ggslam.scene.poses import inverse, orthonormalize, se3_exp, so3_log
 from ggslam.system.array_forms import Form, Pose
+from ggslam.system.savable import savable
 
 AS_GOOD = 1.2
 """A mover stands still as long as the pose that it had explains what is seen that well against the best one."""
@@ -39,6 +40,7 @@ _TURN_COSTS_M = 0.004
 sides."""
 
 
+@savable()
 @dataclass
 class RigidTracker:
     """Follows one mover.

@@ -14,6 +14,7 @@ from ggslam.geometry.voxels import voxel_keys
 from ggslam.movers.patches import Patch
 from ggslam.scene.poses import inverse, orthonormalize, transform_points
 from ggslam.system.array_forms import Form, Points64
+from ggslam.system.savable import savable
 
 VOXEL = 0.006
 """Metres, of points that are kept."""
@@ -50,6 +51,7 @@ class PatchFit:
     apart_m: float
 
 
+@savable(not_saved="_tree")
 @dataclass
 class MoverSurface:
     """Points in the mover's own frame, a few millimetres apart.

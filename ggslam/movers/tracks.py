@@ -15,6 +15,7 @@ from ggslam.movers.recent import RecentFrame, Sight
 from ggslam.movers.rigid import RigidTracker
 from ggslam.scene.poses import inverse, transform_points, turning_angle
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 
 REMEMBERED = 16
 """Frames that are looked back at when something begins to move."""
@@ -32,6 +33,7 @@ _SPREAD = 3
 """Pixels about the points of a surface at which it may be seen."""
 
 
+@savable()
 @dataclass
 class Track:
     """One mover.
@@ -128,6 +130,7 @@ class Track:
         )  # fmt: skip
 
 
+@savable(not_saved="recent")
 @dataclass
 class MoverTracks:
     """All movers of a run.

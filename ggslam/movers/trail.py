@@ -16,6 +16,7 @@ from ggslam.movers.settings import MoverSettings
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 
 VOXEL = 0.05
 """Metres."""
@@ -24,6 +25,7 @@ SEED_SHARE = 0.1
 _STEPS = [neighbour_step(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
 
 
+@savable()
 @dataclass
 class Trail:
     """Voxels in and next to which something was seen that moved.

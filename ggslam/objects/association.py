@@ -22,6 +22,7 @@ from ggslam.objects.overlap import MapView, SegmentOverlap, number_ids, overlap_
 from ggslam.objects.settings import AssociationSettings
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, ObjectId
+from ggslam.system.savable import savable
 
 __all__ = ["Association", "Associator", "MapView"]
 
@@ -53,6 +54,7 @@ class Association:
     forgotten: list[int] = field(default_factory=list)
 
 
+@savable()
 class Associator:
     """Gives the segments of keyframe after keyframe ids that stay with their objects.
 

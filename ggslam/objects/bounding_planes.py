@@ -15,6 +15,7 @@ import numpy as np
 from ggslam.objects.overlap import SegmentOverlap
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ObjectId, Vector3
+from ggslam.system.savable import savable
 
 _STRIDE = 4
 _LEAST = 0.02
@@ -27,6 +28,7 @@ _SAME_DIRECTION, _SAME_PLACE = 0.995, 0.04
 """Cosine of the angle, and metres, between planes that are one."""
 
 
+@savable()
 @dataclass
 class BoundingPlane:
     """Unit normal [3] towards the camera, offset n . x, and the middle [3] of what was seen of it; world, metres."""
@@ -36,6 +38,7 @@ class BoundingPlane:
     middle: Vector3
 
 
+@savable()
 class BoundingPlanes:
     """Remembers which objects are floors and walls."""
 

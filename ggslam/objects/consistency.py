@@ -8,12 +8,14 @@ from scipy.optimize import linear_sum_assignment
 
 from ggslam.objects.overlap import SegmentOverlap
 from ggslam.system.array_forms import IdImage
+from ggslam.system.savable import savable
 
 _MIN_PIXELS = 20
 _MIN_CHANGE = 0.02
 _AGREE, _DISAGREE = 0.9, 0.6
 
 
+@savable()
 class ConsistencyJudge:
     """Compares the masks' ids with those of the map, keyframe by keyframe.
 

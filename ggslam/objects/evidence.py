@@ -11,11 +11,13 @@ import numpy as np
 from ggslam.objects.overlap import SegmentOverlap
 from ggslam.objects.settings import AssociationSettings
 from ggslam.system.array_forms import ObjectId
+from ggslam.system.savable import savable
 
 _MIN_WEIGHT = 0.05
 _FULLY_VISIBLE = 0.5
 
 
+@savable()
 @dataclass
 class _Pair:
     """What is known of two objects.
@@ -31,6 +33,7 @@ class _Pair:
     keyframes: set[int] = field(default_factory=set)
 
 
+@savable()
 class PairEvidence:
     """How often two objects lay together in one segment, and how often in segments of their own.
 

@@ -18,6 +18,7 @@ from ggslam.objects.overlap import SegmentOverlap
 from ggslam.objects.settings import AssociationSettings
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ObjectId, Vector3
+from ggslam.system.savable import savable
 
 _INSIDE = 0.6
 _MINOR = 0.5
@@ -25,6 +26,7 @@ _NEAR = 0.5
 _SIZE_RATIO = 1.6
 
 
+@savable()
 @dataclass
 class Fragment:
     """A place in the world where a part of an object was a segment of its own.
@@ -51,6 +53,7 @@ class Fragment:
         return self.parent == other.parent and near and larger < _SIZE_RATIO * smaller
 
 
+@savable()
 class FragmentMemory:
     """Collects fragments over keyframes."""
 

@@ -25,6 +25,7 @@ from ggslam.scene.object_names import object_label
 from ggslam.scene.oriented_box import OrientedBox, Vector
 from ggslam.system.atomic import write_text
 from ggslam.system.foreign import read_foreign_text
+from ggslam.system.savable import savable
 
 Supervision = Literal["masks", "associated masks", "geometry", "model"]
 """Where the ids came from: masks whose ids are constant in time; masks made consistent by association; the geometric
@@ -36,6 +37,7 @@ ObjectId = Annotated[int, pydantic.Field(ge=1, le=65535)]
 _VALUES_AT_ONCE = 1 << 22
 
 
+@savable()
 @dataclass(frozen=True)
 class Observation:
     """When an object was seen: first and last frame, and in how many views (keyframes)."""

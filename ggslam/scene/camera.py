@@ -10,8 +10,10 @@ from functools import lru_cache
 import numpy as np
 
 from ggslam.errors import InputError
+from ggslam.system.savable import savable
 
 
+@savable(checked=True)
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera without distortion.

@@ -11,8 +11,10 @@ import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ColorImage, DepthImage, Form, Mask, Pose
+from ggslam.system.savable import savable
 
 
+@savable()
 @dataclass(frozen=True)
 class Frame:
     """One RGB-D image pair with what is known about it.

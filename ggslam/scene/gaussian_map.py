@@ -6,12 +6,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 
 from ggslam.errors import FormatError, InputError
 from ggslam.scene.harmonics import harmonic_rotations
+from ggslam.system.savable import savable
 
 SH_C0 = 0.28209479177387814
 """Zeroth spherical-harmonic constant: colour = 0.5 + SH_C0 * sh[0] for degree 0."""
@@ -36,6 +38,7 @@ def sh_to_rgb(sh: torch.Tensor) -> torch.Tensor:
     return 0.5 + SH_C0 * sh
 
 
+@savable(save="state", take="set_state")
 @dataclass(eq=False)
 class GaussianMap:
     """3D Gaussians as arrays whose first `count` rows are in use. Float32 unless said otherwise.
@@ -100,6 +103,32 @@ class GaussianMap:
                 raise FormatError(f"{name} of Gaussians: expected {low} to {high}")
         if not bool(torch.isfinite(self._storage["means"][: self.count]).all()):
             raise FormatError("means of Gaussians: expected finite numbers")
+
+    # --- saved state ---------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """What is saved of the map: counters and the used rows of all arrays."""
+        counters = (
+            "sh_degree", "feature_channels", "with_moments", "compact_features", "count", "version", "order", "growth",
+        )  # fmt: skip
+        rows = {name: array[: self.count] for name, array in self._storage.items()}
+        return {**{name: getattr(self, name) for name in counters}, "capacity": self.capacity, "rows": rows}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Fills the map from what `state` gave. Raises ValueError or InputError if rows and counters do not fit."""
+        rows, capacity, count = saved.pop("rows"), saved.pop("capacity"), saved["count"]
+        expected = GaussianMap(
+            saved["sh_degree"], saved["feature_channels"], with_moments=saved["with_moments"],
+            compact_features=saved["compact_features"],
+        )  # fmt: skip
+        vars(self).update(vars(expected))
+        self.append(rows)  # checks them
+        if self.count != count or not count <= capacity <= 4 * count + 65536:
+            raise ValueError(f"{self.count} Gaussians instead of {count}")
+        self.shrink(0)
+        self.growth = 0.0
+        self.reserve(capacity)
+        vars(self).update(saved)
 
     # --- storage -------------------------------------------------------------------------------------------------
 

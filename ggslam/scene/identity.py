@@ -17,6 +17,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.scene.arrays import arrays_to_bytes, read_arrays
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 
 IDENTITY_CHANNELS = 16
 """Length of an identity vector."""
@@ -24,6 +25,7 @@ NOTHING_LOGIT = 1.0
 """Logit of being no object. Vectors of what was never labelled stay near zero, and all logits of a zero vector too."""
 
 
+@savable()
 @dataclass
 class IdentityClassifier:
     """Linear classifier of identity vectors.

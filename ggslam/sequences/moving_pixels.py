@@ -22,11 +22,13 @@ from ggslam.errors import FormatError
 from ggslam.scene.frame import Frame
 from ggslam.system.array_forms import Form
 from ggslam.system.images import MAX_PIXELS
+from ggslam.system.savable import savable
 
 MOVERS_FILE = "movers.npz"
 """Of runs in which something was found to move."""
 
 
+@savable(fixed="masks")
 @dataclass
 class MovingPixels:
     """Masks by frame, a bit for each pixel.

@@ -22,6 +22,7 @@ from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.result import TrackedFrame
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 from ggslam.tracking.tracker import TrackerState, TrackingResult, TrackingStatus
 
 UNDECIDED = 32
@@ -43,6 +44,7 @@ HIDDEN_MARGIN = 9
 _Coded = Annotated[np.ndarray, Form("u1", None)]
 
 
+@savable(not_saved="mapper poses state", growing="images")
 @dataclass
 class ColorPoses:
     """Aligns located frames to the map as it is, where that is due, and to the map as it is at the end.

@@ -15,6 +15,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
 from ggslam.slam.map_removal import MapRemoval
+from ggslam.system.savable import savable
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult
 
@@ -34,6 +35,7 @@ def filter_classes() -> list[type[FrameFilter]]:
     return sorted(found, key=lambda kind: kind.order)
 
 
+@savable()
 class FilterChain(FrameFilter):
     """Filters, of which each gets the frame as the one before it left it.
 
@@ -88,11 +90,11 @@ class FilterChain(FrameFilter):
             frame = one.expect(frame)
         return frame
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         for one in self.filters:
-            frame, result = one.located(frame, result, noise)
+            frame, result = one.judge(frame, result, noise)
         return frame, result
 
     def expects_motion(self) -> bool:

@@ -16,6 +16,7 @@ from ggslam.slam.left_parts import LeftParts
 from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.part_start import PartStart, pose_apart
 from ggslam.slam.parts import RunParts
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
@@ -43,6 +44,7 @@ class Located:
         return self.joint.status is TrackingStatus.LOST
 
 
+@savable(not_saved="_config _surface _masks _tracker _loops _pager _policy _poses _filters")
 class FrameLocator:
     """Locates the frames of a camera.
 

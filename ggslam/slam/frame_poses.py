@@ -13,9 +13,11 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.slam.result import TrackedFrame
 from ggslam.system.array_forms import Pose, check_indices
+from ggslam.system.savable import savable
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 
+@savable(growing="frames", check="check")
 class FramePoses:
     """Where the frames so far were located."""
 

@@ -15,6 +15,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.slam.loop_closing import LoopCloser
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
@@ -23,6 +24,7 @@ REMEMBERED = 3
 """Parts that are gone back to at most, those left last."""
 
 
+@savable(not_saved="target")
 @dataclass
 class LeftPart:
     """A part that the camera left.
@@ -46,6 +48,7 @@ class LeftPart:
             self.T_world_keyframe, self.target = T_world_keyframe.copy(), None
 
 
+@savable()
 @dataclass
 class LeftParts:
     """The parts left last, the latest at the end."""

@@ -30,12 +30,14 @@ from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.part_joining import find_links, links_between
 from ggslam.slam.place_comparison import PlaceComparison
 from ggslam.system.array_forms import Form, Pose, PoseForm, check_arrays, check_indices
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult
 
 
+@savable()
 @dataclass(frozen=True)
 class LoopEvent:
     """What came of a candidate, or of a frame that was lost.
@@ -77,6 +79,7 @@ class Correction:
     active: set[int]
 
 
+@savable()
 @dataclass(frozen=True)
 class _Found:
     """A verified loop: the newer keyframe, the older, what moves the newer to where the older has it, and where it
@@ -88,6 +91,9 @@ class _Found:
     T_world_camera: Pose
 
 
+@savable(
+    not_saved="settings comparison _camera _surface _tracker _lock _helper _begun", growing="events", check="check"
+)
 class LoopCloser:
     """Remembers every keyframe's place and odometry; finds loops, and lost frames.
 

@@ -16,11 +16,13 @@ from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult
 
 
+@savable(not_saved="_surface _mapper _pager _masks publishing")
 class MapCorrections:
     """Keeps the surface, which the tracker's thread reads, in step with the corrections that the mapper's makes.
 

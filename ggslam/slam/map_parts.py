@@ -26,12 +26,14 @@ from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.loop_closing import LoopCloser, LoopEvent
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.result import TrackedFrame
+from ggslam.system.savable import savable
 from ggslam.tracking.tracker import TrackingStatus
 
 NOT_JOINED = "of a part of the recording that could not be joined"
 PART_EVENTS = ("new part", "left out")
 
 
+@savable(not_saved="_mapper _poses _corrections _loops")
 class MapParts:
     """Makes one part of those there are.
 

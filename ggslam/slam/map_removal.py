@@ -13,9 +13,11 @@ from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.pruning import blank_part, drop_before, drop_moved, drop_pixels
 from ggslam.movers.outdated import OutdatedParts
 from ggslam.slam.map_paging import MapPager
+from ggslam.system.savable import savable
 from ggslam.tracking.surface import MeasuredSurface
 
 
+@savable(not_saved="_surface _mapper _publishing is_paged")
 class MapRemoval:
     """What filters of frames remove things from the map with.
 

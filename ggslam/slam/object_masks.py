@@ -23,6 +23,7 @@ from ggslam.objects.segments import boundary_trust, clean_segments
 from ggslam.objects.settings import AssociationSettings, CleaningSettings, GeometricSettings, SameObjectSettings
 from ggslam.objects.table import Observation, Supervision
 from ggslam.scene.frame import Frame
+from ggslam.system.savable import savable
 from ggslam.system.settings import Conflict, setting, settings_class
 
 _LARGE = 160
@@ -61,6 +62,7 @@ class MaskSettings:
             raise Conflict("model", "expected an ONNX file, because masks.source is model, found none")
 
 
+@savable(not_saved="settings _segment")
 class ObjectMasks:
     """Gives each keyframe its object mask.
 

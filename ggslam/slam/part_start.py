@@ -15,6 +15,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp import AlignmentStatus, GicpTarget, align
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
@@ -44,6 +45,7 @@ class PartBeginning:
     T_first_camera: list[np.ndarray]
 
 
+@savable(not_saved="target")
 @dataclass
 class PartStart:
     """Watches the frames that are lost.

@@ -19,7 +19,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.slam.frame_clock import FrameClock
 from ggslam.slam.result import StepReport
-from ggslam.slam.schedules import NewKeyframe, Schedule
+from ggslam.slam.schedules import MapSteps, NewKeyframe, Schedule
 from ggslam.slam.slam import Slam
 from ggslam.system.opencv import opencv_errors
 
@@ -44,7 +44,7 @@ class _InAnotherThread(Schedule):
     def beside_mapping(self) -> AbstractContextManager[object]:
         return self._beside
 
-    def map(self, slam: Slam, keyframes: Sequence[NewKeyframe], frames: int) -> None:
+    def map(self, slam: MapSteps, keyframes: Sequence[NewKeyframe], frames: int) -> None:
         for keyframe in keyframes:
             self._jobs.put(keyframe)
 

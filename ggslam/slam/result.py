@@ -23,9 +23,11 @@ from ggslam.slam.config import Config
 from ggslam.slam.loop_closing import LoopEvent
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.tracker import TrackingStatus
 
 
+@savable()
 @dataclass(frozen=True)
 class TrackedFrame:
     """What is remembered of every frame.
@@ -75,6 +77,7 @@ class StepReport:
     T_world_camera: np.ndarray = field(default_factory=lambda: np.full((4, 4), np.nan))
 
 
+@savable(not_saved="_started", growing="tracking_by_frame", after="resume")
 @dataclass
 class SlamTimes:
     """Seconds of wall time.
@@ -108,12 +111,17 @@ class SlamTimes:
         seconds = self.tracking_by_frame
         return [1e3 * float(np.mean(seconds[k : k + frames])) for k in range(0, len(seconds), frames)]
 
+    def resume(self) -> None:
+        """The clock goes on from where it was when the state was saved."""
+        self._started = time.perf_counter() - self.wall if self.wall > 0 else None
+
     def stop(self) -> None:
         """A step ends."""
         if self._started is not None:
             self.wall = time.perf_counter() - self._started
 
 
+@savable()
 @dataclass(frozen=True)
 class LearnedObjects:
     """Objects of a run; the Gaussians' `object_id`, `features` and votes belong to them.

@@ -9,6 +9,7 @@ import numpy as np
 
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 
 LONGEST_S = 0.5
 """Seconds between two instants beyond which the motion between them says nothing of that within one."""
@@ -16,6 +17,7 @@ TOGETHER_S = 0.002
 """Images so few seconds apart were taken together: nothing that is carried by hand moves by a millimetre meanwhile."""
 
 
+@savable()
 @dataclass
 class RigClock:
     """Knows the rig's motion from the last instant to the one before: it is taken to go on.

@@ -17,6 +17,7 @@ from ggslam.slam.frame_locator import FrameLocator, Located
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.parts import RunParts
 from ggslam.slam.rig_clock import RigClock
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.noise import estimate_noise
@@ -30,6 +31,7 @@ DARK_LOOK = 8
 """Every so many rows and columns are looked at."""
 
 
+@savable(not_saved="_config _surface _masks _tracker _loops _pager _policy _poses _filters _rig _engine")
 class RigLocator(FrameLocator):
     """See `FrameLocator`. A camera that sees nothing, or has no frame at an instant, is carried along by the others.
     No parts begin in a lost rig, and colour does not correct its poses.

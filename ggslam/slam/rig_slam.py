@@ -15,8 +15,12 @@ from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.parts import RunParts
 from ggslam.slam.rig_locator import RigLocator
 from ggslam.slam.slam import Slam
+from ggslam.system.savable import savable
 
 
+@savable(
+    not_saved="camera rig config context pager start_notes schedule", after="use_scale_again", check="check"
+)
 class RigSlam(Slam):
     """See `Slam`; `step_together` takes the frames of all cameras at one instant. Every frame has a pose and may be a
     keyframe; the keyframes of an instant keep to one another as the rig has them.

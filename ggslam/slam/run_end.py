@@ -5,23 +5,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.parts import device_name
 from ggslam.slam.result import SlamResult
+from ggslam.slam.run_state import RunState
 from ggslam.slam.saved_places import saved_places_to_bytes
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.still_camera import still_notes
 
-if TYPE_CHECKING:
-    from ggslam.slam.slam import Slam
 
-
-def refine(slam: Slam, progress: Callable[[int, int], None] | None = None) -> None:
+def refine(slam: RunState, progress: Callable[[int, int], None] | None = None) -> None:
     """The last optimisation steps of a run that has seen all frames.
 
     Args:
@@ -53,7 +50,7 @@ def refine(slam: Slam, progress: Callable[[int, int], None] | None = None) -> No
         count()
 
 
-def result_of(slam: Slam) -> SlamResult:
+def result_of(slam: RunState) -> SlamResult:
     """What there is so far. The first call settles the objects: it is for the end."""
     pager, parts = slam.pager, slam.parts
     slam.times.loops = slam.loops.seconds if slam.loops is not None else 0.0
@@ -71,7 +68,7 @@ def result_of(slam: Slam) -> SlamResult:
     )  # fmt: skip
 
 
-def _notes(slam: Slam) -> list[str]:
+def _notes(slam: RunState) -> list[str]:
     """What the user should know of the run."""
     frames = len(slam.frames)
     still = still_notes(slam.tracker.state.still.frames, frames)
@@ -79,7 +76,7 @@ def _notes(slam: Slam) -> list[str]:
     return [*slam.start_notes, *still, *slam.filters.notes(frames), *budget]
 
 
-def _places(slam: Slam, gaussians: GaussianMap, cells: GaussianCells | None) -> bytes | None:
+def _places(slam: RunState, gaussians: GaussianMap, cells: GaussianCells | None) -> bytes | None:
     """Content of `places.npz`; None if the run looked for no loops and so remembers no places."""
     if slam.loops is None or not len(slam.surface):
         return None

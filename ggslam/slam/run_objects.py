@@ -10,8 +10,10 @@ from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_chances import count_chances, typical_points
 from ggslam.slam.object_masks import ObjectMasks, observations
 from ggslam.slam.result import LearnedObjects
+from ggslam.system.savable import savable
 
 
+@savable(not_saved="_masks")
 class RunObjects:
     """Objects of a run.
 

@@ -3,16 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
+from ggslam.mapping.mapper import Mapper
 from ggslam.scene.frame import Frame
-from ggslam.tracking.tracker import TrackingResult
-
-if TYPE_CHECKING:
-    from ggslam.slam.slam import Slam
+from ggslam.tracking.tracker import Tracker, TrackingResult
 
 
 @dataclass(frozen=True)
@@ -30,6 +28,19 @@ class NewKeyframe:
     moves_followed: int
 
 
+class MapSteps(Protocol):
+    """The steps that a schedule calls, see `Slam`."""
+
+    mapper: Mapper
+    tracker: Tracker
+
+    def map_keyframe(self, new: NewKeyframe, train: Callable[[], None] | None = None) -> None:
+        """Steps 4 to 6."""
+
+    def train(self, frames: int, keyframes_before: int) -> None:
+        """Step 7."""
+
+
 class Schedule:
     """Maps and trains after each frame: everything one after the other in one thread, so that runs repeat bit for bit.
     """
@@ -44,7 +55,7 @@ class Schedule:
         """Context in which frames are located."""
         return nullcontext()
 
-    def map(self, slam: Slam, keyframes: Sequence[NewKeyframe], frames: int) -> None:
+    def map(self, slam: MapSteps, keyframes: Sequence[NewKeyframe], frames: int) -> None:
         """Maps the keyframes of a step, and trains the map.
 
         Args:
@@ -64,7 +75,7 @@ class BesideTraining(Schedule):
     """The same on a GPU: the points of the last keyframe join the surface while the host hands the step's training to
     the GPU."""
 
-    def map(self, slam: Slam, keyframes: Sequence[NewKeyframe], frames: int) -> None:
+    def map(self, slam: MapSteps, keyframes: Sequence[NewKeyframe], frames: int) -> None:
         before = len(slam.mapper.keyframes)
         if not keyframes:
             slam.train(frames, before)

@@ -17,6 +17,7 @@ from ggslam.slam.result import SlamTimes, StepReport, TrackedFrame
 from ggslam.system.array_forms import Form
 from ggslam.system.foreign import read_foreign_text
 from ggslam.system.process_memory import resident_bytes
+from ggslam.system.savable import savable
 
 STEPS_FILE = "steps.csv"
 _PARTS = ("insertion", "forward", "loss", "backward", "identity")
@@ -32,6 +33,7 @@ resident_mb: resident memory of the process, 10^6 bytes; loss_*: means over thei
 there were none."""
 
 
+@savable(check="check")
 class StepLog:
     """Rows of `COLUMNS`, one for each step."""
 

@@ -4,8 +4,8 @@
     tree = describe(slam, rules, keeper)           # {"o": ["Slam", {...}]}, ready for JSON; arrays beside it
     restore(tree, rules, arrays, kept, into=slam)  # fills objects that exist and makes those that do not
 
-Only classes that there is a rule for are made, without calling them; their attributes get what was saved. Whatever else
-an object holds (threads, native handles, settings of its own) stays as its constructor made it. Objects, lists and
+Only classes that have a rule (`savable`) are made, without calling them; their attributes get what was saved. Whatever
+else an object holds (threads, native handles, settings of its own) stays as its constructor made it. Objects, lists and
 arrays that two places share are shared again. Floats keep every bit, arrays their type and order in memory.
 
 Tree: None, true, false, whole numbers, floats, text and lists stand for themselves; everything else is an object with
@@ -17,43 +17,14 @@ from __future__ import annotations
 import enum
 from array import array as FlatArray
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 
 from ggslam.errors import FormatError
+from ggslam.system.savable import Rule, Rules
 from ggslam.system.typed_values import Example, declared_types, problem
-
-
-@dataclass(frozen=True)
-class Rule:
-    """How objects of a class are saved.
-
-    Attributes:
-        made: attributes that the constructor, or `after`, makes: not saved.
-        fixed: attributes that hold arrays (or lists of arrays) which never change once they are there.
-        growing: attributes that hold lists which only grow, of values that never change.
-        save: gives what is saved by name, instead of the attributes.
-        take: gets that for an object to be filled, instead of its attributes being set.
-        after: called for every object when all of them are there.
-        checked: made by calling the class with its fields, which checks them; for settings.
-        check: raises ValueError if the attributes of an object do not fit together; called when all objects are there
-            and their attributes are of the declared types, before `after`.
-    """
-
-    made: frozenset[str] = frozenset()
-    fixed: frozenset[str] = frozenset()
-    growing: frozenset[str] = frozenset()
-    save: Callable[[Any], dict[str, Any]] | None = None
-    take: Callable[[Any, dict[str, Any]], None] | None = None
-    after: Callable[[Any], None] | None = None
-    checked: bool = False
-    check: Callable[[Any], None] | None = None
-
-
-Rules = Mapping[type, Rule]
 
 
 class Keeper(Protocol):
@@ -166,7 +137,7 @@ class _Describer:
         attributes, found = {}, vars(value) if rule.save is None else rule.save(value)
         self._held.append(found)
         for attribute, content in found.items():
-            if attribute in rule.made:
+            if attribute in rule.not_saved:
                 continue
             place = f"{where}.{attribute}"
             if attribute in rule.growing and self._keeper is not None:
@@ -177,7 +148,8 @@ class _Describer:
 
     def _name(self, kind: type, where: str) -> str:
         if kind not in self._names:
-            raise TypeError(f"{where}: there is no rule for saving {kind.__module__}.{kind.__qualname__}")
+            name = f"{kind.__module__}.{kind.__qualname__}"
+            raise TypeError(f"{where}: {name} does not declare what of it is saved (@savable)")
         return self._names[kind]
 
     def _list_in_parts(self, items: list[Any], where: str) -> Any:
@@ -311,14 +283,14 @@ class _Restorer:
         fill = type(there) is kind
         value = there if fill else object.__new__(kind)
         self._known.append(value)
-        if not fill and rule.made - attributes.keys() - set(_class_defaults(kind)):
+        if not fill and rule.not_saved - attributes.keys() - set(_class_defaults(kind)):
             raise ValueError(f"{name}: there is none to fill")
-        if fill and rule.save is None and (missing := sorted(vars(value).keys() - rule.made - attributes.keys())):
+        if fill and rule.save is None and (missing := sorted(vars(value).keys() - rule.not_saved - attributes.keys())):
             raise ValueError(f"{kind.__name__}: {missing[0]} is missing")
         self._filled.append((value, {name: Example.of(old) for name, old in vars(value).items()} if fill else {}))
         found = {}
         for attribute, tree in attributes.items():
-            if attribute in rule.made:
+            if attribute in rule.not_saved:
                 raise ValueError(f"{name}.{attribute}: is not saved")
             found[attribute] = self.restore(tree, vars(value).get(attribute))
             if rule.take is None:
@@ -363,9 +335,9 @@ def _check_attributes(value: Any, before: Mapping[str, Example | None], rule: Ru
     """Raises ValueError if one is missing, unknown, or of another type than it must be."""
     kind: type = type(value)
     hints, name = declared_types(kind), kind.__name__
-    there = vars(value).keys() - rule.made
+    there = vars(value).keys() - rule.not_saved
     if rule.take is None:
-        expected = (before.keys() or hints.keys()) - rule.made
+        expected = (before.keys() or hints.keys()) - rule.not_saved
         if missing := sorted(expected - there):
             raise ValueError(f"{name}: {missing[0]} is missing")
         if strange := sorted(there - hints.keys() - before.keys()):

@@ -13,6 +13,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import orthonormalize
+from ggslam.system.savable import savable
 from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.noise import estimate_noise
@@ -27,6 +28,7 @@ MIN_TEXTURED = 200
 """Textured points from which grey values are trusted."""
 
 
+@savable(not_saved="_given_engine")
 class GicpTracker(Tracker):
     """Constant velocity, then G-ICP, with grey values where geometry leaves a direction open; if that fails, other
     starts. Grey values are compared with an earlier frame, which the tracker chooses by itself.

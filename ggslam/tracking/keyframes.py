@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.scene.poses import separation
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.system.settings import setting, settings_class
 
 
@@ -29,6 +30,7 @@ class LocatedFrame(Protocol):
         """Of the frame's points, metres."""
 
 
+@savable()
 class KeyframeKind(enum.Enum):
     """Why a frame is a keyframe."""
 
@@ -56,6 +58,7 @@ class KeyframeSettings:
     """A mapping keyframe is also made after a turn by this."""
 
 
+@savable(not_saved="settings")
 class KeyframePolicy:
     """Decides frame by frame; remembers the last keyframe.
 

@@ -12,6 +12,7 @@ from ggslam.features.orb import FeatureView
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.system.array_forms import Form, Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.image_turn import image_turn, small_image
 from ggslam.tracking.photometric import PhotometricReference
 from ggslam.tracking.points import PointSource
@@ -25,6 +26,7 @@ SUDDEN_FLOOR = 0.015
 """...if they differ by this much, in [0, 1]."""
 
 
+@savable(not_saved="reference")
 @dataclass
 class CameraMotion:
     """Where the camera is and how it moves.

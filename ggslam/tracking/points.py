@@ -15,6 +15,7 @@ from ggslam.interface.core import tracking as structures
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, Points32
+from ggslam.system.savable import savable
 from ggslam.tracking.settings import UNBOUNDED, DepthNoise, PointSettings
 
 THICKNESS = 0.01
@@ -38,6 +39,7 @@ class PointSource(Protocol):
         """The points on the host."""
 
 
+@savable()
 @dataclass(frozen=True)
 class FramePoints:
     """Points of one depth image, in its camera's frame.

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ggslam.system.savable import savable
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
 
@@ -27,6 +28,7 @@ ROOM_DEPTH = 1.25
 _MEDIAN_OF_NORMAL = 0.6745
 
 
+@savable()
 @dataclass
 class ResidualNoise:
     """Holds a noise model to the residuals of tracking, frame after frame.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from ggslam.features.orb import FeatureSettings
+from ggslam.system.savable import savable
 from ggslam.system.settings import Conflict, setting, settings_class
 
 PhotometricMode = Literal["never", "degenerate", "auto", "always"]
@@ -15,6 +16,7 @@ UNBOUNDED = 1e9
 """A weight that no point has: the nearest, at 0.1 m, is 10^4 times that at 1 m at most."""
 
 
+@savable()
 @settings_class(frozen=True)
 class DepthNoise:
     """Standard deviation of a depth measurement: sigma(z) = constant + square z^2 (z, sigma in metres).

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from ggslam.system.array_forms import DepthImage, Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.settings import DepthNoise
 
 WIDTH = 160
@@ -41,6 +42,7 @@ MOSTLY = 0.5
 """Share of a run's frames from which it is said that the camera stands still."""
 
 
+@savable()
 @dataclass(frozen=True)
 class SmallFrame:
     """A frame at reduced size: grey values float32 [h, w] of 0 to 255, and depth float32 [h, w], metres, 0: unknown."""
@@ -56,6 +58,7 @@ class SmallFrame:
         return SmallFrame(grey.astype(np.float32), cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST))
 
 
+@savable()
 @dataclass
 class StillCamera:
     """Remembers the frame that the camera may have stood still since.

@@ -23,6 +23,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
 from ggslam.system.array_forms import Form, Pose, PoseForm, check_arrays, check_indices
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import TargetSettings
@@ -48,6 +49,7 @@ def check_surface_arrays(arrays: Mapping[str, np.ndarray]) -> None:
         raise FormatError("surface: points do not fit their numbers")
 
 
+@savable(fixed="_arrays", check="check")
 class _Part:
     """One keyframe's points and normals in its camera's frame, float32 [n, 3]; in an archive if there is one."""
 
@@ -106,6 +108,7 @@ class _Begun:
         return same and np.array_equal(T_world_camera, self.T_world_camera)
 
 
+@savable(not_saved="_context _archive target finish _helper _begun", after="gather_again", check="check")
 class MeasuredSurface:
     """Keyframes' points gathered into one target, keyframe by keyframe. Which of the keyframes take part can be
     chosen, and keyframes can be moved: after a loop was closed the surface is where they are.

@@ -14,6 +14,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import orthonormalize
+from ggslam.system.savable import savable
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.points import PointSource
@@ -67,6 +68,7 @@ class TrackingResult:
         return self.points.median_depth
 
 
+@savable(not_saved="camera context target")
 @dataclass
 class TrackerState:
     """What trackers that work together share.

@@ -51,7 +51,7 @@ class OccupancySettings:
         In a map that is updated point by point the many rays of a voxel add up within one scan. Here one ray stands
         for all of them and counts once, so it must say more if the map is to be as sure after as few scans. OctoMap's
         own insertion of whole scans counts a voxel once as well: the defaults agree with it a little better
-        (scripts/bench_occupancy.py prints both), the raised values follow a change in fewer scans.
+        (scripts/benchmarks/bench_occupancy.py prints both), the raised values follow a change in fewer scans.
         """
         return cls(probability_hit=0.85, probability_miss=0.3)
 

@@ -17,7 +17,7 @@ from ggslam.interface import binding
 from ggslam.interface.core import rendering
 from ggslam.native.loader import load_library
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "make_native_mirrors.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "tools" / "make_native_mirrors.py"
 HEADER = """// SPDX-License-Identifier: Apache-2.0
 // A part.
 #pragma once
@@ -76,7 +76,7 @@ def mirror(generator: ModuleType, folder: Path, monkeypatch: pytest.MonkeyPatch,
 
 def test_the_mirrors_are_those_of_the_headers(generator: ModuleType) -> None:
     old = [str(path) for path, text in generator.written_files().items() if path.read_text() != text]
-    assert not old, "run python scripts/make_native_mirrors.py"
+    assert not old, "run python scripts/tools/make_native_mirrors.py"
 
 
 def test_a_header_is_mirrored(generator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What reaches the compiled core from files is refused or computed, whatever it is: nothing is read or written outside
-of the arrays that were handed over. `scripts/sanitize.sh address` and `undefined` watch these tests."""
+of the arrays that were handed over. `scripts/tools/sanitize.sh address` and `undefined` watch these tests."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from ggslam.native.loader import available_instruction_sets
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts" / "benchmarks"))
 from bench_gradients import NAMES, make_splat, reference_gradients  # noqa: E402
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)

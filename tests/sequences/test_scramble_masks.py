@@ -13,7 +13,7 @@ import pytest
 from ggslam.errors import SequenceError
 from ggslam.sequences import open_sequence
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "scramble_masks.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "tools" / "scramble_masks.py"
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from box_room import CAMERA, QUICK, RED, picture, red_share
 from ggslam.errors import FormatError
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.slam.config import load_config
+from ggslam.slam.filters.earlier_views import EarlierViews
 from ggslam.slam.saved_state import describe_state, restore_state
 from ggslam.slam.slam import Slam
 
@@ -50,8 +51,8 @@ def carried_away() -> Slam:
 @pytest.mark.long("four short runs")
 def test_what_was_carried_away_leaves_map_and_keyframes(carried_away: Slam) -> None:
     untold = two_visits(AWAY, told=False)
-    assert untold.earlier_views.gaussians == 0 and red_share(untold, 0) > 0.02
-    assert carried_away.earlier_views.gaussians > 300
+    assert untold.filters.get(EarlierViews).gaussians == 0 and red_share(untold, 0) > 0.02
+    assert carried_away.filters.get(EarlierViews).gaussians > 300
     assert red_share(carried_away, 0) < red_share(untold, 0) / 10
     first = carried_away.mapper.keyframes[0]
     assert first.moving is not None and not first.depth[first.moving].any()
@@ -62,7 +63,7 @@ def test_what_was_carried_away_leaves_map_and_keyframes(carried_away: Slam) -> N
 def test_where_nothing_changed_all_stays() -> None:
     slam = two_visits(BOX)
     assert slam.filters.get(EarlierViews).counted
-    assert slam.filters.get(EarlierViews).gaussians == 0 and not slam.filters.get(EarlierViews).notes()
+    assert slam.filters.get(EarlierViews).gaussians == 0 and not slam.filters.get(EarlierViews).notes(1)
     assert all(keyframe.moving is None for keyframe in slam.mapper.keyframes)
 
 
@@ -80,18 +81,18 @@ def test_what_stands_before_an_earlier_view_is_left_out_of_it() -> None:
 
 def test_another_run_goes_on_bit_for_bit() -> None:
     first, again = two_visits(AWAY, frames=HALF), new_slam()
-    assert first.earlier_views.counted
+    assert first.filters.get(EarlierViews).counted
     tree, arrays = describe_state(first)
     restore_state(again, json.loads(json.dumps(tree)), [array.copy() for array in arrays])
     for slam in (first, again):
         go_on(slam, range(HALF, ALL), AWAY)
-    assert first.earlier_views.gaussians == again.earlier_views.gaussians > 0
+    assert first.filters.get(EarlierViews).gaussians == again.filters.get(EarlierViews).gaussians > 0
     assert np.array_equal(first.map.means.numpy(), again.map.means.numpy())
 
 
 def test_counts_of_another_size_are_refused() -> None:
     first, again = two_visits(AWAY, frames=HALF), new_slam()
-    view = next(iter(first.earlier_views.views.values()))
+    view = next(iter(first.filters.get(EarlierViews).views.values()))
     view.through = view.through[:-1]
     tree, arrays = describe_state(first)
     with pytest.raises(FormatError, match="EarlierView.through: expected int16"):
@@ -99,10 +100,10 @@ def test_counts_of_another_size_are_refused() -> None:
 
 
 def test_after_a_closed_loop_what_is_gone_stays_gone_and_counting_begins_anew(carried_away: Slam) -> None:
-    views = carried_away.earlier_views
+    views = carried_away.filters.get(EarlierViews)
     gone = {number: view.gone.copy() for number, view in views.views.items()}
     assert any(places.any() for places in gone.values()) and views.counted
-    views.forget()
+    views.loop_closed()
     assert not views.counted
     for number, view in views.views.items():
         assert np.array_equal(view.gone, gone[number])

@@ -26,7 +26,7 @@ from ggslam.slam.config import load_config
 from ggslam.slam.result import SlamResult
 from ggslam.slam.slam import Slam
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts" / "tools"))
 from scramble_masks import scramble_recording  # noqa: E402
 
 FAST = ["mapping.iterations_per_frame=2", "mapping.first_frame_iterations=10"]

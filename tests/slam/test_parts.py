@@ -397,7 +397,7 @@ def test_in_real_time_a_part_begins_before_its_keyframes_are_mapped(back: Path) 
     slam = Slam(frames[0].camera, load_config(None, CHEAP), has_masks=False)
     live, waited = RealtimeSlam(slam, 30), 0
     for frame in frames:
-        live._step(frame)
+        slam.step(frame)
         waited += slam.locator.part_start.target is not None
         while live._jobs.qsize() and frame.index % 4 == 0:
             live._insert_next()

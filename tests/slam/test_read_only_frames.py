@@ -61,7 +61,7 @@ def test_what_opencv_refuses(room: Path, monkeypatch: pytest.MonkeyPatch, tmp_pa
         done = ggslam("run", room, "--out", tmp_path / "none")
         assert done.returncode == 2 and f"frame 0: {reason}" in " ".join(done.stderr.split())
     with monkeypatch.context() as patch:
-        patch.setattr("ggslam.slam.depth_edges.DepthEdges.clean", refuse)
+        patch.setattr("ggslam.slam.filters.depth_edges.DepthEdges.clean", refuse)
         with pytest.raises(OpenCvError, match=f"frame 0: {reason}"):
             Slam(sequence.camera).step(sequence.frame(0))
         done = ggslam("run", room, "--stop", 3, "--out", tmp_path / "run")

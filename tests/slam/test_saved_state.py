@@ -23,8 +23,6 @@ from ggslam.slam.config import Config, load_config
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import (
-    _save_index,
-    _take_index,
     check_state,
     describe_state,
     reason_against_saving,
@@ -95,7 +93,7 @@ def test_the_tree_of_neighbours_is_built_anew_when_it_would_have_been() -> None:
     indices = NeighbourIndex(0.5), NeighbourIndex(0.5)
     rows = np.arange(20)
     indices[0].neighbours(gaussians, rows, 3)
-    _take_index(indices[1], _save_index(indices[0]))
+    indices[1].set_state(indices[0].state())
     for size, built in ((140, 1), (160, 2)):
         grow(size - len(gaussians))
         one, other = (index.neighbours(gaussians, rows, 3) for index in indices)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A short piece of scripts/bench_soak.py: rounds through a room leave nothing behind but the map."""
+"""A short piece of scripts/benchmarks/bench_soak.py: rounds through a room leave nothing behind but the map."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "bench_soak.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "benchmarks" / "bench_soak.py"
 MOST = 16
 pytestmark = pytest.mark.skipif(not SCRIPT.exists(), reason="not in a checkout")
 

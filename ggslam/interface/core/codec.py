@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from codec.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from codec.hpp; changes are lost.
 """The compiled core's G-PCC codec (ISO/IEC 23090-9, first edition) and LZF."""
 
 from __future__ import annotations

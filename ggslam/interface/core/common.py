@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from common.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from common.hpp; changes are lost.
 """What all parts of the compiled core share: its version, instruction sets, threads."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from mapping.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from mapping.hpp; changes are lost.
 """The compiled core's losses, of images and of what pixels are classified as, and the Gaussians that a keyframe
 brings."""
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Written by scripts/make_native_mirrors.py from mapping.hpp; changes are lost. Size of each structure and
+// Written by scripts/tools/make_native_mirrors.py from mapping.hpp; changes are lost. Size of each structure and
 // offsets of its fields, in the order of the header, so that a caller can check its mirrors of them.
 #include <cstddef>
 #include <cstdint>

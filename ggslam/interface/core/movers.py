@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from movers.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from movers.hpp; changes are lost.
 """The compiled core's comparison of depth images, by which movers are found."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from objects.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from objects.hpp; changes are lost.
 """The compiled core's passes over the pixels of a depth image that falls into segments."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from rendering.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from rendering.hpp; changes are lost.
 """The compiled core's rasterizer, sampled compositing (which Gaussians make up a pixel) and pictures of meshes."""
 
 from __future__ import annotations

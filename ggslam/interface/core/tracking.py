@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from tracking.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from tracking.hpp; changes are lost.
 """The compiled core's tracking: points of a depth image, the voxels they are aligned to, alignment."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from volumes.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from volumes.hpp; changes are lost.
 """The compiled core's volumes: truncated signed distances, their surface, the distance field, occupancy."""
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from rendering.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from rendering.hpp; changes are lost.
 """The CUDA kernels' rasterizer and sampled compositing. Pointers lead to device memory, those of the core's
 structures, too. Calls only start work on the caller's stream, but for ggslam_cuda_wait; those with a status return 0
 or a cudaError_t."""

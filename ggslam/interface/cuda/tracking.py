@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Written by scripts/make_native_mirrors.py from tracking.hpp; changes are lost.
+# Written by scripts/tools/make_native_mirrors.py from tracking.hpp; changes are lost.
 """The CUDA kernels' tracking. Pointers lead to device memory. Calls only start work on the caller's stream; those
 with a status return 0 or a cudaError_t."""
 

@@ -50,7 +50,7 @@ EXTRAS = {
     "usd": Extra(("pxr",), "export as OpenUSD"),
     "mesh": Extra(("trimesh",), "meshes as OBJ and GLB"),
     "octomap": Extra(("pyoctomap",), "occupancy in trees of OctoMap's own library"),
-    "formats": Extra(("gsply",), "SPZ in scripts/bench_splats.py"),
+    "formats": Extra(("gsply",), "SPZ in scripts/benchmarks/bench_splats.py"),
     "bench": Extra(("pyoctomap", "open3d", "edt"), "what the benchmarks of volumes compare with"),
     "conformance": Extra(("gsply", "gaussforge", "trimesh", "pycolmap", "open3d"), "readers of others for the tests"),
     "cuda": Extra(("nvidia.cu13.nvvm",), "nvcc for run --device cuda, where no CUDA toolkit is installed"),

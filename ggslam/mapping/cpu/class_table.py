@@ -11,8 +11,10 @@ from ggslam.errors import FormatError
 from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
 from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 
 
+@savable(check="check")
 class CpuClassTable:
     """A growing linear classifier with its optimizer.
 

@@ -11,10 +11,12 @@ from ggslam.errors import RenderError
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.rendering.exposure import identity_exposure
 from ggslam.system.array_forms import Form
+from ggslam.system.savable import savable
 
 _IDENTITY = identity_exposure()
 
 
+@savable()
 class ExposureAdam:
     """Adam (Kingma and Ba 2015) on gain and offset of one keyframe.
 

@@ -21,6 +21,7 @@ from ggslam.rendering.pixel_terms import CpuPixelTerms, FeatureAdamSettings
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
+from ggslam.system.savable import savable
 
 KEPT_POOLS = 64
 """Keyframes whose pixels drawn ahead are kept, 64 KB for each with the settings' defaults."""
@@ -28,6 +29,7 @@ MANY_CLASSES = 128
 """Beyond so many classes a step's softmax runs over those in its sample and this many others, drawn at random."""
 
 
+@savable(not_saved="settings seed")
 @dataclass
 class CpuIdentityLearner(IdentityLearner):
     """Trains identity vectors and classifier, counts votes.

@@ -23,6 +23,7 @@ from ggslam.rendering.exposure import (
     typical_gain,
     without_exposure,
 )
+from ggslam.system.savable import savable
 
 FEWEST_KEYFRAMES = 3
 """So many exposures have to be known before one of them is called typical."""
@@ -33,6 +34,7 @@ BLURRED = 0.5
 leave 0.76 or more, a blur of four pixels 0.26."""
 
 
+@savable()
 class KeyframeExposures:
     """What is known of the exposure of each keyframe of one mapper, by number.
 

@@ -30,6 +30,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.array_forms import check_indices
+from ggslam.system.savable import savable
 
 FEW_LOOKS = 8
 """Where fewer keyframes look for what surfaces hide, each looks with all its pixels; else with a quarter of them by
@@ -40,6 +41,7 @@ TERMS_AT_ONCE = 1 << 22
 """Shares of pixels that are looked at together; each takes eight bytes."""
 
 
+@savable(not_saved="settings residency extra_loss _rasterizer _loss _adam_of_pixel", check="check")
 class CpuMapper(Mapper):
     """See `Mapper`. With the same seed, frames and iteration counts a run on one machine repeats bit for bit, for any
     number of threads.

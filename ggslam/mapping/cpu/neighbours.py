@@ -7,16 +7,21 @@ neighbours i of KL(P_j || Q_i), P and Q being softmax(classifier(identity)), wit
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import NOTHING_LOGIT
+from ggslam.system.savable import savable
 
 MOST_POINTS = 65536
 """Of a larger map neighbours are looked for among every second, third, ... Gaussian, as few as are at most so many."""
+_COUNTERS = ("_growth", "_order", "_size", "_stride", "built")
 
 
+@savable(save="state", take="set_state")
 class NeighbourIndex:
     """k nearest neighbours among the Gaussians' means. Rows are those of the map as it is now.
 
@@ -37,6 +42,17 @@ class NeighbourIndex:
         """A tree of points [n, 3]; the same points always give the same one."""
         # Unbalanced and loose: built in a third of the time, asked nearly as fast.
         return cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=False)
+
+    def state(self) -> dict[str, Any]:
+        """What is saved: counters, and the tree as its points, which float32 holds."""
+        points = None if self._tree is None else np.asarray(self._tree.data).astype(np.float32)
+        return {**{name: getattr(self, name) for name in _COUNTERS}, "points": points}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Fills the index from what `state` gave."""
+        for name in _COUNTERS:
+            setattr(self, name, saved[name])
+        self._tree = None if saved["points"] is None else self.tree_of(saved["points"])
 
     def neighbours(self, gaussians: GaussianMap, rows: np.ndarray, k: int) -> np.ndarray:
         """int64 [M, k], the k nearest other Gaussians of each of `rows` [M]; k is less in a tiny map. In a map of more

@@ -18,6 +18,7 @@ from ggslam.scene.poses import inverse, separation
 from ggslam.slam.filters.frame_filter import FrameFilter
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import DepthImage, Form, Mask, Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
@@ -42,6 +43,7 @@ NEARER, NEARER_THAN_SCENE = 1.5, 0.5
 this share of the scene's distance: such depth is its flying pixels."""
 
 
+@savable()
 @dataclass
 class CameraFixtures(FrameFilter):
     """Looks at the first located frames that are apart from one another.
@@ -85,7 +87,7 @@ class CameraFixtures(FrameFilter):
         fixed = self.mask | (frame.depth < self.nearest)
         return replace(frame, depth=np.where(fixed, np.float32(0), frame.depth), valid=valid)
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The same; what the frame shows may be compared with later ones."""

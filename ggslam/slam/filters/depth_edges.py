@@ -10,6 +10,7 @@ import numpy as np
 from ggslam.geometry.soft_edges import edge_sharpness, soft_edges
 from ggslam.scene.frame import Frame
 from ggslam.slam.filters.frame_filter import FrameFilter, InRigs
+from ggslam.system.savable import savable
 
 SHARP = 0.4
 """Outlines are sharp if this share of the change lies between two neighbouring pixels, in the median."""
@@ -17,6 +18,7 @@ FEWEST, FRAMES = 200, 30
 """Pixels on outlines that have to tell it, and frames among which one must have so many; else outlines are sharp."""
 
 
+@savable()
 @dataclass
 class DepthEdges(FrameFilter):
     """Finds out in the first frames whether outlines of depth are sharp, and drops slopes where they are not.

@@ -28,6 +28,7 @@ from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
 from ggslam.slam.filters.movers import SURE
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult
 
@@ -40,6 +41,7 @@ SAMPLES = 5
 """Places of an earlier view along each axis by which it is told whether a keyframe may see the same."""
 
 
+@savable(not_saved="context")
 @dataclass
 class EarlierViews(FrameFilter):
     """What a run's own keyframes say of those of the map it began with.
@@ -66,7 +68,7 @@ class EarlierViews(FrameFilter):
         """One that has compared nothing yet."""
         return cls(made_of.context)
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The same; the noise is known from now on."""

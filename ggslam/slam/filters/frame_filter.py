@@ -43,7 +43,7 @@ class InRigs(Enum):
 class FrameFilter:
     """Looks at every frame of one camera, and corrects it where it is wrong. Every hook does nothing by default.
 
-    The hooks are called in this order. For every frame: `clean`, `expect`, `located`. For every keyframe, in the
+    The hooks are called in this order. For every frame: `clean`, `expect`, `judge`. For every keyframe, in the
     mapper's thread: `before_insertion`, `after_insertion`. When a loop was closed: `loop_closed` in the mapper's
     thread, and `move` before the next frame is located.
 
@@ -71,7 +71,7 @@ class FrameFilter:
         """The frame that the tracker aligns: it may have less depth than the frame that the run uses."""
         return frame
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The frame and the result, corrected by what the frame's pose tells.

@@ -23,6 +23,7 @@ from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
@@ -38,6 +39,7 @@ LOOKED_BACK = 64
 """So many of the latest keyframes are searched for what has moved since."""
 
 
+@savable(not_saved="_reads_masks _margin context")
 class MoverFilter(FrameFilter):
     """Finds movers in each located frame, if the settings want it; else frames and results stay as they are.
 
@@ -90,7 +92,7 @@ class MoverFilter(FrameFilter):
         """The frame to locate: without depth where something is expected to move."""
         return self.detector.expect(frame) if self.active else frame
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The frame without depth where something moves, which `Frame.moving` tells, and the result without points

@@ -12,6 +12,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.slam.filters.frame_filter import FrameFilter, InRigs
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
@@ -23,6 +24,7 @@ LARGEST_SHARE = 0.6
 """Of the time between two frames: depth that is farther from colour is left as it is."""
 
 
+@savable()
 @dataclass
 class ShutterTimes(FrameFilter):
     """Knows where the depth camera was when it took the last images: its motion is taken to go on.
@@ -60,7 +62,7 @@ class ShutterTimes(FrameFilter):
         self.T_color_depth = T_color_depth
         return replace(frame, depth=moved_depth(frame.depth, frame.camera, T_color_depth), depth_delay=0.0)
 
-    def located(
+    def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The same; the depth camera's motion up to this frame is known from now on."""

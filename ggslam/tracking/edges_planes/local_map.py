@@ -10,12 +10,14 @@ import torch
 
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.system.array_forms import Pose
+from ggslam.system.savable import savable
 from ggslam.tracking.edges_planes.alignment import LAST_STEP, FeatureAligner, FeatureAlignment, FrameClock
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.edges_planes.voxels import FeatureMap
 
 
+@savable(not_saved="settings clock _aligner")
 class LocalFeatureMap:
     """Planes and edges gathered in voxels; scans are aligned to them and added to them.
 

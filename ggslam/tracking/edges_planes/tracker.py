@@ -12,6 +12,7 @@ from ggslam.features.orb import FeatureView, pose_from_matches
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.system.savable import savable
 from ggslam.tracking.edges_planes.alignment import FeatureAlignment
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
 from ggslam.tracking.edges_planes.local_map import LocalFeatureMap
@@ -27,6 +28,7 @@ from ggslam.tracking.settings import DepthNoise, TrackerSettings
 from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
 
 
+@savable()
 @dataclass(frozen=True)
 class FeatureCounts:
     """What a frame had.
@@ -42,6 +44,7 @@ class FeatureCounts:
     inner_iterations: int = 0
 
 
+@savable(not_saved="features _extractor")
 class FeatureTracker(Tracker):
     """Constant velocity, then edges and planes against a local map of their own, within a budget of time.
 

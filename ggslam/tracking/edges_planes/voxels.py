@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ggslam.errors import FormatError
+from ggslam.system.savable import savable
 from ggslam.tracking.edges_planes.settings import FeatureMapSettings
 
 _OFFSET = 1 << 19
@@ -44,6 +45,7 @@ class VoxelMatches:
     surfaces: Tensor
 
 
+@savable(not_saved="settings _shift _mask _corners _ones _isotropic", check="check")
 class FeatureMap:
     """Planes and edges gathered in voxels.
 

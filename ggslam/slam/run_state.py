@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run holds: its parts, wired together, and what there is so far."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ggslam.cuda.library import CudaLibrary
+from ggslam.errors import ConfigError
+from ggslam.mapping.extra_loss import ExtraLoss
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IDENTITY_CHANNELS
+from ggslam.slam.color_poses import ColorPoses
+from ggslam.slam.config import Config
+from ggslam.slam.filter_chain import FilterChain
+from ggslam.slam.filters.frame_filter import FilterContext
+from ggslam.slam.filters.movers import MoverFilter
+from ggslam.slam.frame_locator import FrameLocator
+from ggslam.slam.frame_poses import FramePoses
+from ggslam.slam.map_corrections import MapCorrections
+from ggslam.slam.map_parts import MapParts
+from ggslam.slam.map_removal import MapRemoval
+from ggslam.slam.parts import RunParts, check_arguments, make_parts
+from ggslam.slam.result import LearnedObjects, SlamTimes, TrackedFrame
+from ggslam.slam.run_objects import RunObjects
+from ggslam.slam.schedules import BesideTraining, Schedule
+from ggslam.slam.step_log import StepLog
+from ggslam.tracking.keyframes import KeyframePolicy
+from ggslam.tracking.settings import DepthNoise
+
+
+class RunState:
+    """The parts of a run. `Slam` is the loop that works with them.
+
+    Arguments and errors as of `Slam`.
+    """
+
+    scale: float
+    _noise: DepthNoise | None
+    dropped_frames: list[int]
+    refine_iterations: int
+
+    def __init__(
+        self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None,
+        library: CudaLibrary | None = None, extra_loss: ExtraLoss | None = None,
+    ) -> None:  # fmt: skip
+        check_arguments(camera, config, extra_loss)
+        self.camera = camera
+        self.config = config or Config()
+        parts = make_parts(camera, self.config, has_masks, paging, library, compact=extra_loss is None)
+        self.context, self.masks, self.tracker, self.surface = parts.context, parts.masks, parts.tracker, parts.surface
+        self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
+        self.start_notes = parts.notes
+        """What the user should know of the parts that the settings chose."""
+        if extra_loss is not None and parts.on_device:
+            raise ConfigError("a loss of your own (extra_loss) needs device: cpu; on a GPU kernels compute the losses")
+        self.mapper.extra_loss = extra_loss
+        self.policy = KeyframePolicy(self.config.keyframes)
+        self.scale = 1.0
+        """Size of the scene against a room's, see `geometry.scene_size`."""
+        self.poses = FramePoses()
+        self.dropped_frames = []
+        self.refine_iterations = 0
+        """Steps of the final refinement so far."""
+        self.times = SlamTimes()
+        self.steps = StepLog()
+        self.growing = True
+        """Whether keyframes are made and the map is trained; off: frames are located in the map as it is."""
+        made_of = FilterContext(self.config, self.context)
+        self.chains = self._make_filters(made_of)
+        """Filters of the frames, by `Frame.camera_number`."""
+        self.filters = FilterChain.join(self.chains)
+        """All of them, each once."""
+        self.locator = self._make_locator(parts)
+        self.schedule: Schedule = BesideTraining() if parts.on_device else Schedule()
+        self.corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
+        self.removal = MapRemoval(self.surface, self.mapper, self.pager, self.corrections.publishing)
+        self.parts = MapParts(self.mapper, self.poses, self.corrections, self.loops)
+        self.objects = RunObjects(self.masks)
+        self.moves_followed = 0
+        """How many corrections of the map the newest tracked pose knows of."""
+        self._noise = None
+
+    def _make_filters(self, made_of: FilterContext) -> list[FilterChain]:
+        return [FilterChain.make_all(made_of)]
+
+    def _make_locator(self, parts: RunParts) -> FrameLocator:
+        return FrameLocator(self.config, parts, self.policy, self.poses, self.filters)
+
+    def load_map(self, gaussians: GaussianMap, keyframes: list[Keyframe], objects: LearnedObjects | None) -> None:
+        """Starts in a map made before; `surface` and `loops` hold its keyframes already. The camera counts as lost
+        until `loops` finds it.
+
+        Args:
+            gaussians: the map.
+            keyframes: its keyframes.
+            objects: its objects.
+
+        Raises:
+            ConfigError: memory is limited, and maps made before are taken whole.
+        """
+        if self.pager is not None:
+            raise ConfigError("memory_limit_mb: a run that starts in the map of another (`map`) has no limit of memory")
+        self.objects.learned, self.poses.keyframes_made = objects, len(keyframes)
+        self.mapper.adopt(gaussians, keyframes)
+        if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:
+            self.mapper.identity = None
+        elif self.mapper.identity is not None:
+            self.mapper.identity.resume(objects.classifier)
+        assert self.surface.target is not None
+        self.tracker.start_lost(self.surface.target)
+
+    @property
+    def frames(self) -> list[TrackedFrame]:
+        """How each frame so far was tracked."""
+        return self.poses.frames
+
+    @property
+    def map(self) -> GaussianMap:
+        """As trained so far; on the device that it is trained on."""
+        return self.mapper.map
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Of the frames, by `Frame.camera_number`."""
+        return (self.camera,)
+
+    @property
+    def movers(self) -> MoverFilter:
+        """Knows what moves."""
+        return self.filters.get(MoverFilter)
+
+    @property
+    def color_poses(self) -> ColorPoses:
+        """Aligns frames to the map by colour."""
+        return self.locator.color_poses
+
+    @property
+    def gaussian_count(self) -> int:
+        """Gaussians of the map, in memory and on disk."""
+        return self.map.count + (0 if self.pager is None else self.pager.on_disk)
+
+    def pose_of(self, frame: TrackedFrame) -> np.ndarray:
+        """T_world_camera [4, 4] of a frame that was not lost, as far as is known by now."""
+        return self.poses.pose_of(frame, self.mapper.keyframes)
+
+    @property
+    def refinement_steps(self) -> int:
+        """Optimisation steps that `finish` makes, those of a run that was cut off among them."""
+        if not self.mapper.keyframes or not self.growing:
+            return 0
+        asked, before = self.config.refine_iterations, self.mapper.times.iterations - self.refine_iterations
+        return asked if asked >= 0 else self.mapper.last_iterations(before)
+
+    def join_parts(self) -> None:
+        """Makes one part of those that the recording fell into, see `MapParts`; when there are no more frames."""
+        self.parts.settle()
+
+    def close(self) -> None:
+        """Removes what is on disk of map and keyframes, for a run that has no result."""
+        if self.pager is not None:
+            self.pager.close()

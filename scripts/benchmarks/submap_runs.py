@@ -1,0 +1,166 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""One case of `bench_submaps.py`, in a process of its own so that its peak memory is its own; prints JSON.
+
+python scripts/benchmarks/submap_runs.py world FOLDER --size 100 --scans 150
+python scripts/benchmarks/submap_runs.py room FOLDER --recording data/redkitchen --stop 150
+python scripts/benchmarks/submap_runs.py locate STORE SEQUENCE --full
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+import numpy as np
+from kdtree_gicp import TreeSurface, TreeTracker
+
+from ggslam.jobs.localize.report import LocalizationReport
+from ggslam.jobs.submaps.stores import INDOORS
+from ggslam.localization.frames import FrameTracker
+from ggslam.localization.localizer import Localization, Localizer
+from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
+from ggslam.localization.scans import ScanSequence, scan_files
+from ggslam.localization.surface import NORMAL, SCAN_TARGET, FullSurface, PartialSurface, packed_normals
+from ggslam.localization.visits import FrameSights, record_visit
+from ggslam.native.loader import NativeContext
+from ggslam.sequences import open_sequence
+from ggslam.submaps.grid import GridStore
+from ggslam.submaps.recorder import store_cloud
+from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.json_files import json_ready
+from ggslam.system.process_memory import peak_memory_mb
+from ggslam.tracking.settings import TargetSettings, TrackerSettings
+
+OUTDOORS = SubmapSettings(axes="xy", voxel=0.0, cache_megabytes=100)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    cases = parser.add_subparsers(dest="case", required=True)
+    world = cases.add_parser("world", help="a generated world: FOLDER/map.grid, FOLDER/scans, FOLDER/trajectory.txt")
+    world.add_argument("folder", type=Path)
+    world.add_argument("--size", type=float, default=100.0)
+    world.add_argument("--spacing", type=float, default=0.1, help="of the map's points")
+    world.add_argument("--scans", type=int, default=150)
+    world.add_argument("--seed", type=int, default=0)
+    room = cases.add_parser("room", help="the first frames of a recording with their true poses: FOLDER/map.grid")
+    room.add_argument("folder", type=Path)
+    room.add_argument("--recording", type=Path, required=True)
+    room.add_argument("--stop", type=int, default=150)
+    room.add_argument("--scale", type=float, default=0.5)
+    locate = cases.add_parser("locate")
+    locate.add_argument("store", type=Path)
+    locate.add_argument("sequence", type=Path)
+    locate.add_argument("--full", action="store_true")
+    locate.add_argument("--tree", action="store_true", help="the reference of scripts/benchmarks/kdtree_gicp.py")
+    locate.add_argument("--voxel", type=float, default=0.15)
+    locate.add_argument("--radius", type=float, default=10.0)
+    locate.add_argument("--first", type=int, default=0)
+    locate.add_argument("--stop", type=int)
+    locate.add_argument("--scale", type=float, default=0.5)
+    a = parser.parse_args()
+    began = time.perf_counter()
+    if a.case == "world":
+        found = make_world(a.folder, a.size, a.spacing, a.scans, a.seed)
+    elif a.case == "room":
+        found = make_room(a.folder, a.recording, a.stop, a.scale)
+    else:
+        found = located(a.store, a.sequence, a.full, a.tree, a.voxel, a.radius, a.first, a.stop, a.scale)
+    print(json.dumps(json_ready({**found, "seconds": time.perf_counter() - began, "peak_mb": peak_memory_mb()})))
+
+
+def make_world(folder: Path, size: float, spacing: float, scans: int, seed: int) -> dict[str, Any]:
+    """Writes the map of a generated world, and scans along a walk in it with the true poses."""
+    from worlds.cloud import cloud_tiles
+    from worlds.plan import make_world as planned
+    from worlds.scanner import Scanner
+    from worlds.walk import SPEED, walk
+
+    from ggslam.formats.trajectory import write_tum
+
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "scans").mkdir(parents=True)
+    world = planned(size, seed)
+    poses = walk(world, scans * SPEED / 10 + 1, seed)[:scans]
+    for number, T in enumerate(poses):
+        np.save(folder / "scans" / f"{number:06d}.npy", Scanner().scan(world, T, number).points)
+    write_tum(folder / "trajectory.txt", np.arange(len(poses)) / 10, poses)
+    tiles = [(points, packed_normals(normals)) for points, normals in cloud_tiles(world, spacing)]
+    points, normals = (np.concatenate(arrays) for arrays in zip(*tiles, strict=True))
+    tiles.clear()
+    with GridStore.create(folder / "map.grid", OUTDOORS) as store:
+        cells = len(store_cloud(store, points, {NORMAL: normals}))
+    return {"points": len(points), "cells": cells}
+
+
+def make_room(folder: Path, recording: Path, stop: int, scale: float) -> dict[str, Any]:
+    """Records frames with the recording's own poses."""
+    shutil.rmtree(folder, ignore_errors=True)
+    frames = open_sequence(recording, stop=stop, scale=scale)
+    assert frames.ground_truth is not None
+    # Every place within a cell counts as near its centre: a hand-held camera does not pass by the centres.
+    with GridStore.create(folder / "map.grid", replace(INDOORS, spacing=1.0, radius=0.9)) as store:
+        sights = FrameSights(frames.camera, NativeContext())
+        cells = record_visit(store, frames.stream(masks=False), frames.ground_truth, sights, "map")
+        points = sum(store.cell(key).parts["points.pcd"].count for key in store.cells())
+    return {"points": points, "cells": len(cells)}
+
+
+def located(
+    path: Path, sequence: Path, full: bool, tree: bool, voxel: float, radius: float, first: int, stop: int | None,
+    scale: float,
+) -> dict[str, Any]:  # fmt: skip
+    """Locates a recording from its first given pose; times by frame."""
+    before = peak_memory_mb()
+    context = NativeContext()
+    with GridStore.open(path) as store:
+        target = replace(SCAN_TARGET if scan_files(sequence) else TargetSettings(), voxel=voxel)
+        submaps = replace(store.settings, partial_radius=radius)
+        surface: Any
+        if tree:
+            surface = TreeSurface(store, submaps, full)
+        else:
+            surface = FullSurface(store, target, context) if full else PartialSurface(store, target, context, submaps)
+        if scan_files(sequence):
+            scans = ScanSequence(sequence, first, stop)
+            truth, times = scans.ground_truth, scans.timestamps
+            assert truth is not None
+            tracker: Any = TreeTracker(truth[0]) if tree else ScanTracker(ScanTrackerSettings(), context, truth[0])
+            results, processor = timed(Localizer(surface, tracker, truth[0]), [scan.points for scan in scans.stream()])
+        else:
+            frames = open_sequence(sequence, start=first, stop=stop, scale=scale)
+            truth, times = frames.ground_truth, frames.timestamps
+            assert truth is not None
+            by_frame = Localizer(surface, FrameTracker(frames.camera, TrackerSettings(), context, truth[0]), truth[0])
+            results, processor = timed(by_frame, frames.stream(prefetch=0, masks=False))
+        surface.close()
+    summary = LocalizationReport(str(path), str(sequence), full, times, results, truth).summary()
+    return {
+        **summary, "before_mb": before, "map_ms": [1e3 * r.map_seconds for r in results],
+        "align_ms": [1e3 * r.align_seconds for r in results], "processor_ms": processor,
+    }  # fmt: skip
+
+
+def timed(localizer: Localizer[Any], items: Iterable[Any]) -> tuple[list[Localization], list[float]]:
+    """Locates all, and the milliseconds that all threads together worked on each, those that load ahead included."""
+    results, processor = [], []
+    for item in items:
+        before = time.process_time()
+        results.append(localizer.locate(item))
+        processor.append(1e3 * (time.process_time() - before))
+    return results, processor
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every fault, what the user sees, what was kept.
+
+    python scripts/tools/fault_table.py                        # all, a table
+    python scripts/tools/fault_table.py --only yaml,disk       # those with one of these words in their names
+    python scripts/tools/fault_table.py --markdown docs/faults.md --json faults.json
+
+Each fault happens in a folder of its own: a small recording or run is damaged, or a command is cut off, in a process
+with limits of memory (4 GB) and time (120 s). A row is bad if there is a traceback, a crash, a hang, a control
+character, or nothing was kept; then the exit code is 1. Faults that need a small disk of their own need root.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("COLUMNS", "1000")
+os.environ["NO_COLOR"] = "1"
+
+from fault_bench import FEW, Place, Row, command  # noqa: E402
+from fault_cases import FAULTS, NotHere  # noqa: E402
+
+import ggslam.cli.main  # noqa: E402, F401  (what all processes share)
+import ggslam.jobs.run.pipeline  # noqa: E402, F401
+
+FRAMES = 14
+HEAD = """# Faults
+
+What goes wrong, what ggslam says (the line that matters), and what is kept of your work; written by
+`python fault_table.py --markdown docs/faults.md`, which lets each happen in a folder of its own, here `.`.
+Exit codes: 0 done (3 with `--strict` where the verdict is bad or something seems wrong), 2 the input's fault, 1 the
+machine's or ours, or most frames lost, 128 + n after signal n, -9 after a kill.
+After a kill the line is that of the command that goes on.
+"""
+
+
+def make_inputs(folder: Path) -> tuple[Path, Path]:
+    """A small recording and a finished run of it."""
+    recording, run = folder / "recording", folder / "run"
+    for words in (
+        ["synth", str(recording), "--frames", str(FRAMES), "--width", "96", "--height", "72"],
+        ["run", str(recording), "--out", str(run), *FEW],
+    ):
+        ended = command(words, folder, None, 8 << 30)
+        if ended.code:
+            raise SystemExit(f"{' '.join(words)}: {ended.text}")
+    return recording, run
+
+
+def happen(name: str, folder: Path, recording: Path, run: Path) -> Row | None:
+    """Lets a fault happen; None if this machine cannot."""
+    folder.mkdir()
+    place = Place(folder, recording, run)
+    try:
+        FAULTS[name](place)
+        return place.row(name)
+    except NotHere as reason:
+        print(f"left out: {name}: {reason}", file=sys.stderr)
+        return None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def cell(text: str, most: int) -> str:
+    """Text for a Markdown table."""
+    short = text if len(text) <= most else text[: most - 1] + "…"
+    return short.replace("|", "\\|").replace("<", "&lt;")
+
+
+def table(rows: list[Row]) -> str:
+    lines = ["| fault | what the user sees | exit code | what was kept |", "|---|---|---|---|"]
+    for row in rows:
+        kept = row.kept + (f" **{', '.join(row.problems)}**" if row.problems else "")
+        lines.append(f"| {row.fault} | {cell(row.said, 220)} | {row.code} | {cell(kept, 120)} |")
+    return "\n".join(lines)
+
+
+def page(rows: list[Row]) -> str:
+    """The table as a page of docs."""
+    return f"{HEAD}\n{table(rows)}\n"
+
+
+def write(rows: list[Row], markdown: Path | None, records: Path | None) -> None:
+    """What is known so far."""
+    if markdown is not None:
+        markdown.write_text(page(rows))
+    if records is not None:
+        records.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="words, by commas")
+    parser.add_argument("--markdown", type=Path, help="write a page with the table there")
+    parser.add_argument("--json", type=Path, help="write the rows there")
+    given = parser.parse_args()
+    words = [word for word in given.only.split(",") if word]
+    names = [name for name in FAULTS if not words or any(word in name for word in words)]
+    rows, start = [], time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="ggslam-faults-") as temporary:
+        folder = Path(temporary)
+        inputs = make_inputs(folder)
+        for number, name in enumerate(names):
+            row = happen(name, folder / f"fault{number}", *inputs)
+            if row is not None:
+                rows.append(row)
+                print(table([row]).splitlines()[-1], flush=True)
+                write(rows, given.markdown, given.json)
+    bad = [row for row in rows if row.problems]
+    print(f"{len(rows)} faults in {time.perf_counter() - start:.0f} s, {len(bad)} bad")
+    for row in bad:
+        print(f"bad: {row.fault}: {', '.join(row.problems)}")
+    sys.exit(1 if bad else 0)
+
+
+if __name__ == "__main__":
+    main()
