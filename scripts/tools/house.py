@@ -112,6 +112,11 @@ ONLY_FOR_USERS = {"ggslam.volumes.raycast"}
 """Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it."""
 
 
+def is_package(name: str) -> bool:
+    """Whether a module is a package."""
+    return name in plan.modules() and plan.modules()[name].name == "__init__.py"
+
+
 def unused_modules() -> list[str]:
     """Modules that are reached neither from the command line nor from the public face: tests may need them, users do
     not."""
@@ -123,9 +128,12 @@ def unused_modules() -> list[str]:
             seen.add(name)
             pending += [other for other in plan.imports(name) if other in plan.modules()]
             pending += [name.rpartition(".")[0]] if "." in name else []  # a package is loaded before its modules
-            nodes = ast.walk(ast.parse(plan.modules()[name].read_text()))
-            texts = [node.value for node in nodes if isinstance(node, ast.Constant)]
+            content = plan.modules()[name].read_text()
+            texts = [node.value for node in ast.walk(ast.parse(content)) if isinstance(node, ast.Constant)]
             pending += [text for text in texts if text in plan.modules()]  # started as a process of its own
+            if "iter_modules(" in content:  # loads all modules of the packages that it imports
+                packages = tuple(f"{other}." for other in plan.imports(name) if is_package(other))
+                pending += [other for other in plan.modules() if other.startswith(packages)]
     return sorted(set(plan.modules()) - seen)
 
 
