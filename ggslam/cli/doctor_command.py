@@ -18,6 +18,8 @@ EPILOG = """
   ggslam doctor
 
   ggslam doctor --json > doctor.json      (to send along with a question)
+
+  ggslam doctor --modes                   (what a GPU, real time, a rig or a limit of memory leave out)
 """
 
 _MARKS = {"ok": ("ok", "green"), "missing": ("--", "dim"), "warning": ("!!", "yellow"), "broken": ("XX", "bold red")}
@@ -25,9 +27,13 @@ _MARKS = {"ok": ("ok", "green"), "missing": ("--", "dim"), "warning": ("!!", "ye
 
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    modes: Annotated[bool, typer.Option("--modes", help="Print what runs of each kind leave out, and end.")] = False,
     self_test: Annotated[bool, typer.Option("--self-test/--no-self-test", help="Also render and track.")] = True,
 ) -> None:
     """Check the installation: versions, compiled core, GPU, extras, weights. Exit code 1 if ggslam cannot work."""
+    if modes:
+        _print_modes()
+        return
     from ggslam.jobs.doctor.checkup import examine, works
 
     findings = examine(self_test)
@@ -50,3 +56,16 @@ def doctor(
     else:
         console.print("[bold red]ggslam does not work here[/]: see the lines marked XX.")
     raise typer.Exit(0 if good else 1)
+
+
+def _print_modes() -> None:
+    from rich.table import Table
+
+    from ggslam.slam.modes import table
+
+    heading, *rows = table()
+    printed = Table(*heading)
+    for row in rows:
+        printed.add_row(*row)
+    console.print("What runs can do, besides a synchronous run of one camera on the CPU with all of the map in memory:")
+    console.print(printed)

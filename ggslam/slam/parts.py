@@ -26,6 +26,7 @@ from ggslam.slam.config import Config
 from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.memory_budget import MB, MemoryBudget
+from ggslam.slam.modes import Mode, refuse
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
@@ -98,8 +99,7 @@ def run_library(config: Config) -> tuple[CudaLibrary | None, str | None]:
     if config.device == "cpu":
         return None, None
     try:
-        if config.memory_limit_mb:
-            raise ConfigError("a run with a limit of memory (memory_limit_mb) needs cpu")
+        refuse(Mode.GPU, config)
         return library_for_device(), None
     except (ConfigError, MissingDependency) as error:
         if config.device == "auto":

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ggslam.errors import ConfigError, FormatError
+from ggslam.errors import FormatError
 from ggslam.scene.camera import Camera
 from ggslam.scene.rig import Rig
 from ggslam.slam.config import Config
 from ggslam.slam.filter_chain import FilterChain
 from ggslam.slam.filters.frame_filter import FilterContext
 from ggslam.slam.loop_settings import LoopSettings
+from ggslam.slam.modes import Mode, refuse
 from ggslam.slam.parts import RunParts
 from ggslam.slam.rig_locator import RigLocator
 from ggslam.slam.slam import Slam
@@ -33,6 +34,8 @@ class RigSlam(Slam):
     Raises:
         ConfigError: settings that a rig does not go with.
     """
+
+    is_rig = True
 
     def __init__(self, rig: Rig, config: Config | None = None, has_masks: bool | None = None) -> None:
         self.rig = rig
@@ -62,15 +65,7 @@ def _settings_for(rig: Rig, config: Config) -> Config:
     Raises:
         ConfigError: settings that a rig does not go with.
     """
-    refusals = {
-        "realtime_fps": config.realtime_fps > 0, "memory_limit_mb": config.memory_limit_mb > 0,
-        "device": config.device == "cuda", "tracker": config.tracker != "gicp",
-    }  # fmt: skip
-    refused = [name for name, is_refused in refusals.items() if is_refused]
-    if refused:
-        value = getattr(config, refused[0])
-        raise ConfigError(f"{refused[0]}: a rig of cameras does not go with {value}; runs of a rig are synchronous, on "
-                          "the CPU, tracked by G-ICP, with all of the map in memory")  # fmt: skip
+    refuse(Mode.RIG, config)
     movers = replace(config.movers, enabled=False)  # frames of different cameras follow one another
     return replace(config, device="cpu", loops=_loops_for(len(rig), config.loops), movers=movers)
 

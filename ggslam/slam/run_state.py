@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
 from ggslam.slam.map_removal import MapRemoval
+from ggslam.slam.modes import modes_of, notes
 from ggslam.slam.parts import RunParts, check_arguments, make_parts
 from ggslam.slam.result import LearnedObjects, SlamTimes, TrackedFrame
 from ggslam.slam.run_objects import RunObjects
@@ -43,6 +45,7 @@ class RunState:
     _noise: DepthNoise | None
     dropped_frames: list[int]
     refine_iterations: int
+    is_rig: ClassVar[bool] = False
 
     def __init__(
         self, camera: Camera, config: Config | None = None, has_masks: bool | None = None, paging: Path | None = None,
@@ -54,8 +57,8 @@ class RunState:
         parts = make_parts(camera, self.config, has_masks, paging, library, compact=extra_loss is None)
         self.context, self.masks, self.tracker, self.surface = parts.context, parts.masks, parts.tracker, parts.surface
         self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
-        self.start_notes = parts.notes
-        """What the user should know of the parts that the settings chose."""
+        self.start_notes = [*parts.notes, *notes(modes_of(self.config, self.is_rig, parts.on_device), self.config)]
+        """What the user should know before the first frame: what the settings chose, and what such runs leave out."""
         if extra_loss is not None and parts.on_device:
             raise ConfigError("a loss of your own (extra_loss) needs device: cpu; on a GPU kernels compute the losses")
         self.mapper.extra_loss = extra_loss

@@ -176,6 +176,7 @@ class _Run:
     depth: list[Verdict] | None = None
     fit: MapFit | None = None
     saw_all: bool = False
+    told: list[str] = field(default_factory=list)
 
     def run(self, resumption: Resumption | None) -> RunOutcome:
         """From the first frame, or from where it was, to the report."""
@@ -192,7 +193,7 @@ class _Run:
             if resumption is not None and checkpointing is not None:
                 loop.resume = lambda slam: resumption.restore(slam, checkpoints, checkpointing, observer)
             result, error = loop.run()
-            self.saw_all = loop.saw_all
+            self.saw_all, self.told = loop.saw_all, loop.told
         except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
             if resumption is None:
                 checkpoints.remove()
@@ -240,7 +241,8 @@ class _Run:
         verdicts = self._or_note(lambda: judge(self.sequence, result, self.depth)) or []
         result.notes = doubt_movers(result.notes, verdicts)
         for text in [*LoopsRecord.of_result(result).notes(), *described.notes(), *lacking, *result.notes]:
-            self.observer.note(text)
+            if text not in self.told:
+                self.observer.note(text)
         names = {**_names(self.earlier), **self.sequence.instance_names}
         scored = self.request.evaluate and error is None and self._frames_stay()
         wanted = (*((MetricsRecord.FILE, "frames.csv") if scored else ()), REPORT_FILE)

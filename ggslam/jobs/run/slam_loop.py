@@ -47,6 +47,7 @@ class SlamLoop:
         checkpointing: saves the state; None: never.
         stop: says when to end early.
         resume: brings a fresh `Slam` to where it was, and tells which frame comes next, None if it was nowhere yet.
+        told: notes of the run that were told at its start.
         saw_all: whether all frames were tracked, and what is left is the refinement.
     """
 
@@ -60,6 +61,7 @@ class SlamLoop:
     checkpointing: Checkpointing | None = None
     stop: StopRequest = field(default_factory=StopRequest)
     resume: Callable[[Slam], int | None] | None = None
+    told: list[str] = field(default_factory=list)
     saw_all: bool = False
     _between_steps: bool = False
 
@@ -76,6 +78,9 @@ class SlamLoop:
         folder = self.folder
         paging = new_staging(folder.path) if self.config.memory_limit_mb and folder is not None else None
         slam = make_slam(self.sequence, self.config, paging)
+        self.told = list(slam.start_notes)
+        for note in self.told:
+            self.observer.note(note)
         begin = None if self.resume is None else self.resume(slam)
         if begin is None and self.earlier is not None:
             start_in_map(slam, self.earlier, self.growing)
