@@ -6,6 +6,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts" / "tools"))
 import house  # noqa: E402
 
@@ -20,6 +22,17 @@ def test_records_are_read_by_records_and_settings_have_ranges() -> None:
     assert house.raw_json_reads() == []
     public, internal, without_range = house.settings()
     assert len(public) <= 90 and not set(public) & set(internal) and without_range == []
+
+
+def test_every_module_serves_a_command_or_the_public_face(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert house.unused_modules() == []
+    monkeypatch.setattr(house, "ONLY_FOR_USERS", set())
+    assert "ggslam.volumes.raycast" in house.unused_modules()
+
+
+def test_every_room_has_a_purpose() -> None:
+    assert "else" not in house.lines_by_purpose()
+    assert house.code_lines('"""Text."""\n\n# why\nx = 1  # so\ny = """a\nb"""\n') == 3
 
 
 def test_it_knows_what_it_looks_for() -> None:

@@ -33,6 +33,7 @@ JOBS = (
     {"update"},
     {"changes"},
     {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch", "merge", "refine"},
+    {"stores"},
     {"submaps", "tasks"},
     {"progress"},
 )

@@ -14,6 +14,10 @@ import numpy as np
 import pytest
 from command_line import ggslam, refuse, succeed
 from scipy.spatial import cKDTree
+from worlds.cloud import cloud_tiles
+from worlds.plan import make_world
+from worlds.scanner import Scanner
+from worlds.walk import walk
 
 from ggslam.formats.ply import write_ply
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
@@ -22,10 +26,6 @@ from ggslam.formats.triangle_mesh import read_mesh
 from ggslam.scene.poses import se3_exp, transform_points
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import load_points
-from ggslam.synthetic.world_cloud import cloud_tiles
-from ggslam.synthetic.world_plan import make_world
-from ggslam.synthetic.world_scanner import Scanner
-from ggslam.synthetic.world_walk import walk
 from ggslam.volumes.octomap_files import read_octomap
 
 UTM = np.array([463000.0, 5427000.0, 300.0])

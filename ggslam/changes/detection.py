@@ -15,7 +15,7 @@ from ggslam.changes.motions import ALIKE
 from ggslam.changes.placing import Placing
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
-from ggslam.changes.shapes import fit_shapes
+from ggslam.changes.shape_alignment import fit_shapes
 from ggslam.changes.sightings import Sightings, Surface, Visit
 from ggslam.changes.thing_views import ThingViews
 from ggslam.changes.things import UNNAMED, JudgedSurface, Thing, things_by_id, things_by_surface

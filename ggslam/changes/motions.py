@@ -10,8 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ggslam.changes.shape import COLOR_SCALE_M, Shape
-from ggslam.changes.upright import about
-from ggslam.scene.poses import fit_similarity, turning_angle
+from ggslam.scene.poses import fit_similarity, rotation_about, turning_angle
 
 _COARSE, _COARSE_STEPS, _GOOD = 150, 10, 16
 _FINE, _FINE_STEPS, _BEST = 400, 15, 8
@@ -25,7 +24,7 @@ _TRIMMED = 0.8
 def likeliest_motions(old: Shape, new: Shape, up: np.ndarray) -> list[np.ndarray]:
     """The likeliest motions by points and colours together, from starts all around."""
     rng = np.random.default_rng(0)
-    upright = np.array([about(up, angle) for angle in range(0, 360, 15)])
+    upright = np.array([rotation_about(up, angle) for angle in range(0, 360, 15)])
     rotations = np.concatenate([upright, _rotations()])
     motions = np.tile(np.eye(4), (len(rotations), 1, 1))
     motions[:, :3, :3] = rotations
@@ -75,6 +74,6 @@ def _rotations() -> np.ndarray:
             if np.linalg.det(R) > 0:
                 cube.append(R)
     cube.sort(key=lambda R: -np.trace(R))
-    half = [about(axis, angle) for axis in np.eye(3) for angle in (45, -45)]
-    half += [about(np.array(axis) / np.sqrt(3), 60) for axis in product((-1, 1), repeat=3)]
+    half = [rotation_about(axis, angle) for axis in np.eye(3) for angle in (45, -45)]
+    half += [rotation_about(np.array(axis) / np.sqrt(3), 60) for axis in product((-1, 1), repeat=3)]
     return np.array([*cube, *(R @ H for H in half for R in cube[::2])])

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.scene.poses import se3_exp, transform_points
+from ggslam.scene.poses import rotation_about, transform_points
 
 LEVEL = np.radians(0.5)
 """What tilts a thing less keeps it upright."""
@@ -37,21 +37,16 @@ def without_tilt(T: np.ndarray, up: np.ndarray, point: np.ndarray) -> np.ndarray
     length = float(np.linalg.norm(axis))
     R = T[:3, :3]
     if length > 1e-9:
-        R = about(axis / length, float(np.degrees(tilt(T, up)))) @ R
+        R = rotation_about(axis / length, float(np.degrees(tilt(T, up)))) @ R
     level = np.eye(4)
     level[:3, :3] = R
     level[:3, 3] = transform_points(point[None], T)[0] - R @ point
     return level
 
 
-def about(axis: np.ndarray, degrees: float) -> np.ndarray:
-    """The rotation [3, 3] about an axis [3], a unit vector."""
-    return se3_exp(np.concatenate([np.zeros(3), np.radians(degrees) * axis]))[:3, :3]
-
-
 def turned_about(axis: np.ndarray, degrees: float, point: np.ndarray) -> np.ndarray:
     """The motion [4, 4] that turns about an axis [3], a unit vector, through a point [3]."""
     T = np.eye(4)
-    T[:3, :3] = about(axis, degrees)
+    T[:3, :3] = rotation_about(axis, degrees)
     T[:3, 3] = point - T[:3, :3] @ point
     return T

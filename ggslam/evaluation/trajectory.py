@@ -10,12 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import FormatError, InputError
-from ggslam.formats.trajectory import read_trajectory
+from ggslam.errors import InputError
 from ggslam.scene.poses import fit_similarity, inverse
 
 FEWEST_POSES = 3
@@ -110,60 +108,6 @@ def score_trajectory(
     )
 
 
-def score_trajectory_files(
-    estimated: str | Path, truth: str | Path, max_difference_s: float = 0.02, rpe_delta: int = 1
-) -> TrajectoryScores:
-    """Compares two trajectory files; poses belong together if their timestamps are nearest and close enough.
-
-    Args:
-        estimated, truth: files that `ggslam.formats.trajectory.read_trajectory` reads.
-        max_difference_s: greatest difference of timestamps in seconds (0.02 as in the TUM benchmark).
-        rpe_delta: as in `score_trajectory`, counted in associated poses.
-
-    Raises:
-        FormatError: a file is damaged, or fewer than 3 poses belong together.
-    """
-    P, Q = read_trajectory(estimated), read_trajectory(truth)
-    pairs = associate(P.timestamps, Q.timestamps, max_difference_s)
-    scores = score_trajectory(P.T_world_camera[pairs[:, 0]], Q.T_world_camera[pairs[:, 1]], rpe_delta)
-    if scores is None:
-        raise FormatError(
-            f"{estimated} and {truth} have {len(pairs)} poses within {max_difference_s} s of each other, expected at "
-            f"least {FEWEST_POSES}; their times span {_span(P.timestamps)} and {_span(Q.timestamps)}"
-        )
-    return scores
-
-
-def associate(times: np.ndarray, other_times: np.ndarray, max_difference_s: float = 0.02) -> np.ndarray:
-    """Pairs nearest timestamps, each used once, the closest pairs first.
-
-    Returns:
-        int64 [M, 2] indices into both, by increasing time.
-    """
-    order = np.argsort(other_times, kind="stable")
-    right = np.searchsorted(other_times[order], times)
-    candidates = []
-    for shift in (-2, -1, 0, 1):  # the two neighbours on either side: enough for the second choice after a conflict
-        j = right + shift
-        inside = (j >= 0) & (j < len(order))
-        i = np.nonzero(inside)[0]
-        candidates.append(np.stack([i, order[j[inside]]], 1))
-    pairs = np.concatenate(candidates)
-    difference = np.abs(times[pairs[:, 0]] - other_times[pairs[:, 1]])
-    used: tuple[set[int], set[int]] = (set(), set())
-    chosen = []
-    for k in np.argsort(difference, kind="stable"):
-        a, b = int(pairs[k, 0]), int(pairs[k, 1])
-        if difference[k] > max_difference_s:
-            break
-        if a not in used[0] and b not in used[1]:
-            used[0].add(a)
-            used[1].add(b)
-            chosen.append((a, b))
-    out = np.array(chosen, np.int64).reshape(-1, 2)
-    return out[np.argsort(times[out[:, 0]], kind="stable")]
-
-
 def _stack(poses: np.ndarray | Sequence[np.ndarray | None]) -> np.ndarray:
     """[N, 4, 4] float64 with NaN for None."""
     stacked = np.full((len(poses), 4, 4), np.nan)
@@ -196,7 +140,3 @@ def _relative_errors(P: np.ndarray, Q: np.ndarray, known: np.ndarray, delta: int
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
-
-
-def _span(times: np.ndarray) -> str:
-    return f"{times.min():.3f} to {times.max():.3f} s"

@@ -3,7 +3,7 @@
 
 Depth images have neighbours in their grid instead, and three parts take normals from there, each what it needs: the
 compiled core the shape of a point, noise taken off, for G-ICP (`tracking.points`), new Gaussians none beside a jump
-(`mapping.cpu.insertion`), the segmenter one at every pixel, from inverse depth (`objects.depth_surfaces`).
+(`mapping.cpu.insertion`), the segmenter one at every pixel, from inverse depth (`objects.depth_surface`).
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ import numpy as np
 from ggslam.localization.localizer import ANY_NORMAL
 from ggslam.localization.surface import SCAN_TARGET, Surface
 from ggslam.native.loader import NativeContext
-from ggslam.scene.poses import orthonormalize, se3_exp, separation, transform_points
+from ggslam.scene.poses import orthonormalize, rotation_about, separation, transform_points
 from ggslam.system.settings import setting, settings_class, tuning_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
 from ggslam.tracking.points import FramePoints
@@ -228,7 +228,7 @@ class ScanAligner:
 
     def _starts(self, guess: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
         """The guess, turned and moved over the ground, nearest first."""
-        turns = [np.eye(3), *(_turn(up, sign * self._search.turn_deg) for sign in (1, -1))]
+        turns = [np.eye(3), *(rotation_about(up, sign * self._search.turn_deg) for sign in (1, -1))]
         across = np.linalg.svd(up[None])[2][1:]
         shifts = [np.zeros(3), *(share * self._search.reach * axis for axis in across for share in _AROUND)]
         for shift in shifts:
@@ -303,10 +303,6 @@ def _wider(
 def _directions(normals: np.ndarray) -> np.ndarray:
     """Orthonormal columns [3, 3]: the direction that normals [n, 3] lie along the least, ..., the most."""
     return np.linalg.eigh((normals.T @ normals).astype(np.float64))[1]
-
-
-def _turn(axis: np.ndarray, degrees: float) -> np.ndarray:
-    return se3_exp(np.concatenate([np.zeros(3), np.radians(degrees) * axis]))[:3, :3]
 
 
 def _unit(normals: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@
 x is the rendered colour after the keyframe's exposure (gain * rendered + offset, per channel), y the target in [0, 1];
 rho is |.| or Charbonnier; SSIM (Wang et al. 2004) has an 11x11 Gaussian window, sigma 1.5, and zero padding. At pixels
 without depth x is first pulled to the target, x <- w x + (1 - w) y with w = `no_depth_weight`. `mean_valid` is over
-the pixels whose target depth is known. `losses_reference.py` says the same in a page of torch.
+the pixels whose target depth is known. `tests/mapping/losses_reference.py` says the same in a page of torch.
 """
 
 from __future__ import annotations

@@ -12,9 +12,9 @@ import torch
 from ggslam.errors import ConfigError
 from ggslam.mapping.votes import merge_votes
 from ggslam.objects.encoding import code_of, with_class
-from ggslam.objects.settings import UnitingSettings
+from ggslam.objects.same_object import LabelledVoxels, find_counterparts, sizes_of
+from ggslam.objects.settings import SameObjectSettings
 from ggslam.objects.table import ObjectTable, Observation, Supervision
-from ggslam.objects.uniting import LabelledVoxels, find_counterparts, sizes_of
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 
@@ -73,7 +73,7 @@ class UnitedObjects:
         notes: what the user should know.
     """
 
-    settings: UnitingSettings
+    settings: SameObjectSettings
     classifier: IdentityClassifier = field(default_factory=lambda: IdentityClassifier.empty(IDENTITY_CHANNELS))
     supervision: Supervision | None = None
     names: dict[int, str] = field(default_factory=dict)

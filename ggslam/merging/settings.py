@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import field
 
 from ggslam.loops.settings import GraphSettings, VerificationSettings
-from ggslam.objects.settings import UnitingSettings
+from ggslam.objects.settings import SameObjectSettings
 from ggslam.system.settings import setting, settings_class
 
 
@@ -42,5 +42,5 @@ class MergeSettings:
     """Optimisation steps at the seams, for each run that joins the first."""
     verification: VerificationSettings = field(default_factory=VerificationSettings)
     graph: GraphSettings = field(default_factory=GraphSettings)
-    uniting: UnitingSettings = field(default_factory=UnitingSettings)
+    uniting: SameObjectSettings = field(default_factory=SameObjectSettings)
     seams: SeamSettings = field(default_factory=SeamSettings)

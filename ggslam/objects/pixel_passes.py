@@ -14,7 +14,6 @@ from ggslam.interface.core import objects as core
 from ggslam.native.loader import load_library
 from ggslam.objects.depth_surface import DepthSurface
 from ggslam.objects.settings import GeometricSettings
-from ggslam.scene.camera import Camera
 
 Links = tuple[np.ndarray, np.ndarray]
 """bool [H, W-1] and [H-1, W], of each pixel and its right and its lower neighbour."""
@@ -185,18 +184,6 @@ def count_contacts(
         if found <= room:
             return pairs[:found], counts[:found]
         room = found
-
-
-def normals_of_inverse(inverse: np.ndarray, camera: Camera, step: int, jump: float) -> np.ndarray:
-    """Unit normals towards the camera, float32 [H, W, 3], from differences of inverse depth (float32 [H, W], 1/m) over
-    `step` pixels, on one side only where the other is beyond a jump (1/m)."""
-    inverse, rays = np.ascontiguousarray(inverse, np.float32), np.ascontiguousarray(camera.rays(), np.float32)
-    normals = np.empty((*inverse.shape, 3), np.float32)
-    job = core.NormalsJob(
-        address(inverse), address(rays), *inverse.shape, step, camera.fx, camera.fy, jump, address(normals)
-    )
-    load_library().ggslam_surface_normals(ctypes.byref(job))
-    return normals
 
 
 def count_alike(

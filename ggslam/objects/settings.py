@@ -102,7 +102,7 @@ class GeometricSettings(GeometricTuning):
 
 
 @tuning_class(frozen=True)
-class UnitingSettings:
+class SameObjectSettings:
     """Numbers that decide when two objects, of two maps or of both ends of a loop, are one."""
 
     voxel: float = setting(0.04, 1e-3, 10, "m")

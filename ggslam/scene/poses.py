@@ -47,6 +47,11 @@ def se3_exp(twist: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
+def rotation_about(axis: np.ndarray, degrees: float) -> np.ndarray:
+    """The rotation [3, 3] about an axis [3], a unit vector."""
+    return se3_exp(np.concatenate([np.zeros(3), np.radians(degrees) * axis]))[:3, :3]
+
+
 def left_multiplication(quaternions: np.ndarray) -> np.ndarray:
     """Matrices [..., 4, 4] whose product with a quaternion wxyz is the Hamilton product of these [..., 4] with it."""
     w, x, y, z = np.moveaxis(np.asarray(quaternions, np.float64), -1, 0)

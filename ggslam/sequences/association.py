@@ -18,14 +18,14 @@ WIDE_TOLERANCE = 0.08
 """Tried when almost nothing pairs up within `TOLERANCE`."""
 
 
-def pair_times(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[tuple[int, int]]:
-    """Pairs (i, j) of times first[i], second[j] at most `tolerance` seconds apart, each used once, closest pairs first.
+def pair_times(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
+    """Pairs of times first[i], second[j] at most `tolerance` seconds apart, each used once, closest pairs first.
 
     Args:
         first, second: float64 [n], [m], in any order.
 
     Returns:
-        Pairs sorted by i.
+        int64 [pairs, 2], rows (i, j) sorted by i.
     """
     order = np.argsort(second, kind="stable")
     sorted_second = second[order]
@@ -40,7 +40,7 @@ def pair_times(first: np.ndarray, second: np.ndarray, tolerance: float) -> list[
         if i not in pairs and j not in taken:
             pairs[i] = j
             taken.add(j)
-    return sorted(pairs.items())
+    return np.array(sorted(pairs.items()), np.int64).reshape(-1, 2)
 
 
 def pair_images(
@@ -58,10 +58,10 @@ def pair_images(
         SequenceError: nothing pairs up.
     """
     pairs = pair_times(color, depth, TOLERANCE)
-    if pairs and 2 * len(pairs) >= min(len(color), len(depth)):
-        return pairs, _left_out(len(color), len(pairs), names, few)
+    if len(pairs) and 2 * len(pairs) >= min(len(color), len(depth)):
+        return _as_list(pairs), _left_out(len(color), len(pairs), names, few)
     wide = pair_times(color, depth, WIDE_TOLERANCE)
-    if not wide:
+    if not len(wide):
         gap = min((np.abs(depth - t).min() for t in color), default=np.inf) if len(depth) else np.inf
         raise SequenceError(
             f"{place}: no image of {names[0]} is within {WIDE_TOLERANCE} s of one in {names[1]} (closest: {gap:.3f} "
@@ -71,7 +71,11 @@ def pair_images(
         f"only {len(pairs)} of {len(color)} colour images have depth within {TOLERANCE} s; {len(wide)} paired within "
         f"{WIDE_TOLERANCE} s instead"
     )
-    return wide, [warning]
+    return _as_list(wide), [warning]
+
+
+def _as_list(pairs: np.ndarray) -> list[tuple[int, int]]:
+    return [(int(i), int(j)) for i, j in pairs]
 
 
 def _left_out(images: int, used: int, names: tuple[str, str], few: float) -> list[str]:

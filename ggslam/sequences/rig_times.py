@@ -25,7 +25,7 @@ def find_instants(times: Sequence[np.ndarray], tolerance: float) -> np.ndarray:
     rows[:, 0] = np.arange(len(times[0]))
     at = np.array(times[0], float)
     for number, own in enumerate(times[1:], start=1):
-        pairs = np.array(pair_times(at, own, tolerance), int).reshape(-1, 2)
+        pairs = pair_times(at, own, tolerance)
         rows[pairs[:, 0], number] = pairs[:, 1]
         alone = np.setdiff1d(np.arange(len(own)), pairs[:, 1])
         more = np.full((len(alone), len(times)), -1)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.mapping.mapper import Mapper
-from ggslam.objects.uniting import FAINT, LabelledVoxels
+from ggslam.objects.same_object import FAINT, LabelledVoxels
 from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks

@@ -18,10 +18,10 @@ from ggslam.mapping.labelling import KeyframeLabels, MapLabels
 from ggslam.objects.association import Associator, MapView
 from ggslam.objects.geometric_segmenter import GeometricSegmenter
 from ggslam.objects.onnx_segmenter import OnnxSegmenter, OnnxSegmenterSettings
+from ggslam.objects.same_object import LabelledVoxels, find_counterparts
 from ggslam.objects.segments import boundary_trust, clean_segments
-from ggslam.objects.settings import AssociationSettings, CleaningSettings, GeometricSettings, UnitingSettings
+from ggslam.objects.settings import AssociationSettings, CleaningSettings, GeometricSettings, SameObjectSettings
 from ggslam.objects.table import Observation, Supervision
-from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.frame import Frame
 from ggslam.system.savable import savable
 from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
@@ -59,7 +59,7 @@ class MaskSettings(MaskTuning):
     association: AssociationSettings = field(default_factory=AssociationSettings)
     geometry: GeometricSettings = field(default_factory=GeometricSettings)
     onnx: OnnxSegmenterSettings = field(default_factory=OnnxSegmenterSettings)
-    uniting: UnitingSettings = field(default_factory=UnitingSettings)
+    uniting: SameObjectSettings = field(default_factory=SameObjectSettings)
 
     def __post_init__(self) -> None:
         if self.source == "model" and not self.model:

@@ -17,6 +17,7 @@ to be.
 
 from __future__ import annotations
 
+import math
 import os
 import secrets
 import threading
@@ -161,6 +162,12 @@ class GridStore:
         """Like `near`, for cells that have a part, with the version that it was written with."""
         return self._near(position, radius, part)
 
+    def around(self, key: CellKey, part: str, steps: int) -> list[CellKey]:
+        """Cells that have a part, at most so many cells from one along every axis, sorted; itself among them."""
+        reach = steps * self.grid.spacing * math.sqrt(3) * 1.01
+        near = self.part_versions(part, self.centre_of(key), reach)
+        return sorted(other for other in near if max(abs(a - b) for a, b in zip(key, other, strict=True)) <= steps)
+
     def _near(self, position: np.ndarray, radius: float, part: str | None) -> dict[CellKey, int]:
         position = np.asarray(position, np.float64)
         self.key_of(position)  # refuses positions that are not finite
@@ -177,6 +184,11 @@ class GridStore:
     def cells(self) -> list[CellKey]:
         """Every cell, sorted."""
         return self._index.keys()
+
+    def counts(self, part: str) -> dict[CellKey, int]:
+        """The cells that have a part, sorted, with its number of entries."""
+        found = ((key, self.cell(key).parts.get(part)) for key in self.cells())
+        return {key: record.count for key, record in found if record is not None}
 
     def cell(self, key: CellKey) -> CellRecord:
         """What is known of a cell. Raises KeyError if there is none, FormatError if one that is listed is not found."""

@@ -5,10 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
-from ggslam.synthetic.corridor import furnished_corridor
-from ggslam.synthetic.house import ring_of_rooms
 from ggslam.synthetic.room import furnished_room
 from ggslam.synthetic.scene import Scene
 
@@ -25,9 +22,21 @@ class SceneKind:
     depth_distortion: float
 
 
+def _loop(seed: int, frames: int) -> Scene:
+    from ggslam.synthetic.houses.house import ring_of_rooms  # houses are loaded by those who want one
+
+    return ring_of_rooms(seed)
+
+
+def _corridor(seed: int, frames: int, bare: bool = False) -> Scene:
+    from ggslam.synthetic.houses.corridor import furnished_corridor
+
+    return furnished_corridor(seed, frames, bare=bare)
+
+
 SCENES = {
     "room": SceneKind(lambda seed, frames: furnished_room(seed), 60, 30.0, "loop", 0.0),
-    "loop": SceneKind(lambda seed, frames: ring_of_rooms(seed), 480, 10.0, "route", 0.3),
-    "corridor": SceneKind(furnished_corridor, 720, 10.0, "walk", 0.0),
-    "bare": SceneKind(partial(furnished_corridor, bare=True), 720, 10.0, "walk", 0.0),
+    "loop": SceneKind(_loop, 480, 10.0, "route", 0.3),
+    "corridor": SceneKind(_corridor, 720, 10.0, "walk", 0.0),
+    "bare": SceneKind(lambda seed, frames: _corridor(seed, frames, bare=True), 720, 10.0, "walk", 0.0),
 }

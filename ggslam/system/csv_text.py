@@ -31,13 +31,14 @@ def csv_text(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _plain(cell: Any) -> Any:
-    if not isinstance(cell, str) or _is_number(cell):
+    if not isinstance(cell, str) or is_number(cell):
         return cell
     cell = cell.replace("\r", "\n")  # Python's writer does not quote \r, at which readers begin a new row
     return f"'{cell}" if cell.lstrip(" ").startswith(_FORMULA_STARTS) else cell
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether Python reads a text as a float."""
     try:
         float(text)
     except ValueError:

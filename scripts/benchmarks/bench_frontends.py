@@ -24,13 +24,17 @@ from typing import TypeVar
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "tracking"))
 
 import numpy as np
 import torch
+from feature_odometry import FeatureOdometry, LidarFeatures, split_features
+from worlds.pose_graph import read_pose_graph
 
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
-from ggslam.formats.raw_points import read_pose_graph, read_raw_points
+from ggslam.formats.raw_points import read_raw_points
 from ggslam.geometry.icp import register
 from ggslam.geometry.normals import estimate_normals
 from ggslam.native.loader import NativeContext
@@ -38,8 +42,6 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, so3_log
 from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
-from ggslam.tracking.edges_planes.local_map import FeatureOdometry
-from ggslam.tracking.edges_planes.scans import LidarFeatures, split_features
 from ggslam.tracking.edges_planes.settings import LIDAR, FeatureTrackerSettings
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp import GicpTarget, align

@@ -24,14 +24,15 @@ from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "submaps"))
 
 import numpy as np
+from partial_map import PartialMap
 
 from ggslam.submaps.cell_points import POINTS, decode_points, encode_points
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.cells_around import MapStatus
 from ggslam.submaps.grid import GridStore
-from ggslam.submaps.partial_map import PartialMap
 from ggslam.submaps.recorder import load_points, store_cloud
 from ggslam.submaps.settings import SubmapSettings
 

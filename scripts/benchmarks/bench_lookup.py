@@ -27,11 +27,17 @@ from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 import numpy as np
+from worlds.cloud import cloud_tiles
+from worlds.plan import make_world
+from worlds.pose_graph import read_pose_graph
+from worlds.scanner import Scanner
+from worlds.walk import walk
+from worlds.world import World, cast_rays
 
 from ggslam.formats.cloud_files import read_cloud_file
-from ggslam.formats.raw_points import read_pose_graph
 from ggslam.localization.level import about_z
 from ggslam.localization.localizer import Localization, Localizer
 from ggslam.localization.map_picture import picture_of_store
@@ -47,11 +53,6 @@ from ggslam.scene.poses import separation, transform_points
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.synthetic.world import World, cast_rays
-from ggslam.synthetic.world_cloud import cloud_tiles
-from ggslam.synthetic.world_plan import make_world
-from ggslam.synthetic.world_scanner import Scanner
-from ggslam.synthetic.world_walk import walk
 from ggslam.tracking.scan_points import ScanSettings
 
 INDOORS = SubmapSettings(axes="xy", voxel=0.05, radius=1.5, refresh=0.0)

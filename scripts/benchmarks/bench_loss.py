@@ -13,17 +13,21 @@ from __future__ import annotations
 import argparse
 import ctypes
 import statistics
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "mapping"))
 
 import numpy as np
 import torch
+from losses_reference import reference_loss
 from timing import seconds
 from torch.nn.functional import avg_pool2d
 
 from ggslam.mapping.cpu.losses import CpuImageLoss
 from ggslam.mapping.losses import LossTarget
-from ggslam.mapping.losses_reference import reference_loss
 from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext, available_instruction_sets, available_processors
 

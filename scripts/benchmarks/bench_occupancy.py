@@ -37,17 +37,18 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "volumes"))
 
 import numpy as np
+from agreement import agreement
+from pyoctomap_bridge import insert_batched, insert_rebuilding
 
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points
 from ggslam.sequences.factory import open_sequence
-from ggslam.volumes.agreement import agreement
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.occupancy_settings import OccupancySettings
 from ggslam.volumes.octomap_files import full_octomap
-from ggslam.volumes.pyoctomap_bridge import insert_batched, insert_rebuilding
 from ggslam.volumes.quantization import quantize
 
 

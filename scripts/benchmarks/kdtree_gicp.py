@@ -8,9 +8,14 @@ over the map's points, which takes the longer to build, to fill and to search th
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "submaps"))
 
 import numpy as np
+from partial_map import PartialMap
 from scipy.spatial import cKDTree
 
 from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
@@ -20,7 +25,6 @@ from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import CellArrays
 from ggslam.submaps.cells_around import MapStatus
 from ggslam.submaps.grid import GridStore
-from ggslam.submaps.partial_map import PartialMap
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.tracking.scan_points import ScanSettings, scan_points
 

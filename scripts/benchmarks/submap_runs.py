@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 import numpy as np
 from kdtree_gicp import TreeSurface, TreeTracker
@@ -81,11 +82,12 @@ def main() -> None:
 
 def make_world(folder: Path, size: float, spacing: float, scans: int, seed: int) -> dict[str, Any]:
     """Writes the map of a generated world, and scans along a walk in it with the true poses."""
+    from worlds.cloud import cloud_tiles
+    from worlds.plan import make_world as planned
+    from worlds.scanner import Scanner
+    from worlds.walk import SPEED, walk
+
     from ggslam.formats.trajectory import write_tum
-    from ggslam.synthetic.world_cloud import cloud_tiles
-    from ggslam.synthetic.world_plan import make_world as planned
-    from ggslam.synthetic.world_scanner import Scanner
-    from ggslam.synthetic.world_walk import SPEED, walk
 
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "scans").mkdir(parents=True)

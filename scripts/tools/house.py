@@ -78,6 +78,65 @@ def circles() -> list[str]:
     return []
 
 
+PURPOSES = {
+    "SLAM": "slam tracking mapping loops movers objects rendering scene geometry features native cuda",
+    "recordings, files and stores": "sequences formats coding runs submaps system interface errors __init__ __main__",
+    "work on finished runs": "jobs localization merging changes volumes evaluation viewer reporting",
+    "command line": "cli",
+    "generated recordings": "synthetic",
+}
+"""What the rooms are for."""
+
+
+def code_lines(text: str) -> int:
+    """Lines of a module without blank ones, comments and docstrings."""
+    documented: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            documented.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    lines = enumerate(text.splitlines(), 1)
+    return sum(1 for number, line in lines if line.strip() and line.lstrip()[0] != "#" and number not in documented)
+
+
+def lines_by_purpose() -> dict[str, int]:
+    """Lines of code of the package; rooms without a purpose count as "else"."""
+    purpose = {room: name for name, rooms in PURPOSES.items() for room in rooms.split()}
+    found: Counter[str] = Counter()
+    for name, path in plan.modules().items():
+        room = name.split(".")[1] if name.count(".") else "__init__"
+        found[purpose.get(room, "else")] += code_lines(path.read_text())
+    return dict(found)
+
+
+ONLY_FOR_USERS = {"ggslam.volumes.raycast"}
+"""Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it."""
+
+
+def is_package(name: str) -> bool:
+    """Whether a module is a package."""
+    return name in plan.modules() and plan.modules()[name].name == "__init__.py"
+
+
+def unused_modules() -> list[str]:
+    """Modules that are reached neither from the command line nor from the public face: tests may need them, users do
+    not."""
+    seen: set[str] = set()
+    pending = ["ggslam.__main__", "ggslam", *ONLY_FOR_USERS]
+    while pending:
+        name = pending.pop()
+        if name not in seen:
+            seen.add(name)
+            pending += [other for other in plan.imports(name) if other in plan.modules()]
+            pending += [name.rpartition(".")[0]] if "." in name else []  # a package is loaded before its modules
+            content = plan.modules()[name].read_text()
+            texts = [node.value for node in ast.walk(ast.parse(content)) if isinstance(node, ast.Constant)]
+            pending += [text for text in texts if text in plan.modules()]  # started as a process of its own
+            if "iter_modules(" in content:  # loads all modules of the packages that it imports
+                packages = tuple(f"{other}." for other in plan.imports(name) if is_package(other))
+                pending += [other for other in plan.modules() if other.startswith(packages)]
+    return sorted(set(plan.modules()) - seen)
+
+
 def length(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     """Lines of a function without its docstring."""
     body = node.body
@@ -133,11 +192,15 @@ def main() -> None:
     rooms = Counter(name.split(".")[1] for name in plan.modules() if name.count("."))
     for floor in plan.FLOORS:
         print("  ".join(f"{room} {rooms[room]}" for room in sorted(floor)))
+    print()
+    for purpose, lines in lines_by_purpose().items():
+        print(f"{'lines for ' + purpose:40} {lines}")
     found = list(functions())
     public, internal, unbounded = settings()
     counted = {
         "imports that run up": upward_imports(),
         "circles": circles(),
+        "modules that nothing uses": unused_modules(),
         "modules at the root": sorted(path.name for path in PACKAGE.glob("*.py")),
         f"functions over {LONGEST} lines": [place for place, node in found if length(node) > LONGEST],
         "settings, public": public,

@@ -12,7 +12,7 @@ from ggslam.changes.fits import Fit
 from ggslam.changes.motions import likeliest_motions
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape, Target
-from ggslam.changes.shapes import _stay_level
+from ggslam.changes.shape_alignment import _stay_level
 from ggslam.scene.poses import transform_points
 
 THICK_M = 0.02

@@ -16,8 +16,7 @@ from ggslam.changes.fits import Fit
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
 from ggslam.changes.turns import hidden_sector, tell_turn
-from ggslam.changes.upright import about
-from ggslam.scene.poses import inverse, transform_points, turning_angle
+from ggslam.scene.poses import inverse, rotation_about, transform_points, turning_angle
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -73,7 +72,7 @@ def test_visits_that_saw_different_sides_do_not_tell_a_turn(
     monkeypatch.setattr(turns, "_others", lambda *args: iter(()))
     T = np.eye(4)
     if tilts:
-        T[:3, :3] = about(np.array([1.0, 0, 0]), 90)
+        T[:3, :3] = rotation_about(np.array([1.0, 0, 0]), 90)
     judge: Any = SimpleNamespace(settings=ChangeSettings(), clashes=lambda motions: np.zeros(len(motions)))
     found = tell_turn(Fit(T, share, 1.0, color_apart), shape, shape, judge, hidden, UP)
     assert found.turn_known == known
@@ -83,8 +82,8 @@ def test_visits_that_saw_different_sides_do_not_tell_a_turn(
 def test_what_fell_over_is_also_tried_rolled_and_upright(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bottle on its side looks alike, however it was rolled."""
     lying = np.eye(4)
-    lying[:3, :3] = about(np.array([1.0, 0, 0]), 90)
-    rolled = lying[:3, :3] @ about(UP, 60)
+    lying[:3, :3] = rotation_about(np.array([1.0, 0, 0]), 90)
+    rolled = lying[:3, :3] @ rotation_about(UP, 60)
     tried: list[np.ndarray] = []
 
     def fit(T: np.ndarray) -> Fit:
@@ -140,7 +139,7 @@ def test_another_turn_between_the_probed_ones_that_fits_about_as_well(
 ) -> None:
     """Nothing fits but where the thing is, and turned by 97 degrees more, which is between the turns that are tried."""
     other = np.eye(4)
-    other[:3, :3] = about(UP, 97)
+    other[:3, :3] = rotation_about(UP, 97)
 
     def refine(sample: Shape, T: np.ndarray, fit_m: float, free: np.ndarray) -> np.ndarray:
         turns = free[3:].any()

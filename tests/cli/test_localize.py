@@ -12,6 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
+from worlds.cloud import cloud_tiles
+from worlds.plan import make_world
+from worlds.scanner import Scanner
+from worlds.walk import walk
 
 from ggslam.cli.main import app
 from ggslam.errors import GgslamError
@@ -20,10 +24,6 @@ from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
 from ggslam.runs.folder import RunFolder
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import load_points
-from ggslam.synthetic.world_cloud import cloud_tiles
-from ggslam.synthetic.world_plan import make_world
-from ggslam.synthetic.world_scanner import Scanner
-from ggslam.synthetic.world_walk import walk
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.octomap_files import write_octomap
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from typer.testing import CliRunner
+from worlds.scanner import Scanner
+from worlds.world import World
 
 from ggslam.cli.main import app
 from ggslam.errors import GgslamError
@@ -19,8 +21,6 @@ from ggslam.jobs.submaps.stores import INDOORS
 from ggslam.localization.scans import ScanSequence
 from ggslam.scene.poses import se3_exp
 from ggslam.submaps.grid import GridStore
-from ggslam.synthetic.world import World
-from ggslam.synthetic.world_scanner import Scanner
 
 
 def done(*arguments: object) -> str:

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds.plan import make_world
+from worlds.scanner import Scanner
+from worlds.walk import walk
 
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.geometry.clouds import overlap
@@ -15,9 +18,6 @@ from ggslam.geometry.icp import register
 from ggslam.geometry.surface_distances import summary_of, surface_distances
 from ggslam.geometry.thinning import thinned_points, thinned_rows
 from ggslam.scene.poses import inverse, se3_exp, transform_points, translation, turning_angle
-from ggslam.synthetic.world_plan import make_world
-from ggslam.synthetic.world_scanner import Scanner
-from ggslam.synthetic.world_walk import walk
 
 UTM = np.array([463000.0, 5427000.0, 300.0])
 

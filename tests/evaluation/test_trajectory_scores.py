@@ -4,14 +4,11 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ggslam.errors import FormatError
-from ggslam.evaluation.trajectory import align_points, associate, score_trajectory, score_trajectory_files
-from ggslam.formats.trajectory import write_tum
+from ggslam.evaluation.trajectory import align_points, score_trajectory
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 
 
@@ -123,21 +120,3 @@ def test_too_few_poses_give_no_scores() -> None:
     assert short is not None and json.loads(json.dumps(short.to_dict(), allow_nan=False))["rpe_trans_m"] is None
     with pytest.raises(ValueError, match="10 estimated and 9 true"):
         score_trajectory(truth, truth[:9])
-
-
-def test_association_is_one_to_one_and_nearest() -> None:
-    pairs = associate(np.array([0.0, 1.0, 1.01, 5.0]), np.array([1.009, 0.005, 0.995, 5.5]), 0.02)
-    assert pairs.tolist() == [[0, 1], [1, 2], [2, 0]]
-    assert associate(np.array([]), np.array([1.0])).shape == (0, 2)
-
-
-def test_files_are_associated_by_time(tmp_path: Path) -> None:
-    truth = walk()
-    times = 100 + np.arange(60) / 30
-    write_tum(tmp_path / "truth.txt", times, truth)
-    write_tum(tmp_path / "estimated.txt", times[::2] + 0.004, truth[::2])
-    scores = score_trajectory_files(tmp_path / "estimated.txt", tmp_path / "truth.txt")
-    assert scores.frames_compared == 30 and scores.ate_rmse_m < 1e-8
-    write_tum(tmp_path / "later.txt", times + 1000, truth)
-    with pytest.raises(FormatError, match=r"0 poses within 0.02 s.*1100.000 to 1101.967 s"):
-        score_trajectory_files(tmp_path / "later.txt", tmp_path / "truth.txt")

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds.pose_graph import read_pose_graph
 
 from ggslam.errors import FormatError
-from ggslam.formats.raw_points import read_pose_graph, read_raw_points
+from ggslam.formats.raw_points import read_raw_points
 
 
 def test_points_are_read_back(tmp_path: Path) -> None:

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds.cloud import cloud_tiles
+from worlds.scanner import Scanner
+from worlds.world import World
 
 from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
 from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
@@ -16,9 +19,6 @@ from ggslam.scene.poses import se3_exp, separation
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.synthetic.world import World
-from ggslam.synthetic.world_cloud import cloud_tiles
-from ggslam.synthetic.world_scanner import Scanner
 
 WALLS = [[50, 47.9, 1.5, 49.9, 0.1, 1.5, 0], [50, 52.1, 1.5, 49.9, 0.1, 1.5, 0]]
 NEAR = SubmapSettings(axes="xyz", voxel=0.0, partial_radius=10.0, lookahead=0.0)

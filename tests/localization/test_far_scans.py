@@ -8,6 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds.cloud import cloud_tiles
+from worlds.scanner import Scanner
+from worlds.world import World
 
 from ggslam.localization.coverage import CutCells, RecordedCells, coverage_of, reach_of
 from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
@@ -22,9 +25,6 @@ from ggslam.submaps.cell_keys import Grid
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.synthetic.world import World
-from ggslam.synthetic.world_cloud import cloud_tiles
-from ggslam.synthetic.world_scanner import Scanner
 
 SIZE, MIDDLE = 100.0, np.array([50.0, 50.0, 1.7])
 NEAR = SubmapSettings(axes="xy", voxel=0.0, partial_radius=10.0, lookahead=0.0)

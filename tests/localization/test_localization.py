@@ -9,6 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds.cloud import cloud_tiles
+from worlds.plan import make_world
+from worlds.scanner import Scanner
+from worlds.walk import walk
 
 from ggslam.jobs.submaps.stores import INDOORS
 from ggslam.localization.frames import FrameTracker
@@ -31,10 +35,6 @@ from ggslam.submaps.cell_points import POINTS
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.synthetic.world_cloud import cloud_tiles
-from ggslam.synthetic.world_plan import make_world
-from ggslam.synthetic.world_scanner import Scanner
-from ggslam.synthetic.world_walk import walk
 from ggslam.tracking.settings import TargetSettings, TrackerSettings
 
 GROUND = SubmapSettings(axes="xy", voxel=0.0, partial_radius=8.0, cache_megabytes=20)

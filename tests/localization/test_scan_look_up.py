@@ -8,9 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds.cloud import cloud_tiles
+from worlds.plan import make_world
+from worlds.pose_graph import read_pose_graph
+from worlds.scanner import Scanner
+from worlds.walk import walk
+from worlds.world import World, cast_rays
 
 from ggslam.errors import ConfigError
-from ggslam.formats.raw_points import read_pose_graph, read_raw_points
+from ggslam.formats.raw_points import read_raw_points
 from ggslam.localization.level import about_z, floor_height, level_turn
 from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
 from ggslam.localization.map_picture import picture_of_store
@@ -28,11 +34,6 @@ from ggslam.scene.poses import se3_exp, separation, transform_points
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
-from ggslam.synthetic.world import World, cast_rays
-from ggslam.synthetic.world_cloud import cloud_tiles
-from ggslam.synthetic.world_plan import make_world
-from ggslam.synthetic.world_scanner import Scanner
-from ggslam.synthetic.world_walk import walk
 from ggslam.tracking.scan_points import ScanSettings
 
 GROUND = SubmapSettings(axes="xy", voxel=0.05, partial_radius=10.0, radius=1.5, refresh=0.0)

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
+from losses_reference import reference_loss
 
 from ggslam.errors import ConfigError, RenderError
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.losses import LossTarget
-from ggslam.mapping.losses_reference import reference_loss
 from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext, available_instruction_sets
 

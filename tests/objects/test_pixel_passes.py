@@ -22,8 +22,8 @@ from ggslam.errors import CoreInputError, InputError
 from ggslam.interface.arrays import address
 from ggslam.interface.core import objects as core
 from ggslam.native.loader import load_library
-from ggslam.objects import pixel_passes
-from ggslam.objects.depth_surfaces import surface_of
+from ggslam.objects import depth_surface, pixel_passes
+from ggslam.objects.depth_surface import surface_of
 from ggslam.objects.geometric_segmenter import GeometricSegmenter
 from ggslam.objects.settings import GeometricSettings
 from ggslam.scene.camera import Camera
@@ -33,6 +33,7 @@ NAMES = (
     "link_surfaces", "connected_pieces", "grow_regions", "claim_planes", "share_near_planes", "find_bodies",
     "count_borders", "count_contacts", "normals_of_inverse", "count_alike", "strange_colors",
 )  # fmt: skip
+PASSES = {name: getattr(depth_surface if name == "normals_of_inverse" else pixel_passes, name) for name in NAMES}
 Image = tuple[np.ndarray, np.ndarray, Camera]
 MODULES = [importlib.import_module(f"ggslam.objects.{m.name}") for m in pkgutil.iter_modules(ggslam.objects.__path__)]
 
@@ -84,7 +85,7 @@ def assert_equal_to_reference(monkeypatch: pytest.MonkeyPatch, images: list[Imag
     def compare(name: str) -> Callable[..., Any]:
         def run(*arguments: Any, **named: Any) -> Any:
             called.add(name)
-            result = getattr(pixel_passes, name)(*arguments, **named)
+            result = PASSES[name](*arguments, **named)
             expected = getattr(reference, name)(*arguments, **named)
             for ours, theirs in zip(flatten(result), flatten(expected), strict=True):
                 assert ours.shape == theirs.shape, name

@@ -17,7 +17,6 @@ from typer.testing import CliRunner, Result
 from ggslam.cli.main import app
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
-from ggslam.jobs.export.map_files import object_file_name
 from ggslam.mapping.keyframe import make_keyframe
 from ggslam.mapping.mapper import MapperTimes
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
@@ -26,6 +25,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe
 from ggslam.runs.writing import OBJECT_FILES, write_objects
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.scene.object_names import object_file_name
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
 from ggslam.slam.config import Config
@@ -184,9 +184,9 @@ def test_export_of_single_objects(run: RunFolder, tmp_path: Path) -> None:
     first, second = table.objects[0], table.objects[3]
     message = done("export", run.path, "--objects", f"{first.name},{second.id}", "--out", out)
     assert "2 objects" in message
-    names = {object_file_name(first), object_file_name(second)}
+    names = {object_file_name(first.id, first.name), object_file_name(second.id, second.name)}
     assert {p.name for p in out.iterdir()} == {*names, "objects.json", "map_classifier.npz"}
-    part = read_gaussian_ply(out / object_file_name(second))
+    part = read_gaussian_ply(out / object_file_name(second.id, second.name))
     assert len(part) == second.gaussians and (part.object_id == second.id).all()
     whole = run.gaussians()
     rows = whole.object_id == second.id
@@ -255,7 +255,7 @@ def test_file_names_are_safe(run: RunFolder) -> None:
     names = {"../../etc/passwd": "etc_passwd", "tasse à café": "tasse_caf", None: "", "..": "", "a" * 300: "a" * 64}
     for name, safe in names.items():
         record = type(record)(**{**vars(record), "name": name})
-        assert object_file_name(record) == (f"{record.id}_{safe}.ply" if safe else f"{record.id}.ply")
+        assert object_file_name(record.id, record.name) == (f"{record.id}_{safe}.ply" if safe else f"{record.id}.ply")
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------

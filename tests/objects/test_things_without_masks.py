@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ggslam.objects.association import Associator, MapView
-from ggslam.objects.depth_surfaces import surface_of
+from ggslam.objects.depth_surface import surface_of
 from ggslam.objects.geometric_segmenter import GeometricSegmenter
 from ggslam.objects.pixel_passes import link_surfaces
 from ggslam.objects.settings import AssociationSettings, GeometricSettings

@@ -12,7 +12,7 @@ from drifting_camera import walk_with_drift
 
 from ggslam.loops.activity import ActivitySettings
 from ggslam.loops.settings import GraphSettings, VerificationSettings
-from ggslam.objects.uniting import LabelledVoxels
+from ggslam.objects.same_object import LabelledVoxels
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import yaml
+from worlds.scanner import Scanner
 
 from ggslam.coding.settings import AttributeSettings, CodecSettings
 from ggslam.errors import ConfigError
@@ -21,7 +22,6 @@ from ggslam.localization.frames import LookUpSettings
 from ggslam.objects.inpainting import InpaintSettings
 from ggslam.objects.membership import MembershipSettings
 from ggslam.slam.config import Config, config_to_dict, load_config
-from ggslam.synthetic.world_scanner import Scanner
 from ggslam.system.settings import (
     Known,
     changed_tuning,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from partial_map import PartialMap
 
 from ggslam.errors import ConfigError
 from ggslam.submaps.cell_cache import CellCache, byte_count
@@ -15,7 +16,6 @@ from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_points import CellArrays
 from ggslam.submaps.cells_around import MapStatus
 from ggslam.submaps.grid import GridStore
-from ggslam.submaps.partial_map import PartialMap
 from ggslam.submaps.recorder import load_points, store_cloud
 from ggslam.submaps.settings import SubmapSettings
 

@@ -15,9 +15,10 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sequences import open_sequence
-from ggslam.synthetic import RayCaster, Scene, camera_path, furnished_corridor, lighting
-from ggslam.synthetic import corridor as corridor_module
-from ggslam.synthetic.house_palette import HousePalette
+from ggslam.synthetic import RayCaster, Scene, camera_path, lighting
+from ggslam.synthetic.houses import corridor as corridor_module
+from ggslam.synthetic.houses.corridor import furnished_corridor
+from ggslam.synthetic.houses.palette import HousePalette
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 FRAMES = 200

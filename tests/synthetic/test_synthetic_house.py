@@ -24,10 +24,10 @@ from ggslam.synthetic import (
     SceneBuilder,
     camera_path,
     lighting,
-    ring_of_rooms,
     scenes,
     write_synthetic_sequence,
 )
+from ggslam.synthetic.houses.house import ring_of_rooms
 from ggslam.synthetic.materials import MaterialMaker
 from ggslam.synthetic.sensor import DISPARITY_STEP, disparity_distortion, noisy_depth
 

@@ -5,14 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from feature_odometry import FeatureOdometry, LidarFeatures, split_features
 from feature_scenes import CAMERA, lidar_scan, room_view
 
 from ggslam.scene.poses import inverse, se3_exp, se3_log, turning_angle
 from ggslam.tracking.edges_planes import alignment as feature_alignment
 from ggslam.tracking.edges_planes.alignment import FrameClock, _pose_matrix
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
-from ggslam.tracking.edges_planes.local_map import FeatureOdometry, LocalFeatureMap
-from ggslam.tracking.edges_planes.scans import DepthImageFeatures, LidarFeatures, split_features
+from ggslam.tracking.edges_planes.local_map import LocalFeatureMap
+from ggslam.tracking.edges_planes.scans import DepthImageFeatures
 from ggslam.tracking.edges_planes.settings import LIDAR, FeatureAlignSettings, FeatureTrackerSettings
 from ggslam.tracking.settings import DepthNoise
 

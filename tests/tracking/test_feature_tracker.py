@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from feature_odometry import FeatureOdometry, LidarFeatures, split_features
 from feature_scenes import CAMERA, room_view
+from worlds.pose_graph import read_pose_graph
 
 from ggslam.features.orb import FeatureView
 from ggslam.formats.point_cloud import read_point_cloud
-from ggslam.formats.raw_points import read_pose_graph, read_raw_points
+from ggslam.formats.raw_points import read_raw_points
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.sequences.factory import open_sequence
-from ggslam.tracking.edges_planes.local_map import FeatureOdometry
-from ggslam.tracking.edges_planes.scans import LidarFeatures, split_features
 from ggslam.tracking.edges_planes.settings import LIDAR, FeatureAlignSettings, FeatureTrackerSettings
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp import align

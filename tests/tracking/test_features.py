@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from feature_odometry import LidarFeatures
 from feature_scenes import CAMERA, lidar_scan, room_view
 
 from ggslam.scene.camera import Camera
 from ggslam.tracking.edges_planes.extraction import HALF, LineScanner, ScanLines
-from ggslam.tracking.edges_planes.scans import DepthImageFeatures, LidarFeatures
+from ggslam.tracking.edges_planes.scans import DepthImageFeatures
 from ggslam.tracking.edges_planes.settings import LIDAR, ExtractionSettings
 from ggslam.tracking.settings import DepthNoise
 

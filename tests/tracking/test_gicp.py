@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import ctypes
 
+import gicp_reference as reference
 import numpy as np
 import pytest
 
@@ -10,7 +11,6 @@ from ggslam.interface.arrays import address
 from ggslam.native.loader import NativeContext, available_instruction_sets, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, se3_exp, se3_log
-from ggslam.tracking import reference
 from ggslam.tracking.gicp import (
     PLANE_VARIANCE,
     AlignmentStatus,

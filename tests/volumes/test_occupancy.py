@@ -3,12 +3,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from agreement import agreement
 from occupancy_reference import ReferenceMap, center_of
 
 from ggslam.errors import ConfigError
 from ggslam.native.loader import NativeContext, available_instruction_sets
 from ggslam.scene.camera import Camera
-from ggslam.volumes.agreement import agreement
 from ggslam.volumes.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyMap
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
 from ggslam.volumes.octomap_files import full_octomap

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyoctomap_bridge
 import pytest
 
 from ggslam.errors import FormatError
-from ggslam.volumes import pyoctomap_bridge
 from ggslam.volumes.occupancy import FREE, OCCUPIED, OccupancyMap
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
 from ggslam.volumes.octomap_files import (

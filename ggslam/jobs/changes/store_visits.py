@@ -195,7 +195,7 @@ def _drop_ghosts(store: GridStore, found: _Comparison, foreign: set[str]) -> lis
     """Takes what is gone, and what moved and is in new cells, out of the cells of earlier visits; returns notes.
     `foreign`: visits with ids of their own, which name other things: their cells stay as they are."""
     old_cells, own_ids = {}, set[int]()
-    for key in _cells_with_gaussians(store):
+    for key in store.counts(GAUSSIANS):
         arrays, visit = cell_arrays(store, key)
         if visit == store.visit:
             own_ids |= set(np.unique(arrays["object_id"]).tolist())
@@ -222,10 +222,6 @@ def _ids(entry: VisitObjects, kind: Kind) -> set[int]:
     return {event.id for event in entry.events if event.kind == kind and event.id is not None}
 
 
-def _cells_with_gaussians(store: GridStore) -> list[CellKey]:
-    return [key for key in store.cells() if GAUSSIANS in store.cell(key).parts]
-
-
 # --- the objects -----------------------------------------------------------------------------------------------------
 
 
@@ -237,7 +233,7 @@ def _objects_after(
     others = foreign | ({visit} if found.entry.own_ids else set())
     count: dict[int, int] = {}
     cells: dict[int, list[CellKey]] = {}
-    for key in _cells_with_gaussians(store):
+    for key in store.counts(GAUSSIANS):
         arrays, filled_by = cell_arrays(store, key)
         if filled_by in others:
             continue

@@ -17,9 +17,8 @@ from __future__ import annotations
 import hashlib
 import time
 import zipfile
-from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,13 +37,13 @@ from ggslam.coding.splats import (
 from ggslam.errors import ConfigError, FormatError
 from ggslam.jobs.code.coded_cells import HEAD, OBJECTS, VISIT
 from ggslam.jobs.progress import Observer, SilentObserver
+from ggslam.jobs.stores.over_cells import over_cells
 from ggslam.jobs.submaps.cell_gaussians import (
     GAUSSIANS,
     gaussians_from_bytes,
     map_of_arrays,
 )
 from ggslam.jobs.tasks.engines import Engine
-from ggslam.jobs.tasks.outcomes import Failure
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.runs.records.cells import CELLS_FORMAT, CELLS_VERSION, CellMember, CellsRecord
 from ggslam.runs.records.mark import FileRecord
@@ -120,14 +119,20 @@ def encode_store(
     make_folder(out.parent)
     with GridStore.open(path) as store, hidden_beside(out) as folder:
         make_folder(folder)
-        coding = _Coding(store, folder, CodedStore(out), observer or SilentObserver())
-        if not coding.counts:
+        counts = {key: count for key, count in store.counts(GAUSSIANS).items() if count}
+        coding = _Coding(store, folder, CodedStore(out), counts)
+        if not counts:
             raise ConfigError(f"{path}: has no Gaussians to code; stores made of runs have some")
         fixed = chosen.voxel_size is not None
         if not fixed:
-            chosen = replace(chosen, voxel_size=_step(store, coding.counts))
-        coding.observer.begin("encode", len(coding.counts))
-        (engine or Engine()).do(encode_cell, coding.tasks(rate, chosen, fixed), coding.take)
+            chosen = replace(chosen, voxel_size=_step(store, counts))
+        task_of = partial(coding.task, rate=rate, settings=chosen, fixed=fixed)
+        failures = over_cells(
+            "encode", sorted(counts), task_of, encode_cell, coding.take, engine or Engine(),
+            observer or SilentObserver(),
+        )  # fmt: skip
+        coding.outcome.failures = {key: failure.line for key, failure in failures.items()}
+        coding.outcome.exit_code = min((2, *(failure.exit_code for failure in failures.values())))
         coding.join(rate)
     coding.outcome.seconds = time.perf_counter() - start
     return coding.outcome
@@ -140,44 +145,26 @@ class _Coding:
     store: GridStore
     folder: Path
     outcome: CodedStore
-    observer: Observer
-    counts: dict[CellKey, int] = field(default_factory=dict)
+    counts: dict[CellKey, int]
     seen_by: dict[CellKey, str | None] = field(default_factory=dict)
     members: dict[CellKey, CellMember] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        for key in self.store.cells():
-            part = self.store.cell(key).parts.get(GAUSSIANS)
-            if part is not None and part.count:
-                self.counts[key] = part.count
+    def task(self, key: CellKey, rate: str, settings: CodecSettings, fixed: bool) -> CodeTask:
+        """Of a cell. Raises FormatError if it is damaged."""
+        data = self.store.get(key, GAUSSIANS)
+        self.outcome.store_bytes += len(data)
+        what = f"{self.store.path}: cell {key}: no Gaussians written by ggslam"
+        self.seen_by[key] = gaussians_from_bytes(data, what)[1]
+        return CodeTask(key, what, data, rate, settings, fixed)
 
-    def tasks(self, rate: str, settings: CodecSettings, fixed: bool) -> Iterator[CodeTask]:
-        """The cells; damaged ones are noted."""
-        for key in sorted(self.counts):
-            try:
-                data = self.store.get(key, GAUSSIANS)
-            except FormatError as error:
-                self.outcome.failures[key] = str(error)
-                continue
-            self.outcome.store_bytes += len(data)
-            what = f"{self.store.path}: cell {key}: no Gaussians written by ggslam"
-            with suppress(FormatError):  # told by the task
-                self.seen_by[key] = gaussians_from_bytes(data, what)[1]
-            yield CodeTask(key, what, data, rate, settings, fixed)
-
-    def take(self, task: CodeTask, found: bytes | Failure) -> None:
-        """A cell was coded, or could not be."""
-        if isinstance(found, Failure):
-            self.outcome.failures[task.key] = found.line
-            self.outcome.exit_code = min(self.outcome.exit_code, found.exit_code)
-        else:
-            write_bytes(self.folder / _file_of(task.key), found)
-            cell = self.store.cell(task.key)
-            self.members[task.key] = CellMember(
-                gaussians=self.counts[task.key], bytes=len(found), sha256=hashlib.sha256(found).hexdigest(),
-                visit=cell.visit, seen_by=self.seen_by.get(task.key), recorded_at=cell.recorded_at,
-            )  # fmt: skip
-        self.observer.advance(len(self.members) + len(self.outcome.failures), len(self.counts))
+    def take(self, key: CellKey, found: bytes) -> None:
+        """A cell was coded."""
+        write_bytes(self.folder / _file_of(key), found)
+        cell = self.store.cell(key)
+        self.members[key] = CellMember(
+            gaussians=self.counts[key], bytes=len(found), sha256=hashlib.sha256(found).hexdigest(),
+            visit=cell.visit, seen_by=self.seen_by[key], recorded_at=cell.recorded_at,
+        )  # fmt: skip
 
     def join(self, rate: str) -> None:
         """Writes the file."""

@@ -10,13 +10,14 @@ from typing import Literal
 import numpy as np
 
 from ggslam.errors import ConfigError
-from ggslam.evaluation.trajectory import FEWEST_POSES, align_points, associate
+from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
 from ggslam.formats.trajectory import Trajectory
 from ggslam.geometry.clouds import Cloud, overlap
 from ggslam.geometry.icp import CloudRegistration
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.poses import fit_similarity, inverse
+from ggslam.sequences.association import TOLERANCE, pair_times
 
 Alignment = Literal["auto", "none", "truth", "icp", "trajectory"]
 _ARM_M = 1.0
@@ -56,7 +57,7 @@ def common_poses(a: Side, b: Side) -> np.ndarray:
     """Rows [M, 2] of poses at the same times."""
     if a.trajectory is None or b.trajectory is None:
         return np.empty((0, 2), np.int64)
-    return associate(a.trajectory.timestamps, b.trajectory.timestamps)
+    return pair_times(a.trajectory.timestamps, b.trajectory.timestamps, TOLERANCE)
 
 
 def by_trajectory(a: Side, b: Side, pairs: np.ndarray) -> np.ndarray:
@@ -132,7 +133,7 @@ def _true_world(side: Side) -> np.ndarray:
     if side.truth is None:
         raise ConfigError(f"`align` truth: {side.path} has no ground_truth.txt; `ggslam report` writes it where the "
                           "recording knows true poses")  # fmt: skip
-    pairs = associate(side.trajectory.timestamps, side.truth.timestamps, 1e-3)
+    pairs = pair_times(side.trajectory.timestamps, side.truth.timestamps, 1e-3)
     if len(pairs) < FEWEST_POSES:
         raise ConfigError(f"`align` truth: {side.path}: {len(pairs)} poses have a true one, {FEWEST_POSES} needed")
     found, true = side.trajectory.T_world_camera[pairs[:, 0]], side.truth.T_world_camera[pairs[:, 1]]

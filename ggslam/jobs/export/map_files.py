@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from itertools import chain
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.runs.opened_points import opened_points
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.scene.object_names import object_file_name
 from ggslam.system.atomic import make_folder, write_bytes
 
 OBJECT_EXTRAS = ("object_id", "identity")
@@ -57,7 +57,8 @@ def export_objects(
         return _export_object(opaque, path, chosen[0], None if plain else scene.classifier)
     make_folder(path)
     for record in chosen:
-        total += opaque.objects([record.id]).write(path / object_file_name(record), () if plain else OBJECT_EXTRAS)
+        own = path / object_file_name(record.id, record.name)
+        total += opaque.objects([record.id]).write(own, () if plain else OBJECT_EXTRAS)
     dataclasses.replace(scene.table, objects=chosen).save(path / "objects.json")
     if not plain:
         _write_classifier(path / "map.ply", scene.classifier)
@@ -74,10 +75,6 @@ def _export_object(
     return f"wrote {record.label()} to {path}: {count} Gaussians"
 
 
-def object_file_name(record: ObjectRecord) -> str:
-    """`7_mug.ply`, in characters that every file system takes."""
-    name = re.sub(r"[^A-Za-z0-9-]+", "_", record.name or "").strip("_")[:64]
-    return f"{record.id}_{name}.ply" if name else f"{record.id}.ply"
 
 
 def points_to_export(

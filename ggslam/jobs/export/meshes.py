@@ -13,7 +13,6 @@ from ggslam.errors import RunFolderError, SequenceError
 from ggslam.formats.mesh_files import WRITER, write_mesh
 from ggslam.formats.writer import SurfaceMesh, Writer
 from ggslam.geometry.scene_size import scene_scale
-from ggslam.jobs.export.map_files import object_file_name
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.volumes.frames import PosedFrame, frames_of_run
 from ggslam.jobs.volumes.outputs import Surface
@@ -21,6 +20,7 @@ from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.rendered_views import RenderedViews
 from ggslam.scene.frame import Frame
+from ggslam.scene.object_names import object_file_name
 from ggslam.system.atomic import make_folder
 from ggslam.volumes.floor_frame import BELOW_CAMERAS, FLOOR_FILE, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
@@ -192,7 +192,7 @@ def _write_each(out: Path, mesh: Mesh, labels: np.ndarray, table: ObjectTable, i
     for record in map(table.record, ids):
         part = mesh.part(labels == record.id)
         if len(part.triangles):
-            path = out / object_file_name(record)
+            path = out / object_file_name(record.id, record.name)
             write_mesh(path, part.vertices, part.triangles, part.normals, part.colors, part.labels)
             written.append(part)
     without = len(ids) - len(written)

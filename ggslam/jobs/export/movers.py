@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,8 @@ import numpy as np
 from ggslam.errors import RunFolderError
 from ggslam.formats.ply import write_ply
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.records.movers import MoverRecord, MoversRecord
+from ggslam.runs.records.movers import MoversRecord
+from ggslam.scene.object_names import object_file_name
 from ggslam.system.atomic import make_folder
 
 _FIELDS = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
@@ -40,13 +40,7 @@ def export_movers(folder: RunFolder, path: Path) -> str:
         for k, name in enumerate(("red", "green", "blue")):
             rows[name] = colors[:, k]
         comment = f"mover {mover.id}, {mover.kind}, in its own frame"
-        write_ply(path / mover_file_name(mover), {"vertex": rows}, [comment], sized_names=True)
+        write_ply(path / object_file_name(mover.id, mover.name), {"vertex": rows}, [comment], sized_names=True)
     MoversRecord(movers=movers).write(path)
-    names = ", ".join(mover_file_name(mover) for mover in movers)
+    names = ", ".join(object_file_name(mover.id, mover.name) for mover in movers)
     return f"wrote {path}: {names} and {MoversRecord.FILE}"
-
-
-def mover_file_name(mover: MoverRecord) -> str:
-    """`11_basket.ply`, in characters that every file system takes."""
-    name = re.sub(r"[^A-Za-z0-9-]+", "_", mover.name or "").strip("_")[:64]
-    return f"{mover.id}_{name}.ply" if name else f"{mover.id}.ply"

@@ -11,64 +11,14 @@ import numpy as np
 from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.merge.unseen import UnseenGaussians
 from ggslam.jobs.progress import Observer
+from ggslam.mapping.finished import adopt_finished, train_by_turns
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
-from ggslam.mapping.mapper import Mapper
 from ggslam.merging.coverage import PlacedRun
 from ggslam.merging.objects import UnitedObjects
 from ggslam.native.loader import NativeContext
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
-from ggslam.slam.config import Config
 from ggslam.slam.parts import make_mapper
-
-_GROWN_UP = 100
-"""Steps that a Gaussian of a finished map counts as having seen: its first ones are not longer than others."""
-
-
-@dataclass
-class SeamTraining:
-    """A merged map about to be trained.
-
-    Attributes:
-        gaussians: the map; changed.
-        keyframes: of all runs, those without images among them; their poses follow.
-        seam: numbers of the keyframes to train on, which have images.
-        objects: of the map; its classifier follows. None: none are learned any further.
-        config: settings.
-        sigma: standard deviation of depth at the scene's median depth, metres.
-    """
-
-    gaussians: GaussianMap
-    keyframes: list[Keyframe]
-    seam: list[int]
-    objects: UnitedObjects | None
-    config: Config
-    sigma: float
-
-    def run(self, steps: int, context: NativeContext, observer: Observer) -> None:
-        """Trains with falling rates, by turns on all keyframes at the seams. What these do not see stays as it is."""
-        mapper = make_mapper(replace(self.config, device="cpu"), self.objects is not None, context, None)
-        self.gaussians.updates[:] = _GROWN_UP
-        self.gaussians.feature_updates[:] = _GROWN_UP
-        mapper.adopt(self.gaussians, self.keyframes)
-        mapper.depth_sigma = self.sigma
-        if self.objects is not None and mapper.identity is not None:
-            mapper.identity.resume(self.objects.classifier)
-        self._train(mapper, steps, observer)
-        if self.objects is not None and mapper.identity is not None:
-            mapper.finish_identity()
-            self.objects.classifier = mapper.identity.classifier
-
-    def _train(self, mapper: Mapper, steps: int, observer: Observer) -> None:
-        random, turn = np.random.default_rng(self.config.seed), list[int]()
-        unseen = UnseenGaussians(self.gaussians, [self.keyframes[k] for k in self.seam], self.sigma)
-        observer.begin("train at the seams", steps)
-        for step in range(steps):
-            turn = turn or random.permutation(self.seam).tolist()
-            factor = self.config.mapping.refine_decay ** (step / max(1, steps - 1))
-            mapper.iterate(self.keyframes[turn.pop()], factor)
-            unseen.restore()
-            observer.advance(step + 1, steps)
 
 
 @dataclass(frozen=True)
@@ -112,8 +62,17 @@ def train_seams(
     depth = float(np.median(np.concatenate([p[:, 2] for source in sources for p in source.known.points])))
     sigma = max(source.known.noise.sigma(depth) for source in sources)
     config = replace(sources[0].folder.config(), sh_degree=gaussians.sh_degree)
-    learned = objects if with_masks else None
-    SeamTraining(gaussians, keyframes, seam, learned, config, sigma).run(steps, context, observer)
+    mapper = make_mapper(replace(config, device="cpu"), with_masks, context, None)
+    adopt_finished(mapper, gaussians, keyframes)
+    mapper.depth_sigma = sigma
+    if mapper.identity is not None:
+        mapper.identity.resume(objects.classifier)
+    unseen = UnseenGaussians(gaussians, [keyframes[k] for k in seam], sigma)
+    observer.begin("train at the seams", steps)
+    train_by_turns(mapper, seam, steps, config.seed, lambda _: unseen.restore(), observer.advance)
+    if mapper.identity is not None:
+        mapper.finish_identity()
+        objects.classifier = mapper.identity.classifier
     return TrainedSeams(keyframes, len(seam), steps, notes)
 
 

@@ -1,28 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains a finished map, or a part of it while the rest stays as it is."""
+"""Trains the Gaussians of one cell while those around it stay as they are."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ggslam.mapping.cpu.losses import CpuLossResult
-from ggslam.mapping.cpu.mapper import CpuMapper
+from ggslam.mapping.finished import StillMapper
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.pixel_grid import WHOLE, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
-from ggslam.rendering.exposure import identity_exposure
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.cell_keys import CellKey, Grid
 
-_GROWN_UP = 100
-"""Steps that a Gaussian of a finished map counts as having seen: its first ones are not longer than others."""
 _TRAINED = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
 
 
@@ -86,63 +83,6 @@ class CellBox:
         low = np.where(low < np.array(self.low), np.nextafter(low, np.float32(np.inf)), low)
         high = np.where(high >= np.array(self.high), np.nextafter(high, np.float32(-np.inf)), high)
         points.clamp_(torch.from_numpy(low), torch.from_numpy(high))
-
-
-class StillMapper(CpuMapper):
-    """Trains a finished map: poses and exposures stay as they are, nothing is inserted.
-
-    Args:
-        gaussians: the map.
-        settings: of the run that it is from.
-        context: threads.
-        keyframes: numbered from 0.
-        valid: of each keyframe the pixels that count, bool [H, W]; None: all.
-    """
-
-    def __init__(
-        self, gaussians: GaussianMap, settings: MapperSettings, context: NativeContext, keyframes: list[Keyframe],
-        valid: Sequence[np.ndarray | None],
-    ) -> None:  # fmt: skip
-        super().__init__(gaussians, settings, context)
-        gaussians.updates[:] = _GROWN_UP
-        self.adopt(gaussians, keyframes)
-        self._counted = valid
-
-    def train(
-        self, steps: int, seed: Sequence[int], progress: Callable[[int, int], None] = lambda done, total: None
-    ) -> tuple[float, float]:
-        """Steps by turns on all keyframes, with falling rates.
-
-        Args:
-            steps: how many.
-            seed: of their order.
-            progress: told how many of how many are done.
-
-        Returns:
-            PSNR of what counts, before the first step on each keyframe and before the last one, mean in dB over those
-            that were trained on more than once; NaN if none was.
-        """
-        random, turn, found = np.random.default_rng(seed), list[int](), dict[int, list[float]]()
-        for step in range(steps):
-            turn = turn or random.permutation(len(self.keyframes)).tolist()
-            keyframe = self.keyframes[turn.pop()]
-            self.iterate(keyframe, self.settings.refine_decay ** (step / max(1, steps - 1)))
-            found.setdefault(keyframe.index, []).append(self.last_psnr)
-            progress(step + 1, steps)
-        ends = [(values[0], values[-1]) for values in found.values() if len(values) > 1]
-        before, after = np.mean(ends, axis=0) if ends else (np.nan, np.nan)
-        return float(before), float(after)
-
-    def valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
-        return self._counted[keyframe.index]
-
-    def _is_exposed(self, keyframe: Keyframe) -> bool:
-        return bool((keyframe.exposure != identity_exposure()).any())
-
-    def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
-        exposure = keyframe.exposure
-        super()._finish_step(keyframe, twist, loss, 0.0)
-        keyframe.exposure = exposure
 
 
 class CellMapper(StillMapper):

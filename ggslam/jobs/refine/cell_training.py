@@ -7,19 +7,16 @@ What comes out depends on what goes in and nothing else, so cells can be trained
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 
-from ggslam.errors import GgslamError
 from ggslam.jobs.refine.cell_mapper import CellBox, CellMapper, CellView
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.cell_gaussians import arrays_of_map, gaussians_from_bytes, gaussians_to_bytes, map_of_arrays
-from ggslam.jobs.submaps.visit_records import exposure_of
+from ggslam.jobs.submaps.visit_records import exposure_of, recording_of
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.native.loader import NativeContext
-from ggslam.runs.recordings import open_recorded
 from ggslam.runs.records.visit import VisitRecord
 from ggslam.sequences import Sequence
 from ggslam.submaps.cell_keys import CellKey
@@ -83,7 +80,7 @@ def train_cell(task: CellTask) -> TrainedCell:
         halo = map_of_arrays(gaussians_from_bytes(task.halo, task.name)[0], with_moments=True)
         gaussians.append(halo.take(torch.arange(len(halo))))
     record = VisitRecord.parse(task.record, task.name)
-    keyframes, views = _views(task, record, _recording(task.record))
+    keyframes, views = _views(task, record, recording_of(task.record))
     if not keyframes or not task.settings.steps:
         return TrainedCell(task.key, task.own, own, 0)
     settings = record.settings().mapping
@@ -112,15 +109,3 @@ def _views(task: CellTask, record: VisitRecord, sequence: Sequence) -> tuple[lis
         keyframes.append(keyframe)
         views.append(view)
     return keyframes, views
-
-
-@lru_cache(maxsize=4)
-def _recording(record: str) -> Sequence:
-    """The recording of a visit; a worker opens it once."""
-    known = VisitRecord.parse(record, "visit")
-    try:
-        return open_recorded(known.sequence, known.run)
-    except GgslamError:
-        raise
-    except OSError as error:
-        raise GgslamError(f"{known.run}: its recording cannot be read: {error}") from None

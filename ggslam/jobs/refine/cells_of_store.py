@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -17,7 +16,7 @@ from ggslam.jobs.refine.cell_mapper import CellBox
 from ggslam.jobs.refine.cell_training import CellTask
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.cell_gaussians import ARRAYS, GAUSSIANS, cell_arrays, gaussians_to_bytes
-from ggslam.jobs.submaps.visit_records import read_record
+from ggslam.jobs.submaps.visit_records import read_record, recording_text
 from ggslam.runs.records.visit import VisitRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
@@ -89,11 +88,8 @@ class StoreCells:
 
     def _neighbours(self, key: CellKey) -> list[CellKey]:
         """Cells that reach into the halo of one, sorted."""
-        steps = math.ceil(self.settings.halo / self.store.grid.spacing)
-        reach = steps * self.store.grid.spacing * math.sqrt(3) * 1.01
-        there = self.store.part_versions(GAUSSIANS, self.store.centre_of(key), reach)
-        near = (other for other in there if other in self.versions and other != key)
-        return sorted(other for other in near if max(abs(a - b) for a, b in zip(key, other, strict=True)) <= steps)
+        near = self.store.around(key, GAUSSIANS, math.ceil(self.settings.halo / self.store.grid.spacing))
+        return [other for other in near if other in self.versions and other != key]
 
     def _arrays(self, key: CellKey) -> Mapping[str, np.ndarray] | None:
         if key in self._known:
@@ -116,7 +112,7 @@ class _Views:
     """The keyframes of a visit, and what they may see."""
 
     def __init__(self, record: VisitRecord) -> None:
-        self.text = json.dumps(record.model_copy(update={"poses": {}}).values())
+        self.text = recording_text(record)
         self._count = len(record.keyframes)
         reach = record.settings().mapping.insertion.max_depth_m
         cameras: dict[Camera, list[int]] = {}

@@ -13,9 +13,9 @@ from ggslam.errors import ConfigError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.geometry.scene_size import scene_scale
 from ggslam.jobs.progress import Observer, SilentObserver
-from ggslam.jobs.refine.cell_mapper import StillMapper
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.visit_records import exposure_of
+from ggslam.mapping.finished import StillMapper
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
 from ggslam.mapping.scale import scale_settings
 from ggslam.native.loader import NativeContext

@@ -10,25 +10,23 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ggslam import __version__
-from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
+from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.jobs.progress import Observer, SilentObserver
-from ggslam.jobs.refine.cell_training import CellTask, TrainedCell, train_cell
+from ggslam.jobs.refine.cell_training import TrainedCell, train_cell
 from ggslam.jobs.refine.cells_done import CellsDone, is_cut_off
 from ggslam.jobs.refine.cells_of_store import StoreCells
 from ggslam.jobs.refine.settings import RefineSettings
+from ggslam.jobs.stores.over_cells import over_cells, raise_own_fault
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
 from ggslam.jobs.submaps.stores import is_store
-from ggslam.jobs.submaps.visit_records import read_record
+from ggslam.jobs.submaps.visit_records import records_of_store
 from ggslam.jobs.tasks.engines import Engine
-from ggslam.jobs.tasks.outcomes import Failure
-from ggslam.runs.recordings import open_recorded
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_copy import copy_store
@@ -111,20 +109,10 @@ def _target(path: Path, out: Path | None) -> Path:
 
 def _check_recordings(store: GridStore) -> None:
     """Raises GgslamError if the recordings that the cells are from are not known or not there."""
-    visits = {store.cell(key).visit for key in store.cells() if GAUSSIANS in store.cell(key).parts}
-    if not visits:
+    counts = store.counts(GAUSSIANS)
+    if not counts:
         raise ConfigError(f"{store.path}: has no Gaussians to refine; stores made of runs have some")
-    known = {visit: read_record(store, visit) for visit in sorted(v for v in visits if v is not None)}
-    if not any(known.values()):
-        raise ConfigError(
-            f"{store.path}: nothing is known of the recordings that it is from: make it again from its runs"
-        )
-    for visit, record in known.items():
-        if record is not None:
-            try:
-                open_recorded(record.sequence, record.run)
-            except GgslamError as error:
-                raise ConfigError(f"{store.path}: the recording of visit {visit!r} is needed: {error}") from None
+    records_of_store(store, {store.cell(key).visit for key in counts})
 
 
 @dataclass
@@ -137,9 +125,6 @@ class _Refinement:
     engine: Engine
     observer: Observer
     trained: list[TrainedCell] = field(default_factory=list)
-    failures: dict[CellKey, Failure] = field(default_factory=dict)
-    resumed: int = 0
-    total: int = 0
 
     def run(self) -> StoreRefinement:
         """Trains what is left to train and puts all of it into the store."""
@@ -150,49 +135,32 @@ class _Refinement:
             return outcome
         _check_recordings(self.store)
         cells = StoreCells(self.store, self.settings)
-        outcome.cells = self.total = len(cells.versions)
+        outcome.cells = len(cells.versions)
         if not self.done.begin(_name_of_work(cells)):
             outcome.notes.append("other work on this store that was cut off was thrown away")
-        outcome.resumed = self.resumed = sum(key in self.done for key in cells.versions)
-        self.observer.begin("refine", outcome.cells)
-        self.engine.do(train_cell, self._tasks(cells), self._take)
-        ours = [failure for failure in self.failures.values() if failure.exit_code == 1]
-        if ours:
-            error = GgslamError(f"{self.store.path}: {len(ours)} cells could not be trained: {ours[0].line}")
-            error.exit_code = 1
-            raise error
+        outcome.resumed = sum(key in self.done for key in cells.versions)
+        todo = [key for key in sorted(cells.versions) if key not in self.done]
+        failures = over_cells(
+            "refine", todo, cells.task, train_cell, self._take, self.engine, self.observer, outcome.resumed
+        )
+        raise_own_fault(failures, f"{self.store.path}: {{}} could not be trained")
+        outcome.failures = {key: failure.line for key, failure in failures.items()}
         self._tell(outcome, cells)
         self.done.finish()
-        if len(self.failures) == self.total:
+        if len(failures) == outcome.cells:
             first = next(iter(outcome.failures.values()))
-            raise FormatError(f"{self.store.path}: no part of its {self.total} cells can be used: {first}")
+            raise FormatError(f"{self.store.path}: no part of its {outcome.cells} cells can be used: {first}")
         outcome.seconds = time.perf_counter() - start
         return outcome
 
-    def _tasks(self, cells: StoreCells) -> Iterator[CellTask]:
-        for key in sorted(cells.versions):
-            if key in self.done:
-                continue
-            try:
-                task = cells.task(key)
-            except FormatError as error:
-                self.failures[key] = Failure(str(error), error.exit_code)
-                continue
-            yield task
-
-    def _take(self, task: CellTask, found: TrainedCell | Failure) -> None:
-        if isinstance(found, Failure):
-            self.failures[task.key] = found
-        else:
-            self.done.put(found.key, found.data, found.count)
-            self.trained.append(TrainedCell(found.key, b"", found.count, found.views, found.before, found.after))
-        self.observer.advance(self.resumed + len(self.trained) + len(self.failures), self.total)
+    def _take(self, key: CellKey, found: TrainedCell) -> None:
+        self.done.put(key, found.data, found.count)
+        self.trained.append(replace(found, data=b""))
 
     def _tell(self, outcome: StoreRefinement, cells: StoreCells) -> None:
         seen = [cell for cell in self.trained if cell.views]
         outcome.trained, outcome.unseen = len(seen), len(self.trained) - len(seen)
         outcome.steps = self.settings.steps * len(seen)
-        outcome.failures = {key: failure.line for key, failure in sorted(self.failures.items())}
         outcome.notes += [f"not among the Gaussians around its neighbours: {line}" for line in cells.damaged.values()]
         judged = [cell for cell in seen if np.isfinite(cell.before)]
         if judged:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import GgslamError, RunFolderError
-from ggslam.evaluation.trajectory import FEWEST_POSES, align_points, associate
+from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
 from ggslam.formats.trajectory import read_tum, write_tum
 from ggslam.jobs.report.mover_pictures import mover_views
 from ggslam.jobs.report.run_data import FrameView, LevelAxes, Path3D, RunData
@@ -23,6 +23,7 @@ from ggslam.runs.records.sequence import RigRecord, SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.writing import REPORT_FILE, TRUTH_FILE
 from ggslam.sequences import Sequence
+from ggslam.sequences.association import pair_times
 from ggslam.slam.config import Config, config_to_dict
 from ggslam.slam.step_log import STEPS_FILE, read_table
 from ggslam.system.foreign import read_foreign_text
@@ -160,7 +161,7 @@ def _truth(
     path = folder.path / TRUTH_FILE
     if path.is_file():
         truth = read_tum(path)
-        pairs = associate(seconds, truth.timestamps, 1e-6)
+        pairs = pair_times(seconds, truth.timestamps, 1e-6)
         found[pairs[:, 0]] = truth.T_world_camera[pairs[:, 1], :3, 3]
         return found, ""
     if sequence is None:

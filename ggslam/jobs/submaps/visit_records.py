@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Collection
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recorded
 from ggslam.runs.records.keyframes import KeyframeRecord
 from ggslam.runs.records.visit import VisitRecord
+from ggslam.sequences import Sequence
 from ggslam.slam.config import config_to_dict
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.visit_files import read_visit, visit_file, write_visit
@@ -63,8 +66,12 @@ def read_record(store: GridStore, visit: str) -> VisitRecord | None:
     return None if data is None else VisitRecord.parse(data, str(visit_file(store.path, visit)))
 
 
-def records_of_store(store: GridStore) -> list[VisitRecord]:
+def records_of_store(store: GridStore, visits: Collection[str | None] | None = None) -> list[VisitRecord]:
     """What is known of the runs that filled a store, in the order of their visits.
+
+    Args:
+        store: open.
+        visits: those to look at; None: all.
 
     Raises:
         ConfigError: nothing, or the recording of one is not there any more; says which.
@@ -72,7 +79,7 @@ def records_of_store(store: GridStore) -> list[VisitRecord]:
     """
     records = []
     for visit in store.visits():
-        record = read_record(store, visit)
+        record = read_record(store, visit) if visits is None or visit in visits else None
         if record is None:
             continue
         try:
@@ -85,3 +92,22 @@ def records_of_store(store: GridStore) -> list[VisitRecord]:
             f"{store.path}: nothing is known of the recordings that it is from: make it again from its runs"
         )
     return records
+
+
+def recording_text(record: VisitRecord) -> str:
+    """What a worker needs to open the recording of a visit: JSON of the record, without the poses of all frames."""
+    return json.dumps(record.model_copy(update={"poses": {}}).values())
+
+
+@lru_cache(maxsize=8)
+def recording_of(text: str) -> Sequence:
+    """The recording that `recording_text` tells of; a process opens it once.
+
+    Raises:
+        GgslamError: it cannot be read.
+    """
+    known = VisitRecord.parse(text, "visit")
+    try:
+        return open_recorded(known.sequence, known.run)
+    except OSError as error:
+        raise GgslamError(f"{known.run}: its recording cannot be read: {error}") from None

@@ -17,7 +17,7 @@ from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.jobs.changes.shown import ChangesShown, changes_of, read_changes, sentence_of
 from ggslam.jobs.edit.edited_file import edited_name
 from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
-from ggslam.jobs.export.map_files import OBJECT_EXTRAS, object_file_name
+from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.jobs.view.pictures import ViewPictures
 from ggslam.objects.editing import MAX_NAME
 from ggslam.objects.segmented_map import SegmentedMap
@@ -31,6 +31,7 @@ from ggslam.runs.records.movers import MoverFrameRecord, mover_colors
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.object_names import object_file_name
 from ggslam.sequences import Sequence
 from ggslam.system.foreign import is_plain_name, read_foreign
 from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover
@@ -297,7 +298,7 @@ class ViewedRun:
             part = GaussianMap(g.sh_degree, g.feature_channels, with_moments=False)
             part.append({k: v for k, v in g.take(torch.nonzero(g.object_id == object_id)[:, 0]).items()
                          if "." not in k})  # fmt: skip
-            path = Path(folder) / object_file_name(record)
+            path = Path(folder) / object_file_name(record.id, record.name)
             write_gaussian_ply(path, part, OBJECT_EXTRAS)
             return path.name, read_foreign(path)
 

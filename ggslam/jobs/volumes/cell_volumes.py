@@ -10,18 +10,15 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from ggslam.geometry.frustums import Frustums, depth_reach
+from ggslam.jobs.submaps.visit_records import recording_of
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.native.loader import NativeContext
-from ggslam.runs.recordings import open_recorded
-from ggslam.runs.records.visit import VisitRecord
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes
 from ggslam.scene.poses import inverse
-from ggslam.sequences import Sequence
 from ggslam.submaps.cell_keys import CellKey, Grid
 from ggslam.volumes.esdf import DistanceField, FieldSettings
 from ggslam.volumes.mesh import Mesh, extract_mesh
@@ -131,7 +128,7 @@ def look_at_frames(task: LookTask) -> np.ndarray:
     and the truncation. Raises GgslamError if a recording cannot be read."""
     seen, s = np.zeros((len(task.views), len(task.low)), bool), task.settings
     for row, (visit, number, T_world_camera) in enumerate(task.views):
-        frame = _recording(task.records[visit]).frame(number, masks=False)
+        frame = recording_of(task.records[visit]).frame(number, masks=False)
         depth = frame.depth_or_infinity()
         depth = np.where(depth >= s.min_depth, np.minimum(depth, s.max_depth), 0)
         if depth.any():
@@ -145,7 +142,7 @@ def fuse_cell(task: FuseTask) -> CellPart:
     """The TSDF of a cell. Raises GgslamError if a recording cannot be read."""
     tsdf = TsdfMap(task.settings, NativeContext(own_threads()))
     for visit, number, T_world_camera in task.views:
-        frame = _recording(task.records[visit]).frame(number, masks=False)
+        frame = recording_of(task.records[visit]).frame(number, masks=False)
         depth, within = frame.depth_or_infinity(), task.blocks.around(0)
         tsdf.integrate(depth, frame.camera, T_world_camera, frame.color, within=within)
     return CellPart(task.key, tsdf_to_bytes(tsdf), len(tsdf))
@@ -186,10 +183,3 @@ def _tsdf(task: BlocksTask) -> TsdfMap:
     what = f"cell {task.key}: no TSDF"
     arrays = arrays_of(io.BytesIO(task.tsdf), what, lambda held: {name: held[name] for name in held.files})
     return tsdf_of_arrays(arrays, what, NativeContext(own_threads()))
-
-
-@lru_cache(maxsize=8)
-def _recording(record: str) -> Sequence:
-    """The recording of a visit; a worker opens it once."""
-    known = VisitRecord.parse(record, "visit")
-    return open_recorded(known.sequence, known.run)

@@ -19,19 +19,19 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ggslam import __version__
-from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.mesh_files import write_mesh
 from ggslam.jobs.progress import Observer, SilentObserver
-from ggslam.jobs.submaps.visit_records import records_of_store
+from ggslam.jobs.stores.over_cells import Task, error_of, over_cells, raise_own_fault
+from ggslam.jobs.submaps.visit_records import recording_text, records_of_store
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.jobs.tasks.outcomes import Failure
 from ggslam.jobs.volumes.cell_volumes import (
@@ -148,7 +148,7 @@ class _Work:
 
     def __init__(self, store: GridStore, records: list[VisitRecord], settings: VolumeSettings) -> None:
         self.store, self.settings = store, settings
-        self.texts = tuple(json.dumps(r.model_copy(update={"poses": {}}).values()) for r in records)
+        self.texts = tuple(map(recording_text, records))
         self.poses = [(visit, frame, T) for visit, r in enumerate(records) for frame, T in sorted(r.poses.items())]
         self._low, self._high = self._extent()
         self.seen = np.zeros((len(self.poses), 0), bool)
@@ -196,14 +196,11 @@ class _Work:
             for first in range(0, len(self.poses), _LOOKS)
         ]
 
-    def tasks(self, keys: list[CellKey]) -> list[FuseTask]:
-        """What fusing the cells needs that a frame tells about."""
-        found = []
-        for column, key in enumerate(keys):
-            views = tuple(self.poses[row] for row in np.flatnonzero(self.seen[:, column]))
-            if views:
-                found.append(FuseTask(key, self.blocks(key), self.texts, views, self.settings.tsdf))
-        return found
+    def views(self, keys: list[CellKey]) -> dict[CellKey, tuple[tuple[int, int, np.ndarray], ...]]:
+        """The frames that tell about each of the cells, as `FuseTask` has them; cells that none tells about are left
+        out."""
+        rows = {key: np.flatnonzero(self.seen[:, column]) for column, key in enumerate(keys)}
+        return {key: tuple(self.poses[row] for row in own) for key, own in rows.items() if len(own)}
 
 
 @dataclass
@@ -214,31 +211,27 @@ class _Volumes:
     results: GridStore
     engine: Engine
     observer: Observer
-    failures: dict[CellKey, Failure] = field(default_factory=dict)
-    done: int = 0
 
     def run(self, esdf: bool) -> StoreVolumes:
         """All stages."""
         outcome = StoreVolumes(self.results.path)
         self._look_and_fuse(outcome)
-        counts = {key: self.results.cell(key).parts[TSDF].count for key in self.results.cells()}
+        counts = self.results.counts(TSDF)
         filled = sorted(key for key, count in counts.items() if count)
         if not filled:
             raise ConfigError(f"{self.work.store.path}: no depth of its runs' frames could be fused")
         outcome.cells, outcome.blocks, there = len(filled), sum(counts.values()), set(filled)
-        todo = [key for key in filled if not self._has(key, MESH)]
-        self._stage("mesh", mesh_cell, self._blocks_tasks(todo, there, 1, None), len(todo), MESH, outcome)
+        self._stage("mesh", mesh_cell, filled, self._blocks_tasks(there, 1, None), MESH, outcome)
         if esdf:
             field_settings = self.work.settings.esdf
             reach = math.ceil(field_settings.max_distance / self.work.blocks(filled[0]).edge) + 1
-            todo = [key for key in filled if not self._has(key, ESDF)]
-            tasks_of_fields = self._blocks_tasks(todo, there, reach, field_settings)
-            self._stage("distances", field_cell, tasks_of_fields, len(todo), ESDF, outcome)
+            task_of = self._blocks_tasks(there, reach, field_settings)
+            self._stage("distances", field_cell, filled, task_of, ESDF, outcome)
         start = time.perf_counter()
         mesh = self.whole_mesh(filled)
         write_mesh(self.results.path / WHOLE_MESH, mesh.vertices, mesh.triangles, mesh.normals, mesh.colors)
         outcome.triangles, outcome.seconds["join"] = len(mesh.triangles), time.perf_counter() - start
-        outcome.failures = {key: failure.line for key, failure in sorted(self.failures.items())}
+        outcome.failures = dict(sorted(outcome.failures.items()))
         return outcome
 
     def _look_and_fuse(self, outcome: StoreVolumes) -> None:
@@ -252,14 +245,18 @@ class _Volumes:
 
         def take(task: LookTask, found: np.ndarray | Failure) -> None:
             if isinstance(found, Failure):
-                raise _error(found, found.line)
+                raise error_of(found, found.line)
             work.seen[task.key : task.key + len(found)] = found
             self.observer.advance(task.key // _LOOKS + 1, len(looks))
 
         self.engine.do(look_at_frames, looks, take)
         outcome.seconds["look"] = time.perf_counter() - start
-        tasks = [task for task in work.tasks(keys) if not self._has(task.key, TSDF)]
-        self._stage("fuse", fuse_cell, tasks, len(tasks), TSDF, outcome)
+        views = work.views(keys)
+
+        def task_of(key: CellKey) -> FuseTask:
+            return FuseTask(key, work.blocks(key), work.texts, views[key], work.settings.tsdf)
+
+        self._stage("fuse", fuse_cell, list(views), task_of, TSDF, outcome)
         self.results.begin_visit(_FUSED)
 
     def whole_mesh(self, keys: list[CellKey]) -> Mesh:
@@ -272,25 +269,19 @@ class _Volumes:
         return key in self.results and part in self.results.cell(key).parts
 
     def _stage(
-        self, name: str, work: Callable[[Any], CellPart], tasks: Any, total: int, part: str, outcome: StoreVolumes
-    ) -> None:
-        start, done = time.perf_counter(), 0
-        self.observer.begin(name, total)
+        self, name: str, work: Callable[[Task], CellPart], keys: list[CellKey], task_of: Callable[[CellKey], Task],
+        part: str, outcome: StoreVolumes,
+    ) -> None:  # fmt: skip
+        """Makes a part of those of the cells that do not have it."""
 
-        def take(task: FuseTask | BlocksTask, found: CellPart | Failure) -> None:
-            nonlocal done
-            if isinstance(found, Failure):
-                self.failures[task.key] = found
-            else:
-                self.results.put(found.key, {part: found.data}, counts={part: found.count})
-            done += 1
-            self.observer.advance(done, total)
+        def take(key: CellKey, found: CellPart) -> None:
+            self.results.put(key, {part: found.data}, counts={part: found.count})
 
-        self.engine.do(work, tasks, take)
+        start, todo = time.perf_counter(), [key for key in keys if not self._has(key, part)]
+        failures = over_cells(name, todo, task_of, work, take, self.engine, self.observer)
         outcome.seconds[name] = time.perf_counter() - start
-        ours = [failure for failure in self.failures.values() if failure.exit_code == 1]
-        if ours:
-            raise _error(ours[0], f"{self.results.path}: {len(ours)} cells could not be made: {ours[0].line}")
+        outcome.failures |= {key: failure.line for key, failure in failures.items()}
+        raise_own_fault(failures, f"{self.results.path}: {{}} could not be made")
 
     def _tsdf(self, key: CellKey) -> dict[str, np.ndarray]:
         """The arrays of a cell's TSDF."""
@@ -298,23 +289,16 @@ class _Volumes:
         return arrays_of(held, what, lambda found: {name: found[name] for name in found.files})
 
     def _blocks_tasks(
-        self, keys: list[CellKey], filled: set[CellKey], around: int, settings: FieldSettings | None
-    ) -> Iterator[BlocksTask]:
-        """Cells with their blocks and so many around them; `filled`: cells with blocks."""
+        self, filled: set[CellKey], around: int, settings: FieldSettings | None
+    ) -> Callable[[CellKey], BlocksTask]:
+        """Makes tasks of cells with their blocks and so many around them; `filled`: cells with blocks."""
         read, edge = lru_cache(_CELLS_IN_MEMORY)(self._tsdf), self.work.blocks(next(iter(filled))).edge
         steps = math.ceil(around * edge / self.work.store.grid.spacing + 0.5)
-        for key in keys:
-            blocks, parts = self.work.blocks(key), list[dict[str, np.ndarray]]()
-            reach = steps * self.work.store.grid.spacing * math.sqrt(3) * 1.01
-            there = self.results.part_versions(TSDF, self.results.centre_of(key), reach)
-            for other in sorted(there):
-                if other in filled and max(abs(a - b) for a, b in zip(key, other, strict=True)) <= steps:
-                    parts.append(blocks_within(read(other), *blocks.around(around)))
-            held, least = arrays_to_bytes(**join_blocks(parts)), self.work.settings.min_weight
-            yield BlocksTask(key, blocks, held, settings, least)
 
+        def task_of(key: CellKey) -> BlocksTask:
+            blocks, near = self.work.blocks(key), self.results.around(key, TSDF, steps)
+            parts = [blocks_within(read(other), *blocks.around(around)) for other in near if other in filled]
+            held = arrays_to_bytes(**join_blocks(parts))
+            return BlocksTask(key, blocks, held, settings, self.work.settings.min_weight)
 
-def _error(failure: Failure, text: str) -> GgslamError:
-    error = GgslamError(text)
-    error.exit_code = failure.exit_code
-    return error
+        return task_of

@@ -9,6 +9,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.camera_files.matrices import intrinsics_of_matrix
+from ggslam.system.csv_text import is_number
 
 Entries = dict[str, Any]
 
@@ -37,11 +38,11 @@ def from_text(place: object, text: str) -> Entries:
     """
     rows = [line.replace(",", " ").split() for line in text.splitlines()]
     rows = [row for row in rows if row and not row[0].startswith("#")]
-    if rows and len(rows[0]) > 4 and not _is_number(rows[0][1]):
+    if rows and len(rows[0]) > 4 and not is_number(rows[0][1]):
         return _of_colmap(place, rows)
     words = [word.strip("[];") for row in rows for word in row]
     words = [word for word in words if word]
-    if not words or not all(map(_is_number, words)) or len(words) not in (4, 9, 12, 16):
+    if not words or not all(map(is_number, words)) or len(words) not in (4, 9, 12, 16):
         raise SequenceError(
             f"{place}: expected a camera: a matrix of 3x3 or 4x4 numbers, 'fx fy cx cy', or COLMAP's cameras.txt; "
             f"found {_description(words)}"
@@ -55,16 +56,8 @@ def from_text(place: object, text: str) -> Entries:
 
 
 def _description(words: list[str]) -> str:
-    other = next((word for word in words if not _is_number(word)), None)
+    other = next((word for word in words if not is_number(word)), None)
     return "nothing" if not words else f"{len(words)} numbers" if other is None else f"'{other[:40]}'"
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def _of_colmap(place: object, rows: list[list[str]]) -> Entries:
@@ -75,7 +68,7 @@ def _of_colmap(place: object, rows: list[list[str]]) -> Entries:
     if model not in COLMAP_MODELS:
         raise SequenceError(f"{place}: COLMAP's model {model} is not supported; known are {', '.join(COLMAP_MODELS)}")
     names, lens = COLMAP_MODELS[model][0].split(), COLMAP_MODELS[model][1]
-    if len(words) != 2 + len(names) or not all(map(_is_number, words)):
+    if len(words) != 2 + len(names) or not all(map(is_number, words)):
         wanted = f"width, height and {', '.join(names)}"
         raise SequenceError(f"{place}: expected {wanted} of {model}, found {' '.join(words)[:80]}")
     width, height, *numbers = map(float, words)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The edges and planes about the sensor, what scans are aligned to, and an odometry that needs no more than that."""
+"""The edges and planes around the sensor, which scans are aligned to."""
 
 from __future__ import annotations
 
@@ -100,40 +100,3 @@ class LocalFeatureMap:
         discs = torch.cat([scan.discs, torch.zeros_like(scan.edge_sigmas)])
         self.features.add(torch.addmm(t, scan.points, R.T), len(scan.planes), scan.all_normals @ R.T, discs)
         self._T_map_added = T
-
-
-class FeatureOdometry:
-    """Locates scan after scan: constant velocity, alignment to the local map, growth of the map.
-
-    Args:
-        settings: see `FeatureTrackerSettings`.
-        T_world_sensor: pose of the first scan, [4, 4].
-    """
-
-    def __init__(self, settings: FeatureTrackerSettings, T_world_sensor: np.ndarray | None = None) -> None:
-        self.map = LocalFeatureMap(settings)
-        self.T_world_sensor = np.eye(4) if T_world_sensor is None else np.array(T_world_sensor, float)
-        """Of the newest located scan."""
-        self.velocity = np.eye(4)
-        """Its motion since the one before, [4, 4]."""
-
-    def locate(self, scan: ScanFeatures) -> FeatureAlignment | None:
-        """Locates a scan and maybe adds it to the map. None: the first one, whose pose is given. If the result is not
-        convincing (`map.is_convincing`), the pose stays where it was.
-
-        The time for this counts from `map.clock.start()`.
-        """
-        if self.map.is_empty:
-            self.map.add(scan, self.T_world_sensor)
-            return None
-        found = self.map.align(scan, self.T_world_sensor @ self.velocity)
-        if not self.map.is_convincing(found):
-            self.map.clock.lift()  # to be late is better than to be lost
-            found = self.map.align(scan, found.T_map_sensor)
-        if not self.map.is_convincing(found):
-            self.velocity = np.eye(4)
-            return found
-        self.velocity = inverse(self.T_world_sensor) @ found.T_map_sensor
-        self.T_world_sensor = found.T_map_sensor
-        self.map.update(scan, self.T_world_sensor, found.overlap)
-        return found

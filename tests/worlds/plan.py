@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.synthetic.world import World, spread
+from worlds.world import World, spread
 
 HEIGHT = 3.0
 PITCH, CORRIDOR, WALL = 10.0, 2.4, 0.15

@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from ggslam.synthetic import furniture, house_furniture
-from ggslam.synthetic.house_palette import HousePalette
-from ggslam.synthetic.house_rooms import ceiling_lamp
+from ggslam.synthetic import furniture
+from ggslam.synthetic.houses import furniture as house_furniture
+from ggslam.synthetic.houses.palette import HousePalette
+from ggslam.synthetic.houses.rooms import ceiling_lamp
 from ggslam.synthetic.materials import Material
 from ggslam.synthetic.scene import Scene, SceneBuilder
 

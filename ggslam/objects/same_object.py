@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.geometry.voxels import voxel_keys
-from ggslam.objects.settings import UnitingSettings
+from ggslam.objects.settings import SameObjectSettings
 from ggslam.scene.gaussian_map import GaussianMap
 
 FAINT = 0.1
@@ -70,7 +70,7 @@ class Counterpart:
 
 
 def find_counterparts(
-    first: LabelledVoxels, second: LabelledVoxels, settings: UnitingSettings
+    first: LabelledVoxels, second: LabelledVoxels, settings: SameObjectSettings
 ) -> list[Counterpart]:
     """For each object of the second map the one of the first that it is, if there is one. Only voxels that both maps
     know count, so that an object of which each map has another part is found by what they share.
@@ -96,7 +96,7 @@ def find_counterparts(
 
 
 def _judge(
-    first: int, second: int, shared: int, size: int, other: int, settings: UnitingSettings
+    first: int, second: int, shared: int, size: int, other: int, settings: SameObjectSettings
 ) -> Counterpart | None:
     """Whether two objects are one that fill so many of the voxels that both maps know."""
     overlap, smaller = shared / (size + other - shared), min(size, other)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from ggslam.errors import SequenceError
-from ggslam.synthetic.world import World
+from worlds.world import World
 
 SPEED, RATE = 1.2, 10.0
 """Metres and poses per second."""

@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ggslam.synthetic import house_rooms
-from ggslam.synthetic.house_palette import HousePalette
+from ggslam.synthetic.houses import rooms
+from ggslam.synthetic.houses.palette import HousePalette
 from ggslam.synthetic.materials import Material
 from ggslam.synthetic.scene import Light, Placer, Scene, SceneBuilder
 
@@ -73,11 +73,11 @@ def ring_of_rooms(seed: int = 0) -> Scene:
     spaces = _spaces(m)
     for space in spaces:  # first, since the ray caster skips what is hidden behind earlier shapes
         _shell(b, m, space)
-    house_rooms.living_room(b, m, rng)
-    house_rooms.study(b, m, rng)
-    house_rooms.bedroom(b, m, rng)
-    house_rooms.kitchen(b, m, rng)
-    house_rooms.corridors(b, m)
+    rooms.living_room(b, m, rng)
+    rooms.study(b, m, rng)
+    rooms.bedroom(b, m, rng)
+    rooms.kitchen(b, m, rng)
+    rooms.corridors(b, m)
     scene = b.scene
     scene.lights = [_bound_light(light, spaces) for light in scene.lights]
     scene.bounds = ((-HALF_WALL, -HALF_WALL, 0.0), (WIDTH + HALF_WALL, DEPTH + HALF_WALL, HEIGHT))

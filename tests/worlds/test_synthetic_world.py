@@ -9,8 +9,11 @@ import pytest
 
 from ggslam.errors import ConfigError, SequenceError
 from ggslam.scene.poses import inverse, so3_log, transform_points
-from ggslam.synthetic import Scanner, World, cast_rays, cloud_tiles, make_world, walk, world_cloud
-from ggslam.synthetic.world import CELL
+from worlds.cloud import cloud_tiles, world_cloud
+from worlds.plan import make_world
+from worlds.scanner import Scanner
+from worlds.walk import walk
+from worlds.world import CELL, World, cast_rays
 
 SCANNER = Scanner(16, 360)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.synthetic import furniture, house_furniture
-from ggslam.synthetic.house_palette import HousePalette
+from ggslam.synthetic import furniture
+from ggslam.synthetic.houses import furniture as house_furniture
+from ggslam.synthetic.houses.palette import HousePalette
 from ggslam.synthetic.scene import SceneBuilder, Vector
 
 

@@ -9,13 +9,13 @@ import torch
 
 from ggslam.merging.objects import RunObjects, UnitedObjects
 from ggslam.objects.encoding import code_of, with_class
-from ggslam.objects.settings import UnitingSettings
+from ggslam.objects.same_object import LabelledVoxels, find_counterparts
+from ggslam.objects.settings import SameObjectSettings
 from ggslam.objects.table import ObjectTable, Observation
-from ggslam.objects.uniting import LabelledVoxels, find_counterparts
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 
-SETTINGS = UnitingSettings()
+SETTINGS = SameObjectSettings()
 
 
 def box(centre: tuple[float, float, float], size: tuple[float, float, float], step: float = 0.02) -> np.ndarray:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from ggslam.synthetic.house_palette import HousePalette
+from ggslam.synthetic.houses.palette import HousePalette
 from ggslam.synthetic.materials import Material
 from ggslam.synthetic.scene import SceneBuilder, Vector
 

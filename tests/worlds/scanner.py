@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ggslam.synthetic.world import World, cast_rays
 from ggslam.system.settings import setting, settings_class
+from worlds.world import World, cast_rays
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Scan:
     Attributes:
         points: float32 [n, 3], metres in the sensor's frame: x forward, y left, z up.
         rings, columns: int32 [n], which ray each point is on; rings count from the lowest, columns from behind the
-            sensor counter-clockwise, as `ggslam.tracking.edges_planes.scans.LidarFeatures` has them.
+            sensor counter-clockwise, as the tests' `LidarFeatures` has them.
         tested: pairs of a ray and a box that were tested.
     """
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A large indoor world of boxes between a floor and a ceiling, found through a grid, so that work goes with what is
-near and not with the size of the world. `world_plan` makes one, `world_scanner` scans it, `world_walk` walks through
-it, `world_cloud` samples its surfaces.
+near and not with the size of the world. `plan` makes one, `scanner` scans it, `walk` walks through
+it, `cloud` samples its surfaces.
 
 World axes: x and y along the floor, z up, metres; the floor is z = 0 and reaches from 0 to `size` along x and y.
 """

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ggslam.synthetic.world import World, spread
+from worlds.world import World, spread
 
 TILE = 10.0
 """Edge of the squares that are sampled one by one, metres."""
@@ -24,7 +24,7 @@ def world_cloud(world: World, spacing: float = 0.1, seed: int = 0) -> np.ndarray
 
 
 def cloud_tiles(world: World, spacing: float = 0.1, seed: int = 0) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The points of `world_cloud` and their outward normals, float32 [n, 3] each, tile by tile.
+    """The points of `cloud` and their outward normals, float32 [n, 3] each, tile by tile.
 
     A tile has the floor and ceiling of its square and the boxes whose centre is in it, which may reach out of it.
 
