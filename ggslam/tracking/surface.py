@@ -178,7 +178,7 @@ class MeasuredSurface:
 
     def _join(self, numbers: list[int]) -> GicpTarget:
         """These keyframes take part, too."""
-        return self._note_joined(numbers, self._gather(self._placed(numbers), self.target))
+        return self._note_joined(numbers, self._gather(self._parts_with_poses(numbers), self.target))
 
     def _note_joined(self, numbers: list[int], target: GicpTarget) -> GicpTarget:
         self.active |= set(numbers)
@@ -190,17 +190,17 @@ class MeasuredSurface:
         self._parts.append(_Part(len(self._parts), points, normals, self._archive))
         self.poses.append(T_world_camera)
 
-    def _placed(self, numbers: Iterable[int]) -> list[tuple[_Part, np.ndarray]]:
+    def _parts_with_poses(self, numbers: Iterable[int]) -> list[tuple[_Part, np.ndarray]]:
         """Keyframes with where they are."""
         return [(self._parts[number], self.poses[number]) for number in numbers]
 
     def of(self, numbers: Iterable[int]) -> GicpTarget:
         """A target of these keyframes alone."""
-        return self._gather(self._placed(numbers), None)
+        return self._gather(self._parts_with_poses(numbers), None)
 
     def points(self, numbers: Iterable[int]) -> np.ndarray:
         """World points float32 [n, 3] of these keyframes."""
-        placed = (transform_points(part.points, T) for part, T in self._placed(numbers))
+        placed = (transform_points(part.points, T) for part, T in self._parts_with_poses(numbers))
         return np.concatenate([np.empty((0, 3), np.float32), *placed])
 
     def arrange(self, active: set[int], T_world_camera: np.ndarray | None = None) -> GicpTarget:
@@ -214,7 +214,7 @@ class MeasuredSurface:
         before = self.target if self._archive is None else None  # where memory is short it goes before the next is made
         self.target, self.active, numbers = None, set(active), sorted(active)
         self._joined = [numbers]
-        self.target = self._gather(self._placed(numbers), None, before)
+        self.target = self._gather(self._parts_with_poses(numbers), None, before)
         return self.target
 
     def drop_pixels(self, part: np.ndarray, nearest: float, camera: Camera) -> None:
@@ -245,7 +245,7 @@ class MeasuredSurface:
         bit."""
         self.target = None
         for numbers in self._joined:
-            self.target = self._gather(self._placed(numbers), self.target)
+            self.target = self._gather(self._parts_with_poses(numbers), self.target)
 
     def points_and_normals(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Points, metres, and normals float32 [n, 3] of a keyframe in its camera's frame."""
