@@ -8,13 +8,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 
 import torch
 
 import ggslam
-from ggslam.mapping.extra_loss import ExtraLoss
-from ggslam.mapping.keyframe import Keyframe
-from ggslam.rendering.types import RenderBuffers
+from ggslam import Keyframe, RenderBuffers
+
+Loss = Callable[[RenderBuffers, Keyframe], torch.Tensor]
 
 
 def no_fog(view: RenderBuffers, keyframe: Keyframe) -> torch.Tensor:
@@ -29,7 +30,7 @@ def same_saturation(view: RenderBuffers, keyframe: Keyframe) -> torch.Tensor:
     return 0.1 * (view.image.std(dim=0) - seen.std(dim=0)).abs().mean()
 
 
-def fog(recording: str, loss: ExtraLoss | None, frames: int) -> float:
+def fog(recording: str, loss: Loss | None, frames: int) -> float:
     """Mean of alpha (1 - alpha) in the last keyframe's view, after a run."""
     sequence = ggslam.open_sequence(recording, stop=frames, scale=0.5)
     slam = ggslam.Slam(sequence.camera, has_masks=False, extra_loss=loss)

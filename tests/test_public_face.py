@@ -18,8 +18,8 @@ import ggslam
 ROOT = Path(__file__).parents[1]
 NAMES = """
     Camera CodecSettings Config ConfigError DistanceField Edit FormatError Frame GaussianMap GaussianModel
-    GgslamError InputError LiveSequence MissingDependency ObjectTable OccupancyMap RenderBuffers RenderError RunFolder
-    RunFolderError RunOutcome SegmentationCounts Sequence SequenceError Slam SlamResult StepReport Trajectory
+    GgslamError InputError Keyframe LiveSequence MissingDependency ObjectTable OccupancyMap RenderBuffers RenderError
+    RunFolder RunFolderError RunOutcome SegmentationCounts Sequence SequenceError Slam SlamResult StepReport Trajectory
     TsdfMap collate_frames color_loss decode_cloud depth_loss edit_run encode_cloud evaluate_run export_run
     identity_loss load_config neighbour_loss objects_at open_sequence read_gaussian_ply read_point_cloud read_splats
     read_trajectory render render_run run_recording sample_points save_run score_cloud score_image

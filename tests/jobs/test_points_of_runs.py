@@ -128,6 +128,6 @@ def test_runs_without_points_are_scored_without_them(run: RunFolder, tmp_path: P
 def test_discs_are_asked_for(run: RunFolder, tmp_path: Path) -> None:
     some = ["--min-opacity", 0.5, "--out", tmp_path / "a.pcd"]
     refuse(ggslam("export", run.path, *some), "--discs")
-    refuse(ggslam("export", run.path, "--out", tmp_path / "a.ply", "--discs"), "points or pcd")
+    refuse(ggslam("export", run.path, "--out", tmp_path / "a.ply", "--discs"), "points, pcd")
     succeed("export", run.path, "--discs", *some)
     assert (tmp_path / "a.pcd").is_file()

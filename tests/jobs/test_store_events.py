@@ -11,7 +11,7 @@ import torch
 
 from ggslam.errors import FormatError
 from ggslam.jobs.changes.store_events import events_of_history
-from ggslam.jobs.changes.store_visits import _cells_with_gaussians, _Comparison, _drop_ghosts
+from ggslam.jobs.changes.store_visits import _Comparison, _drop_ghosts
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, arrays_of_map, cell_arrays, gaussians_to_bytes
 from ggslam.jobs.submaps.fill import list_store
 from ggslam.objects.history import History, VisitRecord
@@ -119,5 +119,5 @@ def test_what_went_leaves_the_cells_that_have_the_same_ids(tmp_path: Path) -> No
                 if by == visit:
                     store.put(key, {GAUSSIANS: cell_of(ids, by)}, counts={GAUSSIANS: len(ids)})
         assert _drop_ghosts(store, _Comparison(entry, {}, set()), {"others"}) == []
-        left = {key: cell_arrays(store, key)[0]["object_id"].tolist() for key in _cells_with_gaussians(store)}
+        left = {key: cell_arrays(store, key)[0]["object_id"].tolist() for key in store.counts(GAUSSIANS)}
     assert left == {keys[0]: [1], keys[2]: [2, 7], keys[3]: [1]}

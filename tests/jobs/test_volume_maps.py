@@ -37,7 +37,7 @@ class Played:
     """What `LiveVolumes` asks of a run, at given poses; each frame is a keyframe."""
 
     def __init__(self) -> None:
-        self.corrections, self.scale = 0, 1.0
+        self.corrections, self.scale = [], 1.0
         self.cameras = [None]
         self.mapper: Any = SimpleNamespace(keyframes=[], identity=None)
         self.poses: dict[int, np.ndarray] = {}
@@ -64,7 +64,7 @@ def test_after_a_correction_the_volumes_are_where_the_keyframes_are(frames: list
     live = LiveVolumes(maps, lambda frame, T: None)
     for k, frame in enumerate(frames[:4]):
         slam.play(live, frame, (drift if k < 3 else np.eye(4)) @ frame.T_world_camera)
-    slam.corrections = 1
+    slam.corrections = [np.eye(4)]
     for keyframe, frame in zip(slam.mapper.keyframes, frames, strict=False):
         keyframe.T_camera_world = np.linalg.inv(frame.T_world_camera)
     slam.play(live, frames[4], frames[4].T_world_camera)
@@ -197,7 +197,7 @@ def test_what_keyframes_found_nothing_of_stays_free_after_a_correction(frames: l
         slam.play(live, replace(nothing, index=k), T)
     surface, occupied = len(maps.field.surface()[0]), maps.occupancy.summary().occupied
     assert 0.2 * before < surface < 0.8 * before
-    slam.corrections = 1
+    slam.corrections = [np.eye(4)]
     slam.play(live, replace(nothing, index=9), T)
     assert len(maps.times.rebuilds) == 1
     assert len(maps.field.surface()[0]) == pytest.approx(surface, rel=0.02)

@@ -17,7 +17,7 @@ from ggslam.slam.modes import CAPABILITIES, Lack, Mode, modes_of, notes, refuse,
 
 REFUSED = {
     (Mode.RIG, "realtime_fps"): "realtime_fps=10", (Mode.RIG, "memory_limit_mb"): "memory_limit_mb=4000",
-    (Mode.RIG, "device"): "device=cuda", (Mode.RIG, "tracker"): "tracker=features",
+    (Mode.RIG, "device"): "device=cuda", (Mode.RIG, "tracker"): "tracker=edges_planes",
     (Mode.GPU, "memory_limit_mb"): "memory_limit_mb=4000", (Mode.PAGED, "device"): "device=cuda",
 }  # fmt: skip
 """What each mode refuses, by the setting that asks for it."""

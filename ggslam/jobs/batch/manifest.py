@@ -26,7 +26,7 @@ ALLOWED = (
     "no-skip-bad-frames", "check", "no-check", "strict", "checkpoint-every",
 )  # fmt: skip
 """Options of `ggslam run` that a batch passes on: they say how a run is made. The others choose folders, write files of
-their own (`--log`, `--record`), serve pages, or are the batch's own business."""
+their own (`--log`, `--record`), run code of others (`--loss`), serve pages, or are the batch's own business."""
 
 
 @dataclass(frozen=True)
