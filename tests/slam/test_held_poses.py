@@ -31,7 +31,9 @@ STAYS = {
     r"\.T_keyframe_camera$": "relative to a keyframe",
     r"\.T_color_depth$": "motion between two exposures",
     r"\.(motion|velocity|turned|rig_motion)$": "motion between two frames",
+    r"\._T_map_added$": "within the local map, which moves as a whole",
     r"\.T_i_j$": "measured between two keyframes",
+    r"\.graph\._tree\.poses": "where odometry alone has the keyframes",
     r"\.rig(\.|$)|T_first_|T_rig_": "between two cameras of a rig",
 }
 """Paths of motions that a correction leaves alone, and what they are."""

@@ -17,7 +17,7 @@ NEW = {"map.ply": "new", "cloud.ply": "new", MARKER: '{"of": "new"}'}
 
 
 def files_of(folder: Path) -> dict[str, str]:
-    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
+    return {path.name: path.read_text() for path in folder.iterdir() if not path.name.startswith(".")}
 
 
 def publish_and_die(target: Path, renames: int) -> int:
