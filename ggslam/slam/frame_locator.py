@@ -73,6 +73,9 @@ class FrameLocator:
             start.target = None
         return start.target or published
 
+    def move(self, T_new_old: np.ndarray) -> None:
+        """The world about the camera was moved by a correction [4, 4]; a locator of its own kind may hold a pose."""
+
     def locate(self, frames: list[Frame], growing: bool, takes_keyframes: bool) -> Located:
         """Locates the frames of an instant: of one camera there is one.
 

@@ -51,6 +51,10 @@ class RigLocator(FrameLocator):
         self._engine = RigTrackingEngine(parts.context)
         self._tracker.engine = self._engine
 
+    def move(self, T_new_old: np.ndarray) -> None:
+        """The world about the rig was moved by a correction [4, 4]."""
+        self._clock.move(T_new_old)
+
     def locate(self, frames: list[Frame], growing: bool, takes_keyframes: bool) -> Located:
         """Locates the frames of an instant, one of each camera that has one."""
         now = frames[0].timestamp

@@ -198,7 +198,7 @@ class Slam(RunState):
         published, moves = self.corrections.pending_moves(self.moves_followed)
         self.moves_followed += len(moves)
         for T_new_old in moves:
-            for holder in (self.tracker, self.filters, self.policy, self.poses):
+            for holder in (self.tracker, self.locator, self.filters, self.policy, self.poses):
                 holder.move(T_new_old)
         target = self.locator.target(published)
         if target is not None:

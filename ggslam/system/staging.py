@@ -66,7 +66,9 @@ def leftovers(target: Path) -> list[Path]:
         path for path in target.iterdir()
         if (match := _NAME.fullmatch(path.name)) and not path.is_symlink() and not is_running(int(match[1]))
     ]  # fmt: skip
-    waiting = [_trusted_saving(marker) for marker in target.glob("*.json")] if found else []
+    # A hidden marker is one that was still being written: nothing waits for it.
+    markers = [path for path in target.glob("*.json") if not path.name.startswith(".")] if found else []
+    waiting = [_trusted_saving(marker) for marker in markers]
     return [path for path in found if all(record is None or record["from"] != path.name for record in waiting)]
 
 

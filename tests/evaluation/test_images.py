@@ -197,3 +197,14 @@ def test_means_leave_missing_scores_out() -> None:
     mean.add(ImageScores(psnr=30.0, ssim=0.5))
     assert (mean.mean().psnr, mean.mean().ssim, mean.frames) == (25.0, 0.5, 2)
     assert math.isnan(mean.mean().lpips)
+
+
+def test_exposed_psnr_brings_the_frame_to_the_maps_exposure() -> None:
+    shown = (0.2 + 0.3 * RANDOM.random((24, 32, 3))).astype(np.float32)
+    exposure, typical = np.array([[1.2, 0.05], [0.9, -0.03], [1.1, 0.1]]), np.array([1.1, 0.95, 1.0])
+    recorded = np.rint(255 * (shown * exposure[:, 0] + exposure[:, 1])).astype(np.uint8)
+    frame = Frame(0, 0, 0.0, recorded, np.ones((24, 32), np.float32), Camera(32, 24, 20, 20, 15.5, 11.5))
+    right = RenderedView(shown, exposure=exposure, typical=typical).score(frame)
+    assert right.psnr < 25 and right.psnr_exposed > 50
+    for wrong in (np.array([0, 0.02]), np.array([0.05, 0])):
+        assert RenderedView(shown, exposure=exposure + wrong, typical=typical).score(frame).psnr_exposed < 40

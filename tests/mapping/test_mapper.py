@@ -12,6 +12,7 @@ from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import ELSEWHERE, PoseAdam, make_keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.mean_map import AVERAGED
+from ggslam.mapping.pixel_grid import PixelGrid
 from ggslam.mapping.pruning import is_look_due, prune
 from ggslam.mapping.settings import InsertionSettings, LearningRates, MapperSettings, PruningSettings
 from ggslam.native.loader import NativeContext
@@ -334,3 +335,16 @@ def test_steps_of_means_are_no_longer_than_half_a_pixel() -> None:
         mapper.pixel_m = pixel_m
         assert mapper._standard_adam().learning_rates["means"] == pytest.approx(wanted)
         assert mapper._adam(0.1).learning_rates["means"] == pytest.approx(0.1 * wanted)
+
+
+def test_a_pose_moves_half_as_far_by_a_step_on_a_quarter_of_the_pixels() -> None:
+    """Two such steps make an iteration, which moves a pose as far as one on all pixels."""
+    lengths = []
+    for grid in (PixelGrid(), PixelGrid(2, 1, 0)):
+        mapper = make_mapper()
+        mapper.add_keyframe(wall(), np.eye(4))
+        keyframe = mapper.add_keyframe(wall(1), se3_exp(np.array([0.02, -0.01, 0.01, 0.01, 0.02, 0.01])))
+        before = keyframe.T_camera_world.copy()
+        mapper._step(keyframe, (1.0, 1.0), grid, False)
+        lengths.append(np.linalg.norm(se3_log(keyframe.T_camera_world @ np.linalg.inv(before))))
+    assert lengths[1] > 0 and lengths[1] == pytest.approx(lengths[0] / 2, rel=0.02)

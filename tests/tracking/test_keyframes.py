@@ -48,3 +48,20 @@ def test_motion_counts_by_the_distance_of_the_scene() -> None:
     assert not started().decide(1, Tracked(T_world_camera=moved, median_depth_m=2.0))
     assert started().decide(1, Tracked(T_world_camera=moved, median_depth_m=1.0))
     assert started().decide(1, Tracked(T_world_camera=se3_exp(np.radians([0, 0, 0, 0, 12, 0]))))
+
+
+def test_limits_at_their_edges() -> None:
+    def decides(gap: int, **tracked: object) -> bool:
+        return started(KeyframeSettings(max_gap=5)).decide(gap, Tracked(**tracked))  # type: ignore[arg-type]
+
+    def turned(degrees: float) -> np.ndarray:
+        return se3_exp(np.radians([0, 0, 0, 0, degrees, 0]))
+
+    def shifted(metres: float) -> np.ndarray:
+        return se3_exp(np.array([metres, 0, 0, 0, 0, 0]))
+
+    assert decides(2, overlap=0.799) and not decides(2, overlap=0.801)
+    assert decides(1, overlap=0.599) and not decides(1, overlap=0.601)
+    assert decides(5) and not decides(4)
+    assert decides(1, T_world_camera=turned(10.01)) and not decides(1, T_world_camera=turned(9.99))
+    assert decides(1, T_world_camera=shifted(0.2002)) and not decides(1, T_world_camera=shifted(0.1998))
