@@ -38,3 +38,8 @@ def test_every_room_has_a_purpose() -> None:
 def test_it_knows_what_it_looks_for() -> None:
     assert all(house.is_bare_participle(name) for name in ("kept", "_named", "sorted_again", "found_in"))
     assert not any(house.is_bare_participle(name) for name in ("keep", "needs", "string", "built_map", "_timing"))
+
+
+def test_one_more_of_a_kind_touches_few_files() -> None:
+    touched = {kind: len(files) for kind, files in house.growth.files_touched().items()}
+    assert touched == {"format": 2, "filter": 1, "tracker": 2, "command": 2, "dataset": 2}

@@ -15,6 +15,7 @@ from typing import Annotated
 
 import numpy as np
 
+from ggslam.scene.keyframe_poses import KeyframePoses
 from ggslam.system.array_forms import Form, Points64, check_indices
 from ggslam.system.savable import savable
 from ggslam.system.settings import setting, tuning_class
@@ -56,8 +57,11 @@ class ActiveKeyframes:
     _middles: Points64
     _seen: Annotated[np.ndarray, Form("f8", "n")]
 
-    def __init__(self, settings: ActivitySettings | None = None) -> None:
+    def __init__(self, settings: ActivitySettings | None = None, poses: KeyframePoses | None = None) -> None:
         self.settings = settings or ActivitySettings()
+        self.poses = KeyframePoses() if poses is None else poses
+        self._version = self.poses.version
+        """That `_cameras` and `_middles` are of."""
         self.active = set()
         self.spare = set()
         """Put aside only because there are enough: they lie right to the active ones, and no loop leads to them."""
@@ -77,11 +81,15 @@ class ActiveKeyframes:
         return len(self._depths)
 
     def add(self, T_world_camera: np.ndarray, median_depth_m: float, before: int | None = -1) -> None:
-        """A keyframe is made at `T_world_camera` [4, 4]. It is active, and the camera is there now.
+        """A keyframe is made at `T_world_camera` [4, 4]. It is active, and the camera is there now. Its pose joins
+        `poses`, unless whoever shares them has put it there already.
 
         Args:
             before: number of the keyframe that the camera came from; None: it was there already (in a rig).
         """
+        self._follow()
+        if len(self.poses) == len(self):
+            self.poses.append(T_world_camera)
         if len(self) and before is not None:
             self._path += float(np.linalg.norm(T_world_camera[:3, 3] - self._cameras[before]))
         self.active.add(len(self))
@@ -94,13 +102,17 @@ class ActiveKeyframes:
             known[np.fromiter(numbers, int, len(numbers))] = True
         self._seen[known & self._near(-1)] = self._path
 
-    def move(self, T_world_camera: np.ndarray) -> None:
-        """Keyframes were given new poses [K, 4, 4]."""
-        self._cameras = T_world_camera[:, :3, 3].copy()
-        self._middles = self._cameras + self._depths[:, None] * T_world_camera[:, :3, 2]
+    def _follow(self) -> None:
+        """Cameras and what they look at are where `poses` have them."""
+        if self._version != self.poses.version:
+            T_world_camera = self.poses.array()[: len(self)]
+            self._cameras = T_world_camera[:, :3, 3].copy()
+            self._middles = self._cameras + self._depths[:, None] * T_world_camera[:, :3, 2]
+            self._version = self.poses.version
 
     def update(self) -> bool:
         """Puts aside and takes back what is due; whether the set changed."""
+        self._follow()
         s, before = self.settings, set(self.active)
         limit = s.forget_after * float(np.median(self._depths[-20:]))
         stale = {k for k in self.active if self._path - self._seen[k] > limit}
@@ -189,6 +201,7 @@ class ActiveKeyframes:
     def alike(self, share: float, degrees: float) -> set[int]:
         """Numbers of the keyframes that saw about what the newest sees: cameras and the middles of what they saw are
         nearer than this share of the mean of both median depths, and directions differ by fewer degrees."""
+        self._follow()
         directions = self._middles - self._cameras
         directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
         apart = np.maximum(*(np.linalg.norm(at - at[-1], axis=1) for at in (self._middles, self._cameras)))
@@ -209,5 +222,6 @@ class ActiveKeyframes:
 
     def _near(self, number: int) -> np.ndarray:
         """Which keyframes look where keyframe `number` looks, bool [K]."""
+        self._follow()
         reach = self.settings.near * 0.5 * (self._depths + self._depths[number])
         return np.linalg.norm(self._middles - self._middles[number], axis=1) < reach

@@ -22,8 +22,9 @@ from ggslam.loops.condensed import CondensedGraph, Link, chi_squared_limit
 from ggslam.loops.odometry import OdometryTree
 from ggslam.loops.settings import GraphSettings
 from ggslam.loops.uncertainty import covariance_in_frame, covariance_of
+from ggslam.scene.keyframe_poses import KeyframePoses
 from ggslam.scene.poses import inverse, se3_log, so3_log
-from ggslam.system.array_forms import Pose, check_indices
+from ggslam.system.array_forms import check_indices
 from ggslam.system.savable import savable
 
 _SHORTEST = 0.01
@@ -82,35 +83,45 @@ class PoseGraph:
 
     Args:
         settings: see `GraphSettings`.
+        poses: of the nodes as last known, which others may share; None: its own. `optimise` starts from them.
     """
 
-    poses: list[Pose]
     loops: list[Link]
 
-    def __init__(self, settings: GraphSettings | None = None) -> None:
+    def __init__(self, settings: GraphSettings | None = None, poses: KeyframePoses | None = None) -> None:
         self.settings = settings or GraphSettings()
-        self.poses = []
-        """T_world_camera of every node as last known; `optimise` starts from them and replaces them."""
+        self.poses = KeyframePoses() if poses is None else poses
         self.loops = []
         self._tree = OdometryTree()
+        self._nodes = 0
 
     def check(self) -> None:
         """Raises FormatError if links lead to nodes that are not there: it may come from a file."""
-        if len(self._tree) != len(self.poses):
-            raise FormatError(f"pose graph: {len(self.poses)} nodes, odometry of {len(self._tree)}")
+        if not len(self._tree) == len(self) == len(self.poses):
+            raise FormatError(f"pose graph: {len(self)} nodes, {len(self.poses)} poses, odometry of {len(self._tree)}")
         for link in self.loops:
             check_indices("pose graph", (link.i, link.j), len(self.poses))
             if link.i == link.j:
                 raise FormatError(f"pose graph: node {link.i} is linked to itself")
 
     def add_node(self, T_world_camera: np.ndarray) -> int:
-        """A keyframe; returns its number. Every node but the first then needs an `add_odometry` of its own."""
-        if len(self._tree) != len(self.poses):
-            raise ValueError(f"node {len(self.poses) - 1} has no odometry yet")
-        self.poses.append(np.array(T_world_camera, float))
-        if len(self.poses) == 1:
+        """A keyframe; returns its number. Every node but the first then needs an `add_odometry` of its own. Its pose
+        joins `poses`, unless whoever shares them has put it there already."""
+        self._check_odometry()
+        if len(self.poses) == len(self):
+            self.poses.append(T_world_camera)
+        self._nodes += 1
+        if len(self) == 1:
             self._tree = OdometryTree.root()
-        return len(self.poses) - 1
+        return len(self) - 1
+
+    def __len__(self) -> int:
+        """How many nodes there are."""
+        return self._nodes
+
+    def _check_odometry(self) -> None:
+        if len(self._tree) != len(self):
+            raise ValueError(f"node {len(self) - 1} has no odometry yet")
 
     def add_odometry(
         self, i: int, j: int, T_i_j: np.ndarray, information: np.ndarray, found: bool = False, rigid: bool = False,
@@ -126,7 +137,7 @@ class PoseGraph:
         Raises:
             ValueError: j is not the newest node, has odometry already, or i is not before it.
         """
-        if j != len(self.poses) - 1 or len(self._tree) != j or not 0 <= i < j:
+        if j != len(self) - 1 or len(self._tree) != j or not 0 <= i < j:
             raise ValueError(f"odometry {i} to {j}: expected from an older node to the newest, which has none yet")
         s, covariance = self.settings, _isotropic(_RIGID_M, _RIGID_DEG)
         if not rigid:
@@ -144,8 +155,8 @@ class PoseGraph:
         Raises:
             ValueError: no two different nodes.
         """
-        if i == j or not (0 <= i < len(self.poses) and 0 <= j < len(self.poses)):
-            raise ValueError(f"closure from {i} to {j}: expected two different ones of {len(self.poses)} nodes")
+        if i == j or not (0 <= i < len(self) and 0 <= j < len(self)):
+            raise ValueError(f"closure from {i} to {j}: expected two different ones of {len(self)} nodes")
         self.loops.append(Link(i, j, np.array(T_i_j, float), closure_covariance(T_i_j, information, self.settings)))
         return len(self.loops) - 1
 
@@ -156,34 +167,34 @@ class PoseGraph:
         squared = float(twist @ np.linalg.solve(closure_covariance(T_i_j, information, self.settings), twist))
         return (squared / chi_squared_limit(self.settings.inlier_probability)) ** 0.5
 
-    def optimise(self, waiting: Iterable[int] = ()) -> GraphResult:
-        """Judges all closures, also those rejected before, and moves the nodes to agree with the believed ones.
+    def optimise(self, waiting: Iterable[int] = (), start: Sequence[np.ndarray] | None = None) -> GraphResult:
+        """Judges all closures, also those rejected before, and finds where the nodes agree with the believed ones.
+        `poses` stay as they are: whoever believes the result puts it there.
 
         Args:
             waiting: numbers of closures that are not to be believed yet, whatever they say.
+            start: T_world_camera [4, 4] of each node to start from; None: `poses`.
 
         Raises:
             MissingDependency: gtsam is not installed.
             ValueError: the newest node has no odometry.
         """
-        start = time.perf_counter()
-        if len(self._tree) != len(self.poses):
-            raise ValueError(f"node {len(self.poses) - 1} has no odometry yet")
+        began, start = time.perf_counter(), list(self.poses if start is None else start)
+        self._check_odometry()
         gtsam = _gtsam()
         aside = dict.fromkeys(waiting, "not confirmed yet")
         judged = [k for k in range(len(self.loops)) if k not in aside]
-        far = self._beyond_drift(self.poses, self._beyond_drift(self._tree.poses, judged))
+        far = self._beyond_drift(start, self._beyond_drift(self._tree.poses, judged))
         while True:
-            condensed, disagreeing, errors = self._settle(gtsam, far | aside)
+            condensed, disagreeing, errors = self._settle(gtsam, far | aside, start)
             poses = condensed.all_poses()
             nearer = self._beyond_drift(poses, far)
             if len(nearer) == len(far):
                 break
             far = nearer  # what is out of odometry's reach may be near once the closures before it are closed
-        self.poses = list(poses)
         rejected = far | aside | disagreeing
         accepted = tuple(k for k in range(len(self.loops)) if k not in rejected)
-        return GraphResult(poses, accepted, rejected, *errors, time.perf_counter() - start)
+        return GraphResult(poses, accepted, rejected, *errors, time.perf_counter() - began)
 
     def _beyond_drift(self, poses: Sequence[np.ndarray] | np.ndarray, numbers: Iterable[int]) -> dict[int, str]:
         """Reason by number of those closures that drift does not explain, given poses [n, 4, 4] to start from."""
@@ -205,11 +216,11 @@ class PoseGraph:
         return rejected
 
     def _settle(
-        self, gtsam: ModuleType, far: Mapping[int, str]
+        self, gtsam: ModuleType, far: Mapping[int, str], start: list[np.ndarray]
     ) -> tuple[CondensedGraph, dict[int, str], tuple[float, float]]:
         """The graph settled on those closures not too far that agree; the others' reasons; errors before and after."""
         candidates = [k for k in range(len(self.loops)) if k not in far]
-        condensed = CondensedGraph(self._tree, self.poses, [self.loops[k] for k in candidates])
+        condensed = CondensedGraph(self._tree, start, [self.loops[k] for k in candidates])
         believed, limit, lengths = condensed.agreement(gtsam, self.settings.inlier_probability)
         disagreeing = {
             number: f"disagrees with other closures: {length:.1f} standard deviations, limit {limit:.1f}"

@@ -50,7 +50,7 @@ class KnownRun:
     @property
     def poses(self) -> np.ndarray:
         """T_world_camera of the keyframes as tracked, float64 [K, 4, 4]."""
-        return self.surface.poses
+        return self.surface.poses.array()
 
     def frame_points(self, number: int) -> FramePoints:
         """A keyframe's points as the alignment takes them; their shapes are discs."""

@@ -138,7 +138,7 @@ class FrameLocator:
         """A part of the map begins with the frames that were lost; what tracking says of the last of them."""
         start, tracker, poses = self.part_start, self._tracker, self._poses
         self.left_parts.leave(*poses.anchor, tracker)
-        T_world_first = pose_apart(lost.T_world_camera, self._surface.poses, tracker.settings.points.max_depth)
+        T_world_first = pose_apart(lost.T_world_camera, self._surface.poses.array(), tracker.settings.points.max_depth)
         keyframe, first = poses.keyframes_made, start.first
         begun = start.begin(keyframe, lost, self._surface, T_world_first, tracker.context)
         loops.begin_part(begun.keyframes[0][0] if begun.keyframes else frame, first)

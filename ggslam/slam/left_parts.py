@@ -84,7 +84,7 @@ class LeftParts:
         Returns:
             What tracking says, and the number of the keyframe that it hangs on; None: it is not there.
         """
-        count = len(loops.poses)
+        count = len(loops)
         if here >= count:  # its part has just begun, and its keyframe waits for the mapper
             return None
         self.parts = [p for p in self.parts if p.keyframe >= count or not loops.parts.together(p.keyframe, here)]

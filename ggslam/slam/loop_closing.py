@@ -108,7 +108,6 @@ class LoopCloser:
     """
 
     events: list[LoopEvent]
-    poses: list[Pose]
     _verified: list[_Found]
     _found_at: tuple[int, int] | None
     _parts_begin: set[int]
@@ -121,11 +120,11 @@ class LoopCloser:
         self.events = []
         self.seconds = 0.0
         """Spent here, verification and graph included."""
-        self.graph = PoseGraph(settings.graph)
+        self.graph = PoseGraph(settings.graph, surface.poses)
         self.places = PlaceIndex(camera, settings.places)
-        self.activity = ActiveKeyframes(settings.activity)
-        self.poses = []
-        """T_world_camera of the keyframes as tracked and corrected (the mapper refines its own on top)."""
+        self.activity = ActiveKeyframes(settings.activity, surface.poses)
+        self.poses = surface.poses
+        """Of the keyframes; those of keyframes that are in the surface, but not here yet, are among them."""
         self.parts = KeyframeParts()
         self.revisits = Revisits(settings.revisits)
         self.comparison = PlaceComparison(
@@ -147,9 +146,9 @@ class LoopCloser:
 
     def check(self) -> None:
         """Raises FormatError if its parts are not of the same keyframes: it may come from a file."""
-        count = len(self.poses)
-        counts = [count, len(self.graph.poses), len(self.places), len(self.activity), len(self.revisits)]
-        counts += [len(self.parts.of), len(self._taken)]
+        count = len(self)
+        counts = [count, len(self.poses), len(self.graph), len(self.places), len(self.activity), len(self.revisits)]
+        counts.append(len(self.parts.of))
         if len(set(counts)) > 1:
             raise FormatError(f"loops: numbers of keyframes that do not agree: {counts}")
         named = [keyframe for found in self._verified for keyframe in (found.keyframe, found.old_keyframe)]
@@ -157,6 +156,10 @@ class LoopCloser:
         check_indices("loops", named, count)
 
     # --- keyframes ---------------------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        """How many keyframes were added."""
+        return len(self._taken)
 
     def begin(self, frame: Frame) -> None:
         """Starts to describe the frame that is added next, in another thread: for a caller that has other things to do
@@ -190,11 +193,10 @@ class LoopCloser:
             if begins:
                 self._leave_behind(frame, belated)
             self.activity.add(T, tracking.median_depth_m, None if rigid or begins else before)
-            self.poses.append(T.copy())
             self._taken.append((frame.instant, frame.camera_number))
-            self.places.add(len(self.poses) - 1, place)
+            self.places.add(len(self) - 1, place)
             if belated:
-                self.activity.active.discard(len(self.poses) - 1)
+                self.activity.active.discard(len(self) - 1)
             correction = None if belated else self._look_back(frame, place, tracking)
             if correction is None and (self.activity.update() or belated or begins):
                 self._surface.arrange(self.activity.active)
@@ -204,15 +206,13 @@ class LoopCloser:
     def settle(self, correction: Correction) -> None:
         """Takes over the poses of a correction; the surface is arranged accordingly."""
         with self._lock:
-            self.poses = list(correction.T_world_camera)
-            self.activity.move(correction.T_world_camera)
             self._surface.arrange(correction.active, correction.T_world_camera)
             self._verified.clear()
 
     def _came_from(self, frame: Frame) -> tuple[int, bool]:
         """The keyframe before that of a new frame, -1 without one, and whether it is of the same instant. In a rig that
         is one of this instant, else the same camera's of the instant before, else any of that."""
-        newest = len(self.poses) - 1
+        newest = len(self) - 1
         if newest < 0 or frame.instant is None:
             return newest, False
         first, at = newest, self._taken[newest][0]
@@ -233,7 +233,7 @@ class LoopCloser:
     def _connect(self, tracking: TrackingResult, belated: bool, before: int, rigid: bool, begins: bool) -> None:
         """The new keyframe's node, tied to the one before it, or to where a lost camera was found again; where a part
         begins, by a motion that nothing is known of."""
-        T, number = tracking.T_world_camera, len(self.poses)
+        T, number = tracking.T_world_camera, len(self)
         self.graph.add_node(T)
         found = self._found_at is not None and not belated
         if self._found_at is not None and found:
@@ -251,14 +251,14 @@ class LoopCloser:
             self.parts.add(before)
 
     def _look_back(self, frame: Frame, place: Place, tracking: TrackingResult) -> Correction | None:
-        number, s = len(self.poses) - 1, self.settings
+        number, s = len(self) - 1, self.settings
         known = self.activity.active | self.activity.spare
         waiting = self._correction_to_confirm()
         if waiting is not None:  # the same correction is looked for at the same place
             reach, T = s.confirmation_gap, waiting.T_correction @ self.poses[-1]
             near = {k for k in range(number) if abs(k - waiting.old_keyframe) <= reach}
             return self._revisit(frame, place, tracking, near, T)
-        if len(known) < len(self.poses):  # there is something to come back to
+        if len(known) < len(self):  # there is something to come back to
             for match in self.places.query(place, s.candidates, known.__contains__):
                 found, _ = self._compare(frame.camera, tracking.points, place, match.number)
                 if found.accepted:
@@ -271,7 +271,7 @@ class LoopCloser:
 
     def _believe(self, frame: Frame, old: int, found: Verification) -> Correction | None:
         """A comparison with an old keyframe says that the newest lies elsewhere."""
-        number = len(self.poses) - 1
+        number = len(self) - 1
         reason = f"{found.inliers} features, {found.overlap:.0%} of the voxels, RMSE {1e3 * found.rmse:.1f} mm"
         self.events.append(LoopEvent("verified", frame.index, number, old, reason))
         loop = self.graph.add_loop(old, number, found.T_old_new, found.information)
@@ -283,7 +283,7 @@ class LoopCloser:
         self, frame: Frame, place: Place, tracking: TrackingResult, chosen: set[int], T_expected: np.ndarray
     ) -> Correction | None:
         """Compares the newest keyframe, expected at a pose [4, 4], with the likeliest of the old ones chosen."""
-        number = len(self.poses) - 1
+        number = len(self) - 1
         for match in self.places.query(place, 1, lambda k: k not in chosen):
             old = match.number
             found = self._compare_expected(frame.camera, tracking.points, place, old, T_expected)
@@ -300,7 +300,7 @@ class LoopCloser:
 
     def _correction_to_confirm(self) -> _Found | None:
         """A correction that waits to be confirmed."""
-        if self._verified and len(self.poses) - 1 - self._verified[-1].keyframe <= self.settings.confirmation_gap:
+        if self._verified and len(self) - 1 - self._verified[-1].keyframe <= self.settings.confirmation_gap:
             return self._verified[-1]
         return None
 
@@ -333,13 +333,13 @@ class LoopCloser:
         return count >= s.confirmations
 
     def _close(self, frame_index: int, old: int, loop: int) -> Correction | None:
-        number = len(self.poses) - 1
+        number = len(self) - 1
         joins = not self.parts.together(old, number)
         result = self._optimise(frame_index, loop)
         if result is None:
             return None
         poses = result.poses
-        T_new_old = poses @ inverse(np.array(self.poses))
+        T_new_old = poses @ inverse(self.poses.array())
         kept, doubted = self.activity.inactive(), self.activity.active | self.activity.spare
         if old in doubted:
             kept, doubted = self.activity.visits(old)
@@ -355,16 +355,14 @@ class LoopCloser:
         return Correction(poses, T_new_old, kept, doubted, set(self.activity.active))
 
     def _optimise(self, frame_index: int, number: int) -> GraphResult | None:
-        """The graph with a closure that is to be believed; None, and the graph as it was, if it is not."""
-        loop, before = self.graph.loops[number], list(self.graph.poses)
-        if not self.parts.together(loop.i, loop.j):
-            self._bring_together(loop)
-        result = self.graph.optimise(self._between_other_parts(loop))
+        """The graph with a closure that is to be believed; None if it is not."""
+        loop = self.graph.loops[number]
+        start = None if self.parts.together(loop.i, loop.j) else self._poses_brought_together(loop)
+        result = self.graph.optimise(self._between_other_parts(loop), start)
         if number not in result.rejected:
             return result
         reason = f"the pose graph does not believe it: {result.rejected[number]}"
         self.events.append(LoopEvent("refused", frame_index, loop.j, loop.i, reason))
-        self.graph.poses = before
         self.revisits.pause()
         return None
 
@@ -394,7 +392,7 @@ class LoopCloser:
         if result is None:
             return None
         self._note_joined(-1, agreeing[0].old, agreeing[0].new)
-        T_new_old = result.poses @ inverse(np.array(self.poses))
+        T_new_old = result.poses @ inverse(self.poses.array())
         return Correction(result.poses, T_new_old, olds, news, olds | news)
 
     def begin_part(self, frame: Frame, first: int) -> None:
@@ -402,15 +400,12 @@ class LoopCloser:
         with self._lock:
             self._parts_begin.add(_moment(frame))
             reason = f"part {len(self.parts.begun) + len(self._parts_begin)} begins"
-            self.events.append(LoopEvent("new part", first, len(self.poses), -1, reason))
+            self.events.append(LoopEvent("new part", first, len(self), -1, reason))
 
     def move_world(self, T_new_old: np.ndarray) -> None:
         """Everything is moved [4, 4]."""
         with self._lock:
-            self.poses = [T_new_old @ T for T in self.poses]
-            self.graph.poses = list(self.poses)
-            self.activity.move(np.array(self.poses))
-            self._surface.arrange(self.activity.active, np.array(self.poses))
+            self._surface.arrange(self.activity.active, np.array([T_new_old @ T for T in self.poses]))
 
     def _between_other_parts(self, loop: Link) -> list[int]:
         """Numbers of the closures between parts that will not be one by this closure either: nothing but one another
@@ -419,15 +414,15 @@ class LoopCloser:
         ends = [(self.parts.of[other.i], self.parts.of[other.j]) for other in self.graph.loops]
         return [k for k, (i, j) in enumerate(ends) if i != j and {i, j} != parts]
 
-    def _bring_together(self, loop: Link) -> None:
-        """Puts the graph's nodes of the younger of two parts to where a loop has them: the optimisation starts near its
+    def _poses_brought_together(self, loop: Link) -> list[np.ndarray]:
+        """All poses [4, 4], those of the younger of two parts where a loop has them: the optimisation starts near its
         end."""
         old, new, T_old_new = loop.i, loop.j, loop.T_i_j
         if self.parts.of[new] < self.parts.of[old]:
             old, new, T_old_new = new, old, inverse(T_old_new)
         T = self.poses[old] @ T_old_new @ inverse(self.poses[new])
-        for k in self.parts.members(new):
-            self.graph.poses[k] = T @ self.graph.poses[k]
+        younger = self.parts.members(new)
+        return [T @ pose if k in younger else pose for k, pose in enumerate(self.poses)]
 
     def _note_joined(self, frame_index: int, old: int, new: int) -> None:
         """Two parts are one."""
@@ -471,7 +466,7 @@ class LoopCloser:
             self._found_at = _moment(frame), old
             self.activity.restart(old)
             self._surface.arrange(self.activity.active)
-            self.events.append(LoopEvent("found again", frame.index, len(self.poses), old, reason))
+            self.events.append(LoopEvent("found again", frame.index, len(self), old, reason))
 
     def target_around(self, keyframe: int) -> GicpTarget:
         """The surface about a keyframe, as `go_on_at` would arrange it."""
@@ -483,12 +478,13 @@ class LoopCloser:
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Places, poses and depths, for a file."""
         return {
-            "poses": np.array(self.poses).reshape(-1, 4, 4), "median_depths": self.activity.median_depths,
+            "poses": self.poses.array(), "median_depths": self.activity.median_depths,
             **{f"places_{name}": values for name, values in self.places.to_arrays().items()},
         }  # fmt: skip
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Takes over what `to_arrays` gave, before any keyframe was added. All of it is put aside until found.
+        """Takes over what `to_arrays` gave, before any keyframe was added; the surface has its own already. All
+        keyframes are put aside until one of them is found.
 
         Raises:
             FormatError: arrays that do not fit together.
@@ -497,16 +493,18 @@ class LoopCloser:
         check_arrays(arrays, forms, "loops")
         places = {name.removeprefix("places_"): a for name, a in arrays.items() if name.startswith("places_")}
         self.places = PlaceIndex.from_arrays(self._camera, places, self.settings.places)
-        for number, (T, depth) in enumerate(zip(arrays["poses"], arrays["median_depths"], strict=True)):
+        if not np.array_equal(arrays["poses"], self.poses.array()):
+            raise FormatError("places and surfaces: not of the same keyframes")
+        for number, (T, depth) in enumerate(zip(self.poses, arrays["median_depths"], strict=True)):
             self.graph.add_node(T)
-            self.revisits.add(inverse(self.poses[-1]) @ T if number else np.eye(4))
+            T_before_this = inverse(self.poses[number - 1]) @ T if number else np.eye(4)
+            self.revisits.add(T_before_this)
             if number:
-                self.graph.add_odometry(number - 1, number, inverse(self.poses[-1]) @ T, SURE_INFORMATION)
-            self.poses.append(T.astype(float))
+                self.graph.add_odometry(number - 1, number, T_before_this, SURE_INFORMATION)
             self.parts.add(number - 1)
             self._taken.append((None, 0))
             self.activity.add(T, float(depth))
-        if not len(self.poses) == len(self.places) == len(self._surface):
+        if not len(self) == len(self.places) == len(self._surface):
             raise FormatError("places, poses and surfaces are not of the same keyframes")
         self.activity.active = set()
 

@@ -91,7 +91,7 @@ class MapCorrections:
 
     def move_world(self, T_new_old: np.ndarray, loops: LoopCloser) -> None:
         """Moves everything [4, 4]; for the end, when nothing is tracked any more."""
-        moves = np.tile(T_new_old, (len(loops.poses), 1, 1))
+        moves = np.tile(T_new_old, (len(loops), 1, 1))
         self._mapper.move_keyframes(moves)
         with self.publishing:
             loops.move_world(T_new_old)

@@ -78,7 +78,7 @@ class MapParts:
             replace(frame, status=TrackingStatus.LOST.value, reason=NOT_JOINED) if k in left else frame
             for k, frame in enumerate(frames)
         ]
-        self._mapper.leave_out(set(range(len(loops.poses))) - kept)
+        self._mapper.leave_out(set(range(len(loops))) - kept)
         first_kept = min(kept)
         if first_kept > 0:  # the world is its first keyframe's camera
             self._corrections.move_world(inverse(self._mapper.keyframes[first_kept].T_world_camera), loops)
@@ -88,7 +88,7 @@ class MapParts:
         if any(keyframe.frame_index == ELSEWHERE for keyframe in self._mapper.keyframes):
             return 0
         located = [frame.keyframe for frame in self._poses.frames if _is_located(frame)]
-        counts = Counter(loops.parts.of[keyframe] for keyframe in located if keyframe < len(loops.poses))
+        counts = Counter(loops.parts.of[keyframe] for keyframe in located if keyframe < len(loops))
         return min(counts, key=lambda part: (-counts[part], part), default=0)
 
     def kept_numbers(self) -> list[int]:

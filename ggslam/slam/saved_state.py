@@ -80,7 +80,7 @@ def check_state(slam: Slam) -> None:
     slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
     if slam.loops is not None:
-        counts += [len(slam.loops.poses), len(slam.loops.places), len(slam.loops.parts.of)]
+        counts += [len(slam.loops), len(slam.loops.places), len(slam.loops.parts.of)]
     if len(set(counts)) > 1:
         raise FormatError(f"numbers of keyframes that do not agree: {counts}")
 

@@ -21,8 +21,9 @@ from ggslam.formats.array_archive import ArrayArchive, Arrays
 from ggslam.geometry.image_parts import is_in_image_part
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
+from ggslam.scene.keyframe_poses import KeyframePoses
 from ggslam.scene.poses import transform_points
-from ggslam.system.array_forms import Form, Pose, PoseForm, check_arrays, check_indices
+from ggslam.system.array_forms import Form, PoseForm, check_arrays, check_indices
 from ggslam.system.savable import savable
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.points import PointSource
@@ -55,16 +56,11 @@ class _Part:
 
     _name: str
     _archive: ArrayArchive | None
-    T_world_camera: Pose
     count: int
     _arrays: Arrays
 
-    def __init__(
-        self, number: int, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray,
-        archive: ArrayArchive | None,
-    ) -> None:  # fmt: skip
+    def __init__(self, number: int, points: np.ndarray, normals: np.ndarray, archive: ArrayArchive | None) -> None:
         self._name, self._archive = f"surface{number:06d}", archive
-        self.T_world_camera = T_world_camera
         self.count = len(points)
         self._arrays = {"points": points, "normals": normals}
         if archive is not None:
@@ -111,7 +107,8 @@ class _Begun:
 @savable(not_saved="_context _archive target finish _helper _begun", after="gather_again", check="check")
 class MeasuredSurface:
     """Keyframes' points gathered into one target, keyframe by keyframe. Which of the keyframes take part can be
-    chosen, and keyframes can be moved: after a loop was closed the surface is where they are.
+    chosen, and keyframes can be moved: after a loop was closed the surface is where they are. Holds the run's
+    `KeyframePoses`.
 
     Args:
         settings: voxel sizes and bounds.
@@ -127,6 +124,8 @@ class MeasuredSurface:
         self.settings = settings
         """May be changed until the first keyframe is in."""
         self._context, self._archive = context, archive
+        self.poses = KeyframePoses()
+        """Of the keyframes; others share them."""
         self._parts = []
         self.finish = True
         """False: the targets' voxels are left without shapes; see `GicpTarget.from_arrays`."""
@@ -144,6 +143,8 @@ class MeasuredSurface:
 
     def check(self) -> None:
         """Raises FormatError if it names keyframes that it does not have: it may come from a file."""
+        if len(self.poses) != len(self):
+            raise FormatError(f"surface: {len(self.poses)} poses of {len(self)} keyframes")
         check_indices("keyframes of the surface", self.active, len(self))
         check_indices("keyframes of the surface", (number for group in self._joined for number in group), len(self))
 
@@ -157,8 +158,8 @@ class MeasuredSurface:
 
         def prepare() -> tuple[_Part, GicpTarget]:
             read = points.read()
-            part = _Part(number, read.points.copy(), read.normals.copy(), T, None)
-            return part, self._gather([part], base)
+            part = _Part(number, read.points.copy(), read.normals.copy(), None)
+            return part, self._gather([(part, T)], base)
 
         self._begun = _Begun(points, T, base, number, self._helper.submit(prepare))
 
@@ -169,6 +170,7 @@ class MeasuredSurface:
         if begun is not None and begun.is_for(points, T_world_camera, self.target, number):
             part, target = begun.result.result()
             self._parts.append(part)
+            self.poses.append(begun.T_world_camera)
             return self._note_joined([number], target)
         read = points.read()
         self._append(read.points.copy(), read.normals.copy(), np.array(T_world_camera, float))
@@ -176,7 +178,7 @@ class MeasuredSurface:
 
     def _join(self, numbers: list[int]) -> GicpTarget:
         """These keyframes take part, too."""
-        return self._note_joined(numbers, self._gather([self._parts[number] for number in numbers], self.target))
+        return self._note_joined(numbers, self._gather(self._parts_with_poses(numbers), self.target))
 
     def _note_joined(self, numbers: list[int], target: GicpTarget) -> GicpTarget:
         self.active |= set(numbers)
@@ -184,39 +186,35 @@ class MeasuredSurface:
         self.target = target
         return target
 
-    def _append(self, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray) -> _Part:
-        part = _Part(len(self._parts), points, normals, T_world_camera, self._archive)
-        self._parts.append(part)
-        return part
+    def _append(self, points: np.ndarray, normals: np.ndarray, T_world_camera: np.ndarray) -> None:
+        self._parts.append(_Part(len(self._parts), points, normals, self._archive))
+        self.poses.append(T_world_camera)
 
-    @property
-    def poses(self) -> np.ndarray:
-        """T_world_camera of the keyframes, float64 [K, 4, 4]."""
-        return np.array([part.T_world_camera for part in self._parts]).reshape(-1, 4, 4)
+    def _parts_with_poses(self, numbers: Iterable[int]) -> list[tuple[_Part, np.ndarray]]:
+        """Keyframes with where they are."""
+        return [(self._parts[number], self.poses[number]) for number in numbers]
 
     def of(self, numbers: Iterable[int]) -> GicpTarget:
         """A target of these keyframes alone."""
-        return self._gather([self._parts[number] for number in numbers], None)
+        return self._gather(self._parts_with_poses(numbers), None)
 
     def points(self, numbers: Iterable[int]) -> np.ndarray:
         """World points float32 [n, 3] of these keyframes."""
-        parts = [self._parts[number] for number in numbers]
-        placed = (transform_points(p.points, p.T_world_camera) for p in parts)
+        placed = (transform_points(part.points, T) for part, T in self._parts_with_poses(numbers))
         return np.concatenate([np.empty((0, 3), np.float32), *placed])
 
     def arrange(self, active: set[int], T_world_camera: np.ndarray | None = None) -> GicpTarget:
         """Chooses the keyframes that take part, and with `T_world_camera` [K, 4, 4] where keyframes are; returns the
         new target. Where keyframes only join, the cost goes with them; else with all that take part."""
         if T_world_camera is not None:
-            for part, T in zip(self._parts, T_world_camera, strict=True):
-                part.T_world_camera = np.array(T, float)
+            self.poses.replace(T_world_camera)
         elif self.target is not None and self.active <= active:
             joining = sorted(active - self.active)
             return self._join(joining) if joining else self.target
         before = self.target if self._archive is None else None  # where memory is short it goes before the next is made
         self.target, self.active, numbers = None, set(active), sorted(active)
         self._joined = [numbers]
-        self.target = self._gather([self._parts[number] for number in numbers], None, before)
+        self.target = self._gather(self._parts_with_poses(numbers), None, before)
         return self.target
 
     def drop_pixels(self, part: np.ndarray, nearest: float, camera: Camera) -> None:
@@ -226,7 +224,7 @@ class MeasuredSurface:
             return
         for number, old in enumerate(self._parts):
             stays = ~is_in_image_part(old.points, part, camera) & (old.points[:, 2] >= nearest)
-            self._parts[number] = _Part(number, old.points[stays], old.normals[stays], old.T_world_camera, None)
+            self._parts[number] = _Part(number, old.points[stays], old.normals[stays], None)
         if self.target is not None:
             self.gather_again()
 
@@ -238,7 +236,7 @@ class MeasuredSurface:
         for number, (part, camera) in parts.items():
             old = self._parts[number]
             stays = ~is_in_image_part(old.points, part, camera)
-            self._parts[number] = _Part(number, old.points[stays], old.normals[stays], old.T_world_camera, None)
+            self._parts[number] = _Part(number, old.points[stays], old.normals[stays], None)
         if self.target is not None:
             self.gather_again()
 
@@ -247,7 +245,7 @@ class MeasuredSurface:
         bit."""
         self.target = None
         for numbers in self._joined:
-            self.target = self._gather([self._parts[number] for number in numbers], self.target)
+            self.target = self._gather(self._parts_with_poses(numbers), self.target)
 
     def points_and_normals(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Points, metres, and normals float32 [n, 3] of a keyframe in its camera's frame."""
@@ -266,7 +264,7 @@ class MeasuredSurface:
             "normals": np.concatenate(
                 [np.empty((0, 3), np.int8)] + [np.rint(p.normals * 127).astype(np.int8) for p in self._parts]
             ),
-            "poses": self.poses,
+            "poses": self.poses.array(),
         }
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
@@ -286,14 +284,16 @@ class MeasuredSurface:
             self._append(q.astype(np.float32) * (r / np.float32(32767)), normals, T.astype(float))
         self.arrange(set(range(len(self._parts))))
 
-    def _gather(self, parts: list[_Part], base: GicpTarget | None, like: GicpTarget | None = None) -> GicpTarget:
-        count = sum(part.count for part in parts)
+    def _gather(
+        self, placed: list[tuple[_Part, np.ndarray]], base: GicpTarget | None, like: GicpTarget | None = None
+    ) -> GicpTarget:
+        count = sum(part.count for part, _ in placed)
         points, quaternions, log_scales = (np.empty((count, width), np.float32) for width in (3, 4, 3))
         begin = 0
-        for part in parts:  # one after the other: there may be far more points than a keyframe has
+        for part, T in placed:  # one after the other: there may be far more points than a keyframe has
             rows, own = slice(begin, begin + part.count), part.points
-            points[rows] = transform_points(own, part.T_world_camera)
-            quaternions[rows] = quaternions_from_normals(part.normals @ part.T_world_camera[:3, :3].T)
+            points[rows] = transform_points(own, T)
+            quaternions[rows] = quaternions_from_normals(part.normals @ T[:3, :3].T)
             log_scales[rows] = np.log(SPACING * own[:, 2])[:, None] + np.log([1.0, 1.0, FLATNESS])
             begin += part.count
         return GicpTarget.from_arrays(

@@ -22,6 +22,7 @@ HERE = Path(__file__).parents[2]
 PACKAGE = HERE / "ggslam"
 sys.path[:0] = [str(HERE), str(HERE / "tests"), str(HERE / "scripts" / "tools")]
 
+import growth  # noqa: E402
 import one_door  # noqa: E402
 import test_imports as plan  # noqa: E402
 
@@ -79,7 +80,7 @@ def circles() -> list[str]:
 
 
 PURPOSES = {
-    "SLAM": "slam tracking mapping loops movers objects rendering scene geometry features native cuda",
+    "SLAM": "sight slam tracking mapping loops movers objects rendering scene geometry features native cuda",
     "recordings, files and stores": "sequences formats coding runs submaps system interface errors __init__ __main__",
     "work on finished runs": "jobs localization merging changes volumes evaluation viewer reporting",
     "command line": "cli",
@@ -209,6 +210,8 @@ def main() -> None:
         "functions named by a bare participle": [place for place, node in found if is_bare_participle(node.name)],
         "raw read_json outside records": raw_json_reads(),
         "files read past the door": strays()[0],
+        "numbers named outside settings": list(growth.constants()),
+        **{f"files that one more {kind} touches": files for kind, files in growth.files_touched().items()},
     }
     print()
     for what, names in counted.items():
@@ -216,6 +219,8 @@ def main() -> None:
         if arguments.names and names:
             print("\n".join(f"    {name}" for name in names))
     print(f"{'words in the README':40} {len((HERE / 'README.md').read_text().split())}")
+    print(f"{'words in the docs':40} {growth.words_of_docs()}")
+    print(f"{'longest subject of a commit':40} {len(growth.longest_subject())}")
     if arguments.suite:
         print(f"{'minutes of the tests':40} {suite_minutes():.1f}")
 

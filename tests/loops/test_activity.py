@@ -75,7 +75,7 @@ def test_correction_moves_them() -> None:
     keyframes = walked(1.0)
     shifted = np.stack([looking_out(2 * np.pi * k / 120) for k in range(120)])
     shifted[:, :3, 3] += 100.0
-    keyframes.move(shifted)
+    keyframes.poses.replace(shifted)
     keyframes.add(shifted[0], DEPTH)
     keyframes.activate_around(0)
     assert 0 in keyframes.active
