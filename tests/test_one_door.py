@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that came from elsewhere are read through `ggslam/system/foreign.py` only."""
+"""Files that came from elsewhere are read through `ggslam/system/untrusted_files.py` only."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_all_files_come_in_by_the_door() -> None:
         "def f():\n    def g():\n        return path.read_bytes()",
         "class A:\n    def f(self):\n        open(self.path)",
         "with elsewhere(path) as file:\n    np.load(file)",
-        "def f():\n    with open_foreign(p) as file:\n        pass\ndef g():\n    np.load(file)",
+        "def f():\n    with open_untrusted(p) as file:\n        pass\ndef g():\n    np.load(file)",
     ],
 )  # fmt: skip
 def test_a_planted_read_is_found(source: str) -> None:
@@ -51,10 +51,10 @@ def _is_read(line: str) -> bool:
     [
         "open(path, 'wb')", "temporary.open('xb')", "with path.open('wb') as log: pass", "RunFolder.open(path)",
         "request.open()", "zipfile.ZipFile(path, 'w')", "np.frombuffer(data)", "data.decode()",
-        "def f():\n    with open_foreign(p) as file:\n        np.load(file)",
+        "def f():\n    with open_untrusted(p) as file:\n        np.load(file)",
         "def f():\n    with open_zip(p) as archive, archive.open('a') as member:\n        member.read()",
         "def f(file: IO[bytes]):\n    zipfile.ZipFile(file)",
-        "def f():\n    file = open_foreign(p)\n    zipfile.ZipFile(file)",
+        "def f():\n    file = open_untrusted(p)\n    zipfile.ZipFile(file)",
     ],
 )  # fmt: skip
 def test_what_is_no_read_by_name_is_not(source: str) -> None:
@@ -62,5 +62,5 @@ def test_what_is_no_read_by_name_is_not(source: str) -> None:
 
 
 def test_an_allowance_is_for_one_function() -> None:
-    read = one_door.Read("ggslam.system.foreign:elsewhere", 1, "os.open")
+    read = one_door.Read("ggslam.system.untrusted_files:elsewhere", 1, "os.open")
     assert one_door.strays([read])[0] == [str(read)]

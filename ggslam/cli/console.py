@@ -26,7 +26,7 @@ from rich.text import Text
 
 from ggslam.cli.argument_names import with_options
 from ggslam.errors import plain
-from ggslam.system.foreign import printable
+from ggslam.system.untrusted_files import printable
 
 _NO_TERMINAL = 100_000
 """Columns of what is no terminal: a log or a pipe has no width to wrap lines at."""

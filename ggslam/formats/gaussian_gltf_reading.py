@@ -23,7 +23,7 @@ from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
 from ggslam.formats.spz_reading import spz_columns
 from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.system.foreign import MAX_TEXT_BYTES, member, open_foreign, read_foreign
+from ggslam.system.untrusted_files import MAX_TEXT_BYTES, member, open_untrusted, read_untrusted
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz_2"
@@ -100,7 +100,7 @@ def read_gaussian_gltf(path: Path) -> tuple[SplatColumns, dict[int, str] | None]
 
 
 def _open(path: Path) -> _Document:
-    data = read_foreign(path)
+    data = read_untrusted(path)
     binary = b""
     if data[:4] == b"glTF":
         version, total, length, kind = struct.unpack_from("<4xIII4s", data)
@@ -125,7 +125,7 @@ def _buffer(path: Path, buffer: dict[str, Any], binary: bytes) -> bytes:
         return binary
     if str(uri).startswith("data:"):
         return base64.b64decode(str(uri).partition(",")[2], validate=True)
-    return read_foreign(member(path.parent, str(uri)))
+    return read_untrusted(member(path.parent, str(uri)))
 
 
 def _primitives(gltf: dict[str, Any]) -> list[tuple[np.ndarray, dict[str, Any], dict[str, Any]]]:
@@ -203,7 +203,7 @@ def _is_gltf_of_splats(path: Path, head: bytes) -> bool:
     if head[:4] != b"glTF" and path.suffix.lower() != ".gltf":
         return False
     try:
-        with open_foreign(path) as file:
+        with open_untrusted(path) as file:
             length = struct.unpack_from("<I", file.read(20), 12)[0] if head[:4] == b"glTF" else 0
             file.seek(20 if head[:4] == b"glTF" else 0)
             text = file.read(min(length, 64 << 20) if length else 64 << 20)

@@ -15,7 +15,7 @@ from ggslam.formats.gaussian_usd import USD_ENDINGS, usd_package
 from ggslam.formats.splat_columns import UPRIGHT, SplatColumns
 from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
-from ggslam.system.foreign import member, open_foreign
+from ggslam.system.untrusted_files import member, open_untrusted
 
 _MOST_LAYERS = 1000
 _Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -29,7 +29,7 @@ def read_gaussian_usd(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
         FormatError: it is damaged, or holds no Gaussians.
         MissingDependency: usd-core is not installed or too old.
     """
-    open_foreign(path).close()
+    open_untrusted(path).close()
     pxr = usd_package(path, "read")
     try:
         _check_layers(pxr, path)
@@ -71,7 +71,7 @@ def _check_layers(pxr: ModuleType, path: Path) -> None:
         if len(seen) > _MOST_LAYERS:
             raise ValueError(f"it has more than {_MOST_LAYERS} layers")
         if not pxr.Ar.IsPackageRelativePath(name):  # a layer inside a .usdz is in a file that was looked at
-            open_foreign(member(path.parent, name)).close()
+            open_untrusted(member(path.parent, name)).close()
         layer = pxr.Sdf.Layer.FindOrOpen(name)
         if layer is None:
             raise ValueError(f"no layer of OpenUSD: {name}")

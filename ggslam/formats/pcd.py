@@ -18,7 +18,7 @@ from ggslam.formats import lzf
 from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.atomic import write_bytes
-from ggslam.system.foreign import open_foreign, read_foreign
+from ggslam.system.untrusted_files import open_untrusted, read_untrusted
 
 _MAXIMUM_HEADER_BYTES = 1 << 16
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
@@ -42,7 +42,7 @@ def read_pcd(path: str | Path) -> np.ndarray:
         FormatError: the file is missing, no PCD file, cut off or damaged; names file and reason.
     """
     path = Path(path)
-    return parse_pcd(read_foreign(path), path)
+    return parse_pcd(read_untrusted(path), path)
 
 
 def parse_pcd(data: bytes, path: str | Path) -> np.ndarray:
@@ -68,7 +68,7 @@ def read_viewpoint(path: str | Path) -> np.ndarray | None:
         FormatError: the file is missing, no PCD file, or the pose is none; names file and reason.
     """
     path = Path(path)
-    with open_foreign(path) as file:
+    with open_untrusted(path) as file:
         lines, _ = _header_lines(file.read(_MAXIMUM_HEADER_BYTES), path)
     words = lines.get("VIEWPOINT")
     if words is None:

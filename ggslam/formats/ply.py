@@ -17,7 +17,7 @@ from ggslam.errors import FormatError, InputError
 from ggslam.formats.ply_header import FORMATS, PLY_NAMES, SIZED_NAMES, Element, Header, read_header
 from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.system.atomic import atomic_write
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def read_ply(path: str | Path) -> PlyFile:
     """
     path = Path(path)
     try:
-        with open_foreign(path) as file:
+        with open_untrusted(path) as file:
             header = read_header(file, path)
             if header.encoding == "ascii":
                 elements = _read_ascii(file, header, path)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.ply_header import FORMATS, read_header
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 
 class PlyRows:
@@ -26,7 +26,7 @@ class PlyRows:
     def __init__(self, path: Path, element: str) -> None:
         self.path = path
         try:
-            with open_foreign(path) as file:
+            with open_untrusted(path) as file:
                 header = read_header(file, path)
         except OSError as error:
             raise FormatError(f"cannot read {path}: {error.strerror or error}") from error
@@ -48,7 +48,7 @@ class PlyRows:
         """
         try:
             offset = self._begin + start * self._stored.itemsize
-            with open_foreign(self.path) as file:
+            with open_untrusted(self.path) as file:
                 file.seek(offset)
                 rows = np.fromfile(file, self._stored, count)
         except OSError as error:

@@ -23,7 +23,7 @@ from ggslam.formats.positions import placed_rows
 from ggslam.formats.voxel_cloud import join_clouds
 from ggslam.formats.writer import SurfacePoints, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 COLORS = ("red", "green", "blue")
 _COLOR_NAMES = (COLORS, ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -81,7 +81,7 @@ def read_point_cloud(path: str | Path, tell: bool = True) -> ColoredCloud:
     """
     path = Path(path)
     try:
-        with open_foreign(path) as file:
+        with open_untrusted(path) as file:
             start = file.read(4)
     except OSError as error:
         raise FormatError(f"cannot read {path}: {error.strerror or error}") from error

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.system.foreign import read_foreign
+from ggslam.system.untrusted_files import read_untrusted
 
 _WIDEST = 8
 _LOOKED_AT = 1 << 20
@@ -49,7 +49,7 @@ def read_raw_points(path: str | Path, columns: int | None = None) -> np.ndarray:
 
 
 def _whole_numbers(path: Path) -> bytes:
-    data = read_foreign(path)
+    data = read_untrusted(path)
     if len(data) % 4:
         raise FormatError(f"{path}: {len(data)} bytes, expected a multiple of 4 (float32 numbers)")
     return data

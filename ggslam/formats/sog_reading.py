@@ -24,8 +24,8 @@ from ggslam.formats.sog import LARGEST_COUNT, META
 from ggslam.formats.splat_columns import SplatColumns, check_count
 from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
-from ggslam.system.foreign import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, is_plain_name, member, read_foreign
 from ggslam.system.images import claimed_size, decode_image
+from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, is_plain_name, member, read_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, open_zip, read_member
 
 LEVELS = "lod-meta.json"
@@ -47,7 +47,7 @@ def read_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
     """
     try:
         if path.name.lower() == META:
-            return _decode(lambda name, limit: read_foreign(member(path.parent, _plain(name)), limit))
+            return _decode(lambda name, limit: read_untrusted(member(path.parent, _plain(name)), limit))
         with open_zip(path) as archive:
             inner = {Path(info.filename).name: info for info in archive.infolist()}
 
@@ -62,7 +62,7 @@ def read_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
 def read_streamed_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
     """The finest level of a streamed SOG, of which `path` is the index; see `read_sog`."""
     try:
-        index = json.loads(read_foreign(path, MAX_TEXT_BYTES))
+        index = json.loads(read_untrusted(path, MAX_TEXT_BYTES))
         pieces: set[tuple[int, int, int]] = set()
         waiting = [index["tree"]]
         while waiting:

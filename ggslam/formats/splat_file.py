@@ -21,7 +21,7 @@ from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.system.atomic import atomic_write
-from ggslam.system.foreign import read_foreign
+from ggslam.system.untrusted_files import read_untrusted
 
 SPLAT_ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 """One Gaussian as it is stored."""
@@ -67,7 +67,7 @@ def read_splat(path: Path) -> SplatColumns:
     Raises:
         FormatError: it is missing, empty, or no whole number of Gaussians long.
     """
-    data = read_foreign(path)
+    data = read_untrusted(path)
     if not data or len(data) % SPLAT_ROW.itemsize:
         raise FormatError(f"{path}: {len(data)} bytes are no whole number of Gaussians of {SPLAT_ROW.itemsize} bytes")
     rows = np.frombuffer(data, SPLAT_ROW)

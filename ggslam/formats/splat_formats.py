@@ -10,7 +10,7 @@ from ggslam.formats.splat_reader import Names, SplatFile, SplatReader
 from ggslam.formats.table import readers, splat_writer
 from ggslam.formats.writer import Splats
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 
 def splat_format(path: str | Path) -> SplatReader | None:
@@ -22,7 +22,7 @@ def splat_format(path: str | Path) -> SplatReader | None:
     if found is None:
         return None
     try:
-        with open_foreign(found) as file:
+        with open_untrusted(found) as file:
             head = file.read(16)
     except (FormatError, OSError):
         return None

@@ -15,7 +15,7 @@ from ggslam.formats.gaussian_rows import GaussianRows, GaussiansInMemory
 from ggslam.formats.ply_header import read_header
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_repair import SplatFaults, map_of_columns, mend
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 Names = dict[int, str]
 """Names of objects by id, empty where an object has none."""
@@ -74,6 +74,6 @@ def properties_of_ply(path: Path, head: bytes) -> set[str]:
     """
     if head[:3] != b"ply":
         return set()
-    with open_foreign(path) as file:
+    with open_untrusted(path) as file:
         elements = {element.name: element for element in read_header(file, path).elements}
     return {p.name for p in elements["vertex"].properties} if "vertex" in elements else set()

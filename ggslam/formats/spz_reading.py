@@ -21,7 +21,7 @@ from ggslam.formats.optional_package import package_for
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
-from ggslam.system.foreign import read_foreign
+from ggslam.system.untrusted_files import read_untrusted
 
 MAGIC = b"NGSP"
 _HEADER = 16
@@ -37,7 +37,7 @@ def read_spz(path: Path) -> SplatColumns:
         FormatError: it is damaged, of another version, or expands to more than it may.
         MissingDependency: it is of version 4, and zstandard is not installed.
     """
-    return spz_columns(path, read_foreign(path))
+    return spz_columns(path, read_untrusted(path))
 
 
 def spz_columns(path: Path, data: bytes) -> SplatColumns:

@@ -11,10 +11,10 @@ from ggslam.formats import (
     colmap,
     compressed_ply,
     compressed_ply_reading,
-    foreign_ply,
     gaussian_gltf,
     gaussian_gltf_reading,
     gaussian_ply,
+    gaussian_ply_reading,
     gaussian_usd,
     gaussian_usd_reading,
     mesh_files,
@@ -42,7 +42,7 @@ class Format:
 
 
 FORMATS: tuple[Format, ...] = (
-    Format(gaussian_ply.WRITER, foreign_ply.READER),
+    Format(gaussian_ply.WRITER, gaussian_ply_reading.READER),
     Format(gaussian_ply.SEGMENTED),
     Format(mesh_files.WRITER),
     Format(compressed_ply.WRITER, compressed_ply_reading.READER),

@@ -23,7 +23,7 @@ from ggslam.formats.writer import Takes, Writer
 from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalize, quaternion_to_matrix
 from ggslam.system.atomic import write_text
 from ggslam.system.clock_units import EPOCH_DIGITS, UNITS
-from ggslam.system.foreign import read_foreign_text
+from ggslam.system.untrusted_files import read_untrusted_text
 
 _G2O_TAGS = ("VERTEX_", "EDGE_", "PARAMS_", "FIX")
 _VERTEX = "VERTEX_SE3:QUAT"
@@ -128,7 +128,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
         FormatError: as `read_tum` and `read_matrices`.
     """
     path = Path(path)
-    for line in read_foreign_text(path).splitlines():
+    for line in read_untrusted_text(path).splitlines():
         content = line.split("#", 1)[0].strip()
         if not content:
             continue
@@ -170,7 +170,7 @@ def _quaternion_order(path: Path) -> list[int]:
 
 def _head(path: Path) -> str:
     """The first line of a table if it has names, else nothing."""
-    first = read_foreign_text(path).lstrip().split("\n", 1)[0].lstrip("# ")
+    first = read_untrusted_text(path).lstrip().split("\n", 1)[0].lstrip("# ")
     return "" if first[:1].isdigit() else first
 
 
@@ -181,7 +181,7 @@ def read_g2o(path: str | Path) -> Trajectory:
         FormatError: as `read_tum`, or two poses of one number.
     """
     found: dict[int, np.ndarray] = {}
-    for number, line in enumerate(read_foreign_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_untrusted_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
         if not words or words[0] != _VERTEX:
             continue
@@ -204,7 +204,7 @@ def _rows(
 ) -> Iterator[tuple[str, np.ndarray]]:
     """("file, line n", numbers) of each line with content; the number of columns must be one of `columns` (None: any);
     `between`: what stands between them, None: space. The names above a table are passed over."""
-    for number, line in enumerate(read_foreign_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_untrusted_text(path).splitlines(), start=1):
         words = line.split("#", 1)[0].split(between)
         if not "".join(words).strip() or (number == 1 and between == "," and words[0].strip()[:1].isalpha()):
             continue

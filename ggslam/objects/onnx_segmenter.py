@@ -11,8 +11,8 @@ import numpy as np
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.objects.mask_painting import distinct_masks, paint_segments
 from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Letterbox, MaskCandidates, mask_candidates, yolo_candidates
-from ggslam.system.foreign import open_foreign
 from ggslam.system.settings import setting, settings_class, tuning_class
+from ggslam.system.untrusted_files import open_untrusted
 
 IMAGENET_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
 IMAGENET_DEVIATION = np.array((0.229, 0.224, 0.225), np.float32)
@@ -154,7 +154,7 @@ def _open_session(path: Path, threads: int) -> Any:
         raise MissingDependency(
             f"to segment with {path} the package onnxruntime is needed: `pip install 'ggslam[masks]'` ({error})"
         ) from None
-    open_foreign(path, ConfigError).close()
+    open_untrusted(path, ConfigError).close()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads

@@ -24,8 +24,8 @@ from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.object_names import object_label
 from ggslam.scene.oriented_box import OrientedBox, Vector
 from ggslam.system.atomic import write_text
-from ggslam.system.foreign import read_foreign_text
 from ggslam.system.savable import savable
+from ggslam.system.untrusted_files import read_untrusted_text
 
 Supervision = Literal["masks", "associated masks", "geometry", "model"]
 """Where the ids came from: masks whose ids are constant in time; masks made consistent by association; the geometric
@@ -236,7 +236,7 @@ class ObjectTable:
             FormatError: missing, no JSON, or not as `save` writes it; the message names the object and the field.
         """
         try:
-            values = json.loads(read_foreign_text(path))
+            values = json.loads(read_untrusted_text(path))
             table = pydantic.TypeAdapter(ObjectTable).validate_python(values)
         except pydantic.ValidationError as error:
             first = error.errors()[0]

@@ -57,9 +57,9 @@ from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config, config_from_dict
 from ggslam.slam.result import SlamResult
 from ggslam.system.folder_lock import LOCK_FILE, refuse_other_writers
-from ggslam.system.foreign import printable, read_foreign_text, refuse_links
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.staging import finish_saving, is_being_saved, leftovers, refuse_links_at
+from ggslam.system.untrusted_files import printable, read_untrusted_text, refuse_links
 
 MARKER = RunRecord.FILE
 """Is there if and only if a folder is a run of ggslam."""
@@ -313,7 +313,7 @@ class RunFolder:
         """The settings of the run."""
         path = self.path / "config.yaml"
         try:
-            return config_from_dict(parse_yaml(read_foreign_text(path, RunFolderError)), str(path))
+            return config_from_dict(parse_yaml(read_untrusted_text(path, RunFolderError)), str(path))
         except PlainYamlError as error:
             raise RunFolderError(f"{path}: cannot be read: {error}") from None
 

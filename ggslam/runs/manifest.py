@@ -12,7 +12,7 @@ from pathlib import Path
 from ggslam.errors import RunFolderError
 from ggslam.runs.checkpoints import FOLDER as CHECKPOINTS
 from ggslam.runs.records.mark import FileRecord, RunRecord
-from ggslam.system.foreign import is_plain_name, open_foreign
+from ggslam.system.untrusted_files import is_plain_name, open_untrusted
 
 Files = dict[str, FileRecord]
 
@@ -78,7 +78,7 @@ def files_in(folder: Path, below: Iterable[str] | None = None) -> Files:
 def sum_of(path: Path) -> str:
     """SHA-256 of a file."""
     found = hashlib.sha256()
-    with open_foreign(path, RunFolderError) as file:
+    with open_untrusted(path, RunFolderError) as file:
         while block := file.read(1 << 20):
             found.update(block)
     return found.hexdigest()

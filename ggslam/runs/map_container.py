@@ -64,8 +64,8 @@ from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.packed_arrays import pack_arrays, pack_bytes, unpack_arrays, unpack_bytes
 from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
-from ggslam.system.foreign import read_foreign
 from ggslam.system.hidden_folder import hidden_beside
+from ggslam.system.untrusted_files import read_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, open_zip
 
 SUFFIX = ".ggz"
@@ -133,8 +133,8 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
         make_folder(folder_of_stream)
         stream = folder_of_stream / MAP
         count, notes = _encode_map(rows, births, with_objects, rate, settings, stream)
-        members = dict(_smallest(n, read_foreign(folder.path / n)) for n in names)
-        members |= {_PLACES: pack_arrays(places), MAP: read_foreign(stream)}
+        members = dict(_smallest(n, read_untrusted(folder.path / n)) for n in names)
+        members |= {_PLACES: pack_arrays(places), MAP: read_untrusted(stream)}
         head = ContainerRecord(
             format=CONTAINER_FORMAT, version=CONTAINER_VERSION, ggslam=__version__, gaussians=count, rate=rate,
             files={n: FileRecord(bytes=len(b), sha256=hashlib.sha256(b).hexdigest()) for n, b in members.items()},

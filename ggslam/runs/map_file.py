@@ -37,7 +37,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config
-from ggslam.system.foreign import open_foreign, printable, read_foreign
+from ggslam.system.untrusted_files import open_untrusted, printable, read_untrusted
 
 VIEWS = 24
 """Cameras around a map without a recording."""
@@ -204,9 +204,9 @@ def open_map(path: str | Path) -> RunFolder:
 
 def _of_stream(path: Path) -> SplatFile:
     """The Gaussians of a G-PCC stream."""
-    open_foreign(path).close()
+    open_untrusted(path).close()
     try:
-        cloud = decode_in_parts(read_foreign(path), None)
+        cloud = decode_in_parts(read_untrusted(path), None)
         if not is_splat_cloud(cloud.like):
             raise FormatError("is a stream of points, not of Gaussians")
         like = gaussians_of(cloud.like)

@@ -24,8 +24,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.atomic import write_text
-from ggslam.system.foreign import read_foreign_text
 from ggslam.system.process_memory import release_early
+from ggslam.system.untrusted_files import read_untrusted_text
 
 MAP_INDEX = "map_cells.json"
 _VERSION = 1
@@ -74,7 +74,7 @@ class MapIndex:
             FormatError: it is missing, damaged or of another version.
         """
         try:
-            values = json.loads(read_foreign_text(path))
+            values = json.loads(read_untrusted_text(path))
             if values["version"] != _VERSION:
                 raise ValueError(f"version {values['version']}, this program reads version {_VERSION}")
             columns = [np.array([row[name] for row in values["cells"]]) for name in ("start", "count", "low", "high")]

@@ -19,8 +19,8 @@ from ggslam.sequences.joined import JoinedPart, JoinedSequence
 from ggslam.sequences.live import LiveSequence, is_live, open_live
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sequences.rig import RigSequence
-from ggslam.system.foreign import read_foreign
 from ggslam.system.json_files import json_ready
+from ggslam.system.untrusted_files import read_untrusted
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def identity_of(sequence: Sequence) -> dict[str, Any]:
 
 def fingerprint(folder: RunFolder) -> str:
     """Tells a run from another one in the same folder."""
-    return hashlib.sha256(read_foreign(folder.path / "keyframes.json", error=RunFolderError)).hexdigest()
+    return hashlib.sha256(read_untrusted(folder.path / "keyframes.json", error=RunFolderError)).hexdigest()
 
 
 def request_in(record: OpenRecord, path: Path | None = None, masks: Path | None = None) -> SequenceRequest:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ggslam.errors import FormatError, GgslamError
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, check_zip, open_zip
 
 T = TypeVar("T")
@@ -40,7 +40,7 @@ def read_array(path: str | Path, error: type[GgslamError] = FormatError) -> np.n
     Raises:
         error: missing, no array of numbers, or damaged; a header that claims more than the file holds included.
     """
-    with open_foreign(path, error) as file:
+    with open_untrusted(path, error) as file:
         try:
             shape, _, dtype = _read_header(file)
             if dtype.hasobject:
@@ -101,7 +101,7 @@ class _Member:
 
 
 def _read(path: str | Path, content: str, chosen: Callable[[Any], T]) -> T:
-    with open_foreign(path) as file:
+    with open_untrusted(path) as file:
         return arrays_of(file, f"{path}: not {content} written by ggslam", chosen)
 
 

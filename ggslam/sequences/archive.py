@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.system.foreign import MAX_IMAGE_BYTES, open_foreign
+from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, open_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, check_zip, read_member
 
 
@@ -26,7 +26,7 @@ class Archive:
     def __init__(self, path: Path) -> None:
         """Raises SequenceError if the file is no whole zip archive."""
         self.path = path
-        file = open_foreign(path, SequenceError)
+        file = open_untrusted(path, SequenceError)
         try:
             self._zip = zipfile.ZipFile(file)
             check_zip(self._zip)

@@ -16,7 +16,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 LARGEST_TABLE = 1 << 26
 """Bytes of a table; what a damaged file may claim is not believed beyond."""
@@ -29,7 +29,7 @@ def count_hidden_frames(path: Path) -> int:
     """Frames of the first video track that come before the beginning of its edit list; 0 without one, and for files
     that are no MP4."""
     try:
-        with open_foreign(path, SequenceError) as file:
+        with open_untrusted(path, SequenceError) as file:
             return _count_hidden(file, os.fstat(file.fileno()).st_size)
     except (OSError, struct.error, ValueError, SequenceError):
         return 0

@@ -39,7 +39,7 @@ from ggslam.sequences.rig import NAME as RIG
 from ggslam.sequences.rig import open_rig
 from ggslam.sequences.rig_file import find_rig_file
 from ggslam.sequences.sequence import OnBadFrame, Sequence
-from ggslam.system.foreign import given_path, refuse_links
+from ggslam.system.untrusted_files import given_path, refuse_links
 
 FORMATS: tuple[RecordingFormat, ...] = (
     SyntheticFormat(),

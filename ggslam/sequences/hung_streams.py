@@ -13,7 +13,7 @@ from ggslam.sequences.glances import Glance, glance_of
 from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.verdicts import Verdict
-from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
+from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, read_untrusted
 
 FEWEST = 4
 """Frames that hold one image, from which a stream hangs: cameras of other rates repeat images once or twice."""
@@ -180,6 +180,6 @@ def _size(file: ImageFile) -> int | None:
 
 def _read(file: ImageFile) -> bytes | None:
     try:
-        return read_foreign(file, MAX_IMAGE_BYTES, SequenceError) if isinstance(file, Path) else None
+        return read_untrusted(file, MAX_IMAGE_BYTES, SequenceError) if isinstance(file, Path) else None
     except SequenceError:
         return None

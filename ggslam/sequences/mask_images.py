@@ -14,8 +14,8 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.images import describe_channels
-from ggslam.system.foreign import open_foreign
 from ggslam.system.images import MAX_PIXELS, PNG_SIGNATURE, decode_image, read_image_bytes
+from ggslam.system.untrusted_files import open_untrusted
 
 MaskKind = Literal["grey", "palette", "RGB"]
 
@@ -51,7 +51,7 @@ class MaskImage:
 def mask_kind(path: Path) -> MaskKind | None:
     """How a file holds its ids, by its first bytes; None when it is no PNG or cannot be read."""
     try:
-        with open_foreign(path, SequenceError) as file:
+        with open_untrusted(path, SequenceError) as file:
             header = file.read(_HEADER_SIZE)
     except (OSError, SequenceError):
         return None

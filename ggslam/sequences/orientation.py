@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ggslam.errors import SequenceError
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 HEAD = 1 << 16
 """Bytes at the beginning of a file that are looked at: the tag comes before the picture."""
@@ -26,7 +26,7 @@ def orientation_of(file: object) -> int:
     if not isinstance(file, Path) or file.suffix.lower() not in (".jpg", ".jpeg"):
         return 1
     try:
-        with open_foreign(file, SequenceError) as opened:
+        with open_untrusted(file, SequenceError) as opened:
             return orientation_in(opened.read(HEAD))
     except (OSError, SequenceError):
         return 1

@@ -15,7 +15,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.depth_kind import PLAIN, DepthKind
-from ggslam.system.foreign import read_foreign_text
+from ggslam.system.untrusted_files import read_untrusted_text
 
 T = TypeVar("T")
 
@@ -365,7 +365,7 @@ def read_text(path: Path) -> str:
     Raises:
         SequenceError: missing, unreadable, too large or not text.
     """
-    return read_foreign_text(path, SequenceError)
+    return read_untrusted_text(path, SequenceError)
 
 
 def select(path: Path, count: int, start: int, stop: int | None, stride: int) -> range:

@@ -13,7 +13,7 @@ from ggslam.errors import SequenceError
 from ggslam.sequences.images import read_color
 from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
-from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
+from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, read_untrusted
 
 PLACES, LENGTH = 3, 9
 """Where in a recording one looks, and how many successive frames there."""
@@ -70,7 +70,7 @@ def _is_blank(file: ImageFile) -> bool:
 def _alike(a: ImageFile, b: ImageFile) -> bool:
     """Whether two images are the same: files by their bytes, others by their pixels."""
     if isinstance(a, Path) and isinstance(b, Path):
-        return a == b or read_foreign(a, MAX_IMAGE_BYTES, SequenceError) == read_foreign(
+        return a == b or read_untrusted(a, MAX_IMAGE_BYTES, SequenceError) == read_untrusted(
             b, MAX_IMAGE_BYTES, SequenceError
         )
     if isinstance(a, Path) or isinstance(b, Path):

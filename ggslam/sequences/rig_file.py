@@ -33,8 +33,8 @@ from ggslam.errors import SequenceError
 from ggslam.sequences.association import TOLERANCE
 from ggslam.sequences.calibration import number_entry, transform_entry
 from ggslam.sequences.recording import read_text
-from ggslam.system.foreign import given_path
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml, repeated_key
+from ggslam.system.untrusted_files import given_path
 
 FILE = "rig.yaml"
 """The file of a rig in a folder of its own."""

@@ -13,8 +13,8 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.edit_list import count_hidden_frames
 from ggslam.sequences.recording import NumberedImage
-from ggslam.system.foreign import open_foreign
 from ggslam.system.images import MAX_PIXELS
+from ggslam.system.untrusted_files import open_untrusted
 
 FORWARD = 90
 """So many frames are decoded and dropped rather than sought past: seeking starts at a key frame anyway."""
@@ -41,7 +41,7 @@ class Video:
         self.rate = float(self._capture.get(cv2.CAP_PROP_FPS)) or 30.0
 
     def _open(self) -> cv2.VideoCapture:
-        open_foreign(self.path, SequenceError).close()
+        open_untrusted(self.path, SequenceError).close()
         # The orientation tag is ignored: depth and calibration refer to the pixels as stored.
         capture = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)

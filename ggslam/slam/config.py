@@ -25,10 +25,10 @@ from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.object_masks import MaskSettings
 from ggslam.submaps.paging_settings import PagingSettings
 from ggslam.system.atomic import write_text
-from ggslam.system.foreign import given_path, read_foreign_text
 from ggslam.system.overrides import with_overrides
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.settings import changed_tuning, setting, settings_class, tuning_class, tuning_note, walk
+from ggslam.system.untrusted_files import given_path, read_untrusted_text
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
 from ggslam.tracking.keyframes import KeyframeSettings
 from ggslam.tracking.settings import TrackerSettings
@@ -219,7 +219,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         if not path.exists():
             raise ConfigError(f"{path}: no such file, nor a preset (presets: {', '.join(presets())})")
-        values = parse_yaml(read_foreign_text(path, ConfigError))
+        values = parse_yaml(read_untrusted_text(path, ConfigError))
     except PlainYamlError as error:
         raise ConfigError(f"{path}: cannot be read as YAML: {error}") from None
     return values if values is not None else {}

@@ -15,9 +15,9 @@ from ggslam.errors import FormatError
 from ggslam.mapping.mapper import LossSums, Mapper, MapperTimes
 from ggslam.slam.result import SlamTimes, StepReport, TrackedFrame
 from ggslam.system.array_forms import Form
-from ggslam.system.foreign import read_foreign_text
 from ggslam.system.process_memory import resident_bytes
 from ggslam.system.savable import savable
+from ggslam.system.untrusted_files import read_untrusted_text
 
 STEPS_FILE = "steps.csv"
 _PARTS = ("insertion", "forward", "loss", "backward", "identity")
@@ -104,7 +104,7 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
     Raises:
         FormatError: it cannot be read, or a row has another number of columns than the header.
     """
-    lines = read_foreign_text(path).splitlines()
+    lines = read_untrusted_text(path).splitlines()
     names = lines[0].split(",") if lines else []
     rows = [line.split(",") for line in lines[1:]]
     for number, row in enumerate(rows, start=2):

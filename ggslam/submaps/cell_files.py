@@ -23,8 +23,8 @@ import numpy as np
 from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.system.atomic import write_failure
-from ggslam.system.foreign import read_foreign
 from ggslam.system.links import refuse_link, refuse_shared_file
+from ggslam.system.untrusted_files import read_untrusted
 
 _WAITING_THREADS = 8
 _CELL = re.compile(r"(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})", re.ASCII)
@@ -202,7 +202,7 @@ def _content(path: Path, size: int) -> bytes:
     if stat.S_ISREG(found.st_mode) and found.st_size != size:  # before it is read: it may be a huge file of holes
         raise FormatError(f"{path}: damaged: {found.st_size} bytes, the index says {size}")
     try:
-        return read_foreign(path)
+        return read_untrusted(path)
     except FormatError:
         path.lstat()
         raise

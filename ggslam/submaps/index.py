@@ -72,7 +72,7 @@ class CellIndex:
         """Opens an index and reads its settings.
 
         Raises:
-            FormatError: there is none, it is foreign, damaged or of another version.
+            FormatError: there is none, it is not an index, damaged or of another version.
             RunFolderError: the operating system does not let it be opened.
         """
         if not path.is_file():

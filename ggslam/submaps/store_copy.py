@@ -17,8 +17,8 @@ from ggslam.submaps.index import CellIndex
 from ggslam.submaps.store_objects import OBJECTS_FILE
 from ggslam.submaps.visit_files import visit_file
 from ggslam.system.atomic import make_folder
-from ggslam.system.foreign import MAX_TEXT_BYTES, copy_foreign
 from ggslam.system.process_memory import most_memory_bytes
+from ggslam.system.untrusted_files import MAX_TEXT_BYTES, copy_untrusted
 
 _TRIES = 20
 """Times that a writer may have replaced files between a look at the index and at them."""
@@ -78,7 +78,7 @@ def _copy_part(source: Path, target: Path, part: PartRecord) -> None:
     size = source.stat().st_size
     try:
         if size == part.bytes:
-            copy_foreign(source, target, limit=min(size, most_memory_bytes()))
+            copy_untrusted(source, target, limit=min(size, most_memory_bytes()))
             return
     except FormatError:
         source.stat()  # removed by a writer meanwhile?
@@ -93,6 +93,6 @@ def _copy_beside(source: Path, target: Path, visits: Sequence[str]) -> list[Path
     for file, copy in known:
         if file.is_file():
             copy.parent.mkdir(exist_ok=True)
-            copy_foreign(file, copy, MAX_TEXT_BYTES)
+            copy_untrusted(file, copy, MAX_TEXT_BYTES)
             written.append(copy)
     return written

@@ -27,7 +27,7 @@ from ggslam.synthetic.scenes import SCENES, SceneKind
 from ggslam.synthetic.sensor import disparity_distortion, noisy_color, noisy_depth
 from ggslam.synthetic.trajectory import camera_path
 from ggslam.system.atomic import write_failure
-from ggslam.system.foreign import MAX_TEXT_BYTES, read_foreign
+from ggslam.system.untrusted_files import MAX_TEXT_BYTES, read_untrusted
 
 DEPTH_SCALE = 5000.0
 LARGEST_DISTORTION = 10.0
@@ -282,7 +282,7 @@ def check_target(target: Path, file: str, overwrite: bool) -> None:
     if not any(target.iterdir()):
         return
     description = target / file
-    generated = description.is_file() and b"generator:" in read_foreign(description, MAX_TEXT_BYTES, SequenceError)
+    generated = description.is_file() and b"generator:" in read_untrusted(description, MAX_TEXT_BYTES, SequenceError)
     if not (overwrite and generated):
         what = "holds a generated recording already" if generated else "is not empty"
         raise SequenceError(f"{target}: {what}; choose another folder")

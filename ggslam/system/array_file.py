@@ -22,8 +22,8 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.system.atomic import write_failure
-from ggslam.system.foreign import open_foreign
 from ggslam.system.links import new_file
+from ggslam.system.untrusted_files import open_untrusted
 
 _MAGIC = b"ggstate1"
 _ALIGNMENT = 64
@@ -135,7 +135,7 @@ def read_array_file(path: Path, expected: WrittenFile | None = None) -> tuple[An
         FormatError: it is missing, damaged or another one than expected.
     """
     try:
-        with open_foreign(path) as file:
+        with open_untrusted(path) as file:
             size = os.fstat(file.fileno()).st_size
             if expected is not None and size != expected.size:
                 raise ValueError(f"expected {expected.size} bytes, found {size}")

@@ -16,8 +16,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ggslam.errors import RunFolderError
-from ggslam.system.foreign import printable
 from ggslam.system.links import refuse_shared_file
+from ggslam.system.untrusted_files import printable
 
 try:
     import fcntl

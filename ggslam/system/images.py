@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from ggslam.errors import FormatError, GgslamError
-from ggslam.system.foreign import MAX_IMAGE_BYTES, read_foreign
 from ggslam.system.opencv import opencv_errors
+from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, read_untrusted
 
 MAX_PIXELS = 100_000_000
 """Of one image: more than any camera of a recording has, and 300 MB in memory."""
@@ -49,7 +49,7 @@ def read_image_bytes(path: Path, error: type[GgslamError] = FormatError) -> byte
     Raises:
         error: missing, truncated, damaged, or not an image.
     """
-    content = read_foreign(path, MAX_IMAGE_BYTES, error)
+    content = read_untrusted(path, MAX_IMAGE_BYTES, error)
     damage = find_damage(content)
     if damage:
         raise error(f"{path}: {damage}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from ggslam.errors import RunFolderError
 from ggslam.system.atomic import write_text
-from ggslam.system.foreign import read_foreign_text
+from ggslam.system.untrusted_files import read_untrusted_text
 
 
 def json_ready(value: Any) -> Any:
@@ -44,7 +44,7 @@ def read_json(path: Path) -> Any:
         RunFolderError: it is missing or damaged.
     """
     try:
-        return json.loads(read_foreign_text(path, RunFolderError))
+        return json.loads(read_untrusted_text(path, RunFolderError))
     except ValueError as error:
         raise RunFolderError(f"{path}: cannot be read: {error}") from None
     except RecursionError:

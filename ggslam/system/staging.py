@@ -22,9 +22,9 @@ from typing import Any
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.system.atomic import is_machine_error, reason_of, write_text
 from ggslam.system.folder_lock import WAIT_S, folder_lock
-from ggslam.system.foreign import is_plain_name, read_foreign_text
 from ggslam.system.links import first_link_in, refuse_link
 from ggslam.system.process_tie import is_running
+from ggslam.system.untrusted_files import is_plain_name, read_untrusted_text
 
 _SAVING = "saving"
 _NAME = re.compile(r"\.staged-(\d+)-[0-9a-f]{8}")
@@ -193,7 +193,7 @@ def _read_saving(marker: Path) -> dict[str, Any] | None:
         RunFolderError: names that `publish` does not write: somebody else wrote them.
     """
     try:
-        record = json.loads(read_foreign_text(marker))[_SAVING]
+        record = json.loads(read_untrusted_text(marker))[_SAVING]
     except (GgslamError, ValueError, KeyError, TypeError, RecursionError):
         return None
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Zip archives that came from elsewhere: opened as `foreign` opens files, members read within a limit."""
+"""Zip archives from untrusted sources: opened like any untrusted file, members read within a limit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ggslam.errors import FormatError, GgslamError
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 PLAIN_WAYS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Ways to pack a member whose reader makes no more than it is asked for; LZMA's and bzip2's make all of it at once."""
@@ -24,10 +24,10 @@ def open_zip(path: str | Path, error: type[GgslamError] = FormatError) -> Iterat
     """A zip archive, open; `ZIP_DAMAGE` says what reading its members raises.
 
     Raises:
-        error: as `open_foreign`.
+        error: as `open_untrusted`.
         BadZipFile, ValueError: no whole archive, or a member is packed in a way that is not read.
     """
-    with open_foreign(path, error) as file, zipfile.ZipFile(file) as archive:
+    with open_untrusted(path, error) as file, zipfile.ZipFile(file) as archive:
         check_zip(archive)
         yield archive
 

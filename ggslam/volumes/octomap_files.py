@@ -22,7 +22,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.system.atomic import write_bytes
-from ggslam.system.foreign import read_foreign
+from ggslam.system.untrusted_files import read_untrusted
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.occupancy_arrays import output_bytes
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
@@ -74,7 +74,7 @@ def read_octomap(
         FormatError: the file is missing, of another kind, cut off, damaged or too large; names file and reason.
     """
     path = Path(path)
-    return decode_octomap(read_foreign(path), str(path), settings, context, memory_limit)
+    return decode_octomap(read_untrusted(path), str(path), settings, context, memory_limit)
 
 
 def decode_octomap(

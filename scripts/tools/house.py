@@ -173,7 +173,7 @@ def raw_json_reads() -> list[str]:
 
 
 def strays() -> tuple[list[str], list[str]]:
-    """Reads of files that do not go through `ggslam/system/foreign.py`, and allowances that nothing needs."""
+    """Reads of files that do not go through `ggslam/system/untrusted_files.py`, and allowances that nothing needs."""
     return one_door.strays([read for n, p in plan.modules().items() for read in one_door.reads_in(n, p.read_text())])
 
 

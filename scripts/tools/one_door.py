@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds reads of files that do not go through the door, `ggslam/system/foreign.py`; a part of house.py.
+"""Finds reads of files that do not go through the door, `ggslam/system/untrusted_files.py`; a part of house.py.
 
-A file that a user or a stranger gave may be a pipe, a device, a folder, or larger than memory. `open_foreign`,
-`read_foreign` and what is built on them (`open_zip`, `read_picture`, `copy_foreign`) know; a plain `open` does not. A
-call that reads from a file which the door opened is fine, and so is writing.
+A file that a user or a stranger gave may be a pipe, a device, a folder, or larger than memory. `open_untrusted`,
+`read_untrusted` and what is built on them (`open_zip`, `read_picture`, `copy_untrusted`) check for that; a plain `open`
+does not. A call that reads from a file which the door opened is fine, and so is writing.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-DOORS = {"open_foreign", "open_zip"}
+DOORS = {"open_untrusted", "open_zip"}
 """Functions that give an open file."""
 OPENED = {"IO", "BinaryIO", "TextIO", "ZipFile"}
 """Types of parameters that are open files."""
@@ -32,7 +32,7 @@ _MODE = re.compile(r"[rwaxbtU+]{1,4}")
 _FILES = re.compile(r"path|file|log|source|^Path$", re.IGNORECASE)
 
 ALLOWED = {
-    "ggslam.system.foreign:open_foreign": "the door",
+    "ggslam.system.untrusted_files:open_untrusted": "the door",
     "ggslam.system.images:decode_image": "the door of pictures: their headers were read",
     "ggslam.sequences.video:_open": "OpenCV takes names only; the door looks first",
     "ggslam.sequences.formats.ros_messages:<import>": "rosbags takes names only; the door looks first",

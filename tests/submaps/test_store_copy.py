@@ -83,6 +83,6 @@ def test_a_huge_file_beside_the_cells_is_refused(store: Path, tmp_path: Path, na
 
 def test_a_part_of_another_size_is_not_read(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.truncate(part(store, 1), HUGE)
-    monkeypatch.setattr("ggslam.submaps.cell_files.read_foreign", lambda *_: pytest.fail("was read"))
+    monkeypatch.setattr("ggslam.submaps.cell_files.read_untrusted", lambda *_: pytest.fail("was read"))
     with GridStore.open(store) as opened, pytest.raises(FormatError, match=f"damaged: {HUGE} bytes, the index says"):
         opened.get((1, 0, 0), "points.pcd")

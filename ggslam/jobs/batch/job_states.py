@@ -18,8 +18,8 @@ from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.record import RecordFile
 from ggslam.system.atomic import make_folder
-from ggslam.system.foreign import open_foreign, printable
 from ggslam.system.links import refuse_link
+from ggslam.system.untrusted_files import open_untrusted, printable
 
 _log = logging.getLogger(__name__)
 _TAIL, _LINE = 8192, 300
@@ -84,7 +84,7 @@ class JobState:
     def last_line(self) -> str:
         """The error that the run printed, or else the last thing it said."""
         try:
-            with open_foreign(self.log) as file:
+            with open_untrusted(self.log) as file:
                 file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
                 text = file.read(_TAIL).decode(errors="replace")
         except (OSError, FormatError):

@@ -13,8 +13,8 @@ from typing import Any
 from ggslam.errors import ConfigError
 from ggslam.sequences import recognise_format
 from ggslam.slam.config import load_config
-from ggslam.system.foreign import given_path, is_plain_name, read_foreign_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
+from ggslam.system.untrusted_files import given_path, is_plain_name, read_untrusted_text
 
 REPLICA = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 """Replica's scenes in the order in which papers list them."""
@@ -83,7 +83,7 @@ def read_manifest(path: str | Path, out: Path | None = None, options: Sequence[s
     """
     path = Path(path)
     try:
-        values = parse_yaml(read_foreign_text(path, ConfigError))
+        values = parse_yaml(read_untrusted_text(path, ConfigError))
     except PlainYamlError as error:
         raise ConfigError(f"{path}: {error}") from None
     if not isinstance(values, dict) or set(values) - _KEYS or "recordings" not in values:

@@ -23,8 +23,8 @@ from ggslam.jobs.tasks.outcomes import Failure
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.jobs.tasks.ray_cluster import RayCluster
 from ggslam.system.atomic import make_folder, write_text
-from ggslam.system.foreign import read_foreign, read_foreign_text
 from ggslam.system.links import remove_folder
+from ggslam.system.untrusted_files import read_untrusted, read_untrusted_text
 
 _TOKEN = ".shared-by"
 """File in the batch's folder by which a worker sees that it is the driver's."""
@@ -134,13 +134,13 @@ def _make_in_folder(state: JobState, root: Path | None) -> Made:
     files = None
     if root is not None:
         paths = [path for top in (state.run, state.log) for path in (top.rglob("*") if top.is_dir() else [top])]
-        files = {path.relative_to(root).as_posix(): read_foreign(path) for path in paths if path.is_file()}
+        files = {path.relative_to(root).as_posix(): read_untrusted(path) for path in paths if path.is_file()}
     return Made(record.exit_code, record.seconds, record.line, files)
 
 
 def _is_shared(out: Path, token: str) -> bool:
     try:
-        return read_foreign_text(out / _TOKEN) == token
+        return read_untrusted_text(out / _TOKEN) == token
     except FormatError:
         return False
 

@@ -14,8 +14,8 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.changes import ChangeRecord, ChangesRecord
 from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.oriented_box import Vector
-from ggslam.system.foreign import refuse_links
 from ggslam.system.images import MAX_PIXELS, read_picture
+from ggslam.system.untrusted_files import refuse_links
 
 MOST_PICTURES = 12
 """Pictures that a page shows."""

@@ -96,10 +96,10 @@ def add_run(
                      observer)  # fmt: skip
     found.replaced += [v for v in store.visits() if v != name and v in {f"run {state[:16]}" for state in states}]
     store_of_run(run, store, visit, at, found.replaced)
-    foreign = {e.visit for e in earlier if e.own_ids}
+    unrelated = {e.visit for e in earlier if e.own_ids}
     if found.against is not None and not found.entry.own_ids:
-        found.entry.notes.extend(_drop_ghosts(store, found, foreign))
-    after = _objects_after(store, table, found, foreign)
+        found.entry.notes.extend(_drop_ghosts(store, found, unrelated))
+    after = _objects_after(store, table, found, unrelated)
     cells = {known.id: known.cells for known in after}
     entry = replace(found.entry, events=with_cells(found.entry.events, cells))
     write_objects(store, StoreObjects(visits=[*earlier, entry], objects=after))
@@ -191,15 +191,15 @@ def _check_world(folder: RunFolder, outcome: ChangesOutcome, visit: str) -> None
 # --- the cells -------------------------------------------------------------------------------------------------------
 
 
-def _drop_ghosts(store: GridStore, found: _Comparison, foreign: set[str]) -> list[str]:
+def _drop_ghosts(store: GridStore, found: _Comparison, unrelated: set[str]) -> list[str]:
     """Takes what is gone, and what moved and is in new cells, out of the cells of earlier visits; returns notes.
-    `foreign`: visits with ids of their own, which name other things: their cells stay as they are."""
+    `unrelated`: visits whose object ids mean other objects; their cells stay as they are."""
     old_cells, own_ids = {}, set[int]()
     for key in store.counts(GAUSSIANS):
         arrays, visit = cell_arrays(store, key)
         if visit == store.visit:
             own_ids |= set(np.unique(arrays["object_id"]).tolist())
-        elif visit not in foreign:
+        elif visit not in unrelated:
             old_cells[key] = visit
     gone, moved, added = (_ids(found.entry, kind) for kind in ("removed", "moved", "added"))
     leaving = sorted(gone | (moved & own_ids))
@@ -226,11 +226,11 @@ def _ids(entry: VisitObjects, kind: Kind) -> set[int]:
 
 
 def _objects_after(
-    store: GridStore, table: ObjectTable, found: _Comparison, foreign: set[str]
+    store: GridStore, table: ObjectTable, found: _Comparison, unrelated: set[str]
 ) -> list[StoredObject]:
-    """The store's objects after a visit, counted in its cells; `foreign`: earlier visits with ids of their own."""
+    """The store's objects after a visit, counted in its cells; `unrelated`: earlier visits with ids of their own."""
     visit = found.entry.visit
-    others = foreign | ({visit} if found.entry.own_ids else set())
+    others = unrelated | ({visit} if found.entry.own_ids else set())
     count: dict[int, int] = {}
     cells: dict[int, list[CellKey]] = {}
     for key in store.counts(GAUSSIANS):

@@ -43,7 +43,7 @@ from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.map_file import open_map
 from ggslam.runs.opened_points import opened_points
 from ggslam.system.atomic import make_folder, write_bytes
-from ggslam.system.foreign import read_foreign
+from ggslam.system.untrusted_files import read_untrusted
 
 PRESETS = ("pointcloud", "splat")
 Box = tuple[Sequence[float], Sequence[float]]
@@ -195,7 +195,7 @@ def decode_file(
     if out.suffix.lower() not in (".ply", ".pcd"):
         raise ConfigError(f"{out}: expected a name that ends in .ply or .pcd")
     _refuse_itself(source, out)
-    data = read_foreign(source)
+    data = read_untrusted(source)
     try:
         if slice_id is None and box is None and (splats := _splats_in_parts(data, threads)) is not None:
             return _write_splats(splats, out)
@@ -238,7 +238,7 @@ def list_stream(path: Path) -> StreamListing:
     Raises:
         FormatError: the file cannot be read or is no G-PCC stream at all.
     """
-    listing = list_units(read_foreign(path))
+    listing = list_units(read_untrusted(path))
     if not listing.units:
         raise FormatError(f"{path}: not a G-PCC stream: {listing.problems[0] if listing.problems else 'it is empty'}")
     return listing

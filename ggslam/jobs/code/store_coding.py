@@ -53,8 +53,8 @@ from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_objects import objects_to_bytes, read_objects
 from ggslam.submaps.visit_files import read_visit
 from ggslam.system.atomic import atomic_write, make_folder, write_bytes
-from ggslam.system.foreign import read_foreign
 from ggslam.system.hidden_folder import hidden_beside
+from ggslam.system.untrusted_files import read_untrusted
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ class _Coding:
             for name, content in files.items():
                 archive.writestr(zipfile.ZipInfo(name), content)
             for key in keys:
-                archive.writestr(zipfile.ZipInfo(f"cells/{_file_of(key)}"), read_foreign(self.folder / _file_of(key)))
+                archive.writestr(zipfile.ZipInfo(f"cells/{_file_of(key)}"), read_untrusted(self.folder / _file_of(key)))
         self.outcome.sizes = {key: self.members[key].bytes for key in keys}
         self.outcome.gaussians = sum(member.gaussians for member in self.members.values())
 

@@ -26,8 +26,8 @@ from ggslam.sequences import Sequence
 from ggslam.sequences.association import pair_times
 from ggslam.slam.config import Config, config_to_dict
 from ggslam.slam.step_log import STEPS_FILE, read_table
-from ggslam.system.foreign import read_foreign_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
+from ggslam.system.untrusted_files import read_untrusted_text
 from ggslam.volumes.map_upright import upright_of
 from ggslam.volumes.upright import estimate_up
 
@@ -74,7 +74,7 @@ def _table(folder: RunFolder, name: str) -> dict[str, np.ndarray]:
 def _settings(folder: RunFolder) -> dict[str, Any]:
     path = folder.path / "config.yaml"
     try:
-        values = parse_yaml(read_foreign_text(path, RunFolderError)) if path.is_file() else {}
+        values = parse_yaml(read_untrusted_text(path, RunFolderError)) if path.is_file() else {}
     except PlainYamlError as error:
         raise RunFolderError(f"{path}: cannot be read: {error}") from None
     if not isinstance(values or {}, dict):

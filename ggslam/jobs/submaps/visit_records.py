@@ -22,7 +22,7 @@ from ggslam.sequences import Sequence
 from ggslam.slam.config import config_to_dict
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.visit_files import read_visit, visit_file, write_visit
-from ggslam.system.foreign import printable
+from ggslam.system.untrusted_files import printable
 
 _log = logging.getLogger(__name__)
 

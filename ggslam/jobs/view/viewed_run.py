@@ -33,7 +33,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.object_names import object_file_name
 from ggslam.sequences import Sequence
-from ggslam.system.foreign import is_plain_name, read_foreign
+from ggslam.system.untrusted_files import is_plain_name, read_untrusted
 from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover
 from ggslam.viewer.splats import Splats, most_visible, splats_of
 from ggslam.viewer.static_page import static_page
@@ -300,7 +300,7 @@ class ViewedRun:
                          if "." not in k})  # fmt: skip
             path = Path(folder) / object_file_name(record.id, record.name)
             write_gaussian_ply(path, part, OBJECT_EXTRAS)
-            return path.name, read_foreign(path)
+            return path.name, read_untrusted(path)
 
     def default_target(self) -> str:
         """See `EditableMap`."""

@@ -36,9 +36,9 @@ from ggslam.runs.publishing import change_in_run
 from ggslam.runs.records.volumes import VolumesRecord
 from ggslam.scene.origin import moved_pose
 from ggslam.scene.poses import translation
-from ggslam.system.foreign import is_plain_name
 from ggslam.system.json_files import write_json
 from ggslam.system.staging import finish_saving, make_staging, publish
+from ggslam.system.untrusted_files import is_plain_name
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import (
     BELOW_CAMERAS,

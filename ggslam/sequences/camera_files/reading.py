@@ -39,5 +39,7 @@ def read_entries(path: Path) -> dict[str, Any]:
         raise SequenceError(f"{path}: expected entries width, height, fx, fy, cx, cy, depth_scale, found {found}")
     if any(name in settings for name in OWN):
         return settings
-    foreign = from_yaml(path, settings)
-    return settings if foreign is None else foreign | {key: settings[key] for key in BESIDE if key in settings}
+    from_other_program = from_yaml(path, settings)
+    if from_other_program is None:
+        return settings
+    return from_other_program | {key: settings[key] for key in BESIDE if key in settings}

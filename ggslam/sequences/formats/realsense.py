@@ -21,7 +21,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.pixel_grid import ImageGeometry, image_size
 from ggslam.sequences.recording import NO_OPTIONS, DepthCamera, FrameFiles, NumberedImage, ReadOptions, Recording
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 TIMEOUT_MS = 5000
 SNIFFED = 1 << 20
@@ -206,7 +206,7 @@ class RealSenseFormat:
     def matches(self, path: Path) -> bool:
         if not path.is_file() or path.suffix.lower() != ".bag":
             return False
-        with open_foreign(path, SequenceError) as file:
+        with open_untrusted(path, SequenceError) as file:
             return b"/device_0/sensor_" in file.read(SNIFFED)
 
     def read(self, path: Path, options: ReadOptions = NO_OPTIONS) -> Recording:

@@ -41,7 +41,7 @@ from ggslam.sequences.recording import (
     ReadOptions,
     Recording,
 )
-from ggslam.system.foreign import open_foreign
+from ggslam.system.untrusted_files import open_untrusted
 
 STORAGES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 """Ends of the names of files that ROS 2 stores messages in."""
@@ -57,7 +57,7 @@ class Ros1Format:
     def matches(self, path: Path) -> bool:
         if not path.is_file() or path.suffix.lower() != ".bag":
             return False
-        with open_foreign(path, SequenceError) as file:
+        with open_untrusted(path, SequenceError) as file:
             return file.read(len(BAG_START)) == BAG_START
 
     def read(self, path: Path, options: ReadOptions = NO_OPTIONS) -> Recording:

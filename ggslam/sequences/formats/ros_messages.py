@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import GgslamError, MissingDependency, SequenceError
-from ggslam.system.foreign import open_foreign, refuse_links
+from ggslam.system.untrusted_files import open_untrusted, refuse_links
 
 NO_MESSAGE = "there is none"
 ZSTD_START = b"\x28\xb5\x2f\xfd"
@@ -40,7 +40,7 @@ class Bag:
         if path.is_dir():
             refuse_links(path, SequenceError, links=True)
         else:
-            open_foreign(path, SequenceError).close()
+            open_untrusted(path, SequenceError).close()
         self.path = path
         self._lock = threading.RLock()
         self._cursors: dict[str, tuple[int, Iterator[Any]]] = {}

@@ -10,8 +10,8 @@ import pytest
 
 from ggslam.errors import FormatError
 from ggslam.formats import gaussian_rows
-from ggslam.formats.foreign_ply import ForeignGaussianRows, apply_filter
 from ggslam.formats.gaussian_ply import read_gaussian_ply
+from ggslam.formats.gaussian_ply_reading import PlyGaussianRows, apply_filter
 from ggslam.formats.ply import write_ply
 from ggslam.formats.splat_formats import open_splats, read_splats
 from ggslam.scene.gaussian_map import SH_C0
@@ -124,12 +124,12 @@ def test_harmonics_of_degree_4_become_3_and_bytes_are_colours(tmp_path: Path) ->
 
 def test_blocks_are_the_whole_without_the_bad_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gaussian_rows, "BLOCK", 64)
-    monkeypatch.setattr("ggslam.formats.foreign_ply.BLOCK", 64)
+    monkeypatch.setattr("ggslam.formats.gaussian_ply_reading.BLOCK", 64)
     vertex = rows(1000)
     gone = np.random.default_rng(5).random(1000) < 0.3
     gone[[0, 63, 64, 999]] = True
     vertex["opacity"][gone] = np.nan
-    found = ForeignGaussianRows(stored(tmp_path / "map.ply", vertex))
+    found = PlyGaussianRows(stored(tmp_path / "map.ply", vertex))
     expected = vertex["x"][~gone]
     assert len(found) == len(expected)
     np.testing.assert_array_equal(np.concatenate([b.means.numpy()[:, 0] for b in found.blocks()]), expected)

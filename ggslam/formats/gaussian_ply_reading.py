@@ -159,7 +159,7 @@ def apply_filter(
         )
 
 
-class ForeignGaussianRows(GaussianRows):
+class PlyGaussianRows(GaussianRows):
     """The Gaussians of others' PLY files by row, without those that cannot be drawn; what is not read from the file
     again is one number for each of these.
 
@@ -262,7 +262,7 @@ def _stack(vertex: np.ndarray, names: Sequence[str]) -> np.ndarray:
 
 
 def _open(path: Path) -> SplatFile:
-    rows = ForeignGaussianRows(path)
+    rows = PlyGaussianRows(path)
     return SplatFile("3DGS PLY", rows, {} if rows.has_ids else None, rows.notes())
 
 

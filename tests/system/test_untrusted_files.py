@@ -9,15 +9,15 @@ import pytest
 from little_memory import with_little_memory
 
 from ggslam.errors import FormatError, RunFolderError, SequenceError
-from ggslam.system.foreign import (
-    copy_foreign,
-    copy_foreign_folder,
+from ggslam.system.untrusted_files import (
+    copy_untrusted,
+    copy_untrusted_folder,
     given_path,
     is_plain_name,
     member,
     printable,
-    read_foreign,
-    read_foreign_text,
+    read_untrusted,
+    read_untrusted_text,
     refuse_links,
 )
 
@@ -25,9 +25,9 @@ from ggslam.system.foreign import (
 def test_a_file_is_read_within_its_limit(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"12345")
-    assert read_foreign(path) == read_foreign(path, 5) == b"12345"
+    assert read_untrusted(path) == read_untrusted(path, 5) == b"12345"
     with pytest.raises(FormatError, match=r"a\.bin: too large.*5 bytes, at most 4"):
-        read_foreign(path, 4)
+        read_untrusted(path, 4)
 
 
 @pytest.mark.parametrize("kind", ["missing", "folder", "pipe", "device", "socket", "linked pipe"])
@@ -45,14 +45,15 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, kind: str) -
         os.mkfifo(tmp_path / "b")
         path.symlink_to("b")
     with pytest.raises(RunFolderError, match="missing" if kind == "missing" else "not a regular file"):
-        read_foreign(path, 10, RunFolderError)
+        read_untrusted(path, 10, RunFolderError)
 
 
 @pytest.mark.parametrize(("room", "kind", "exit_code"), [(40, "MemoryFullError", 1), (200, "nothing", 0)])
 def test_full_memory_is_no_fault_of_a_small_file(tmp_path: Path, room: int, kind: str, exit_code: int) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(bytes(60 << 20))
-    ended = with_little_memory("from ggslam.system.foreign import read_foreign", "read_foreign(path)", path, room << 20)
+    prelude = "from ggslam.system.untrusted_files import read_untrusted"
+    ended = with_little_memory(prelude, "read_untrusted(path)", path, room << 20)
     assert (ended.kind, ended.exit_code) == (kind, exit_code)
     if exit_code:
         assert ended.message == f"{path}: memory is full: no room for its 62,914,560 bytes"
@@ -64,22 +65,22 @@ def test_a_file_that_no_machine_holds_is_the_fault_of_the_file(tmp_path: Path) -
     with path.open("wb") as file:
         file.truncate(1 << 42)
     with pytest.raises(FormatError, match=r"too large for what it is: 4,398,046,511,104 bytes, at most"):
-        read_foreign(path)
+        read_untrusted(path)
 
 
 def test_no_more_is_read_than_there_was(tmp_path: Path) -> None:
     """Files in /proc have no size and may go on for ever."""
     if Path("/proc/self/pagemap").exists():
-        assert read_foreign("/proc/self/pagemap") == b""
+        assert read_untrusted("/proc/self/pagemap") == b""
 
 
 def test_text_may_have_any_line_ends_and_a_mark(tmp_path: Path) -> None:
     path = tmp_path / "a.txt"
     path.write_bytes(b"\xef\xbb\xbfone\r\ntwo\rthree\n")
-    assert read_foreign_text(path) == "one\ntwo\nthree\n"
+    assert read_untrusted_text(path) == "one\ntwo\nthree\n"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(FormatError, match="as text"):
-        read_foreign_text(path)
+        read_untrusted_text(path)
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "/etc", "..\\x", "a\0", "a" * 256, None, 3, ["x"], "\ud800"])
@@ -121,11 +122,11 @@ def test_control_characters_are_shown_not_sent() -> None:
 def test_a_copy_is_within_its_limit(tmp_path: Path) -> None:
     data = os.urandom((1 << 21) + 17)
     (tmp_path / "a").write_bytes(data)
-    copy_foreign(tmp_path / "a", tmp_path / "b", len(data))
+    copy_untrusted(tmp_path / "a", tmp_path / "b", len(data))
     assert (tmp_path / "b").read_bytes() == data
     os.truncate(tmp_path / "a", 50 << 30)
     with pytest.raises(RunFolderError, match=r"a: too large for what it is: 53,687,091,200 bytes"):
-        copy_foreign(tmp_path / "a", tmp_path / "c", 1 << 20, RunFolderError)
+        copy_untrusted(tmp_path / "a", tmp_path / "c", 1 << 20, RunFolderError)
     assert not (tmp_path / "c").exists()
 
 
@@ -135,14 +136,14 @@ def test_a_folder_is_copied_without_its_links(tmp_path: Path, leads_to: str) -> 
     (source / "inner").mkdir(parents=True)
     (source / "inner" / "b.txt").write_text("b")
     (source / "a.txt").write_text("a")
-    copy_foreign_folder(source, tmp_path / "copy", 10)
+    copy_untrusted_folder(source, tmp_path / "copy", 10)
     assert sorted(p.relative_to(tmp_path / "copy").as_posix() for p in (tmp_path / "copy").rglob("*")) == [
         "a.txt", "inner", "inner/b.txt",
     ]  # fmt: skip
     assert (tmp_path / "copy" / "inner" / "b.txt").read_text() == "b"
     (source / "inner" / "z").symlink_to(leads_to)
     with pytest.raises(FormatError, match="inner/z: is a link"):
-        copy_foreign_folder(source, tmp_path / "again", 10)
+        copy_untrusted_folder(source, tmp_path / "again", 10)
 
 
 @pytest.mark.parametrize(

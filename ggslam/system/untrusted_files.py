@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that came from elsewhere: read whole and within a limit, never through a name that leads out of their folder.
+"""Files from untrusted sources: read whole and within a limit, never through a name that leads out of their folder.
 
 Recordings, runs, stores and streams are passed around, so nothing in them is trusted: not a size, not a name, not the
 kind of a file. Whoever reads one reads it through here.
@@ -54,7 +54,7 @@ def given_path(path: str | Path, error: type[GgslamError] = SequenceError, where
     return Path(os.path.expanduser(path))  # noqa: PTH111 (Path's raises for unknown users)
 
 
-def open_foreign(path: str | Path, error: type[GgslamError] = FormatError) -> BinaryIO:
+def open_untrusted(path: str | Path, error: type[GgslamError] = FormatError) -> BinaryIO:
     """Opens a regular file for reading; a pipe, a device or a folder of that name is refused, not waited for.
 
     Args:
@@ -84,7 +84,7 @@ def _refuse_other_kinds(path: str | Path, mode: int, error: type[GgslamError]) -
         raise error(f"{path}: is {'a folder, ' if stat.S_ISDIR(mode) else ''}not a regular file")
 
 
-def read_foreign(path: str | Path, limit: int | None = None, error: type[GgslamError] = FormatError) -> bytes:
+def read_untrusted(path: str | Path, limit: int | None = None, error: type[GgslamError] = FormatError) -> bytes:
     """The bytes of a regular file, as many as it has when it is opened.
 
     Args:
@@ -93,10 +93,10 @@ def read_foreign(path: str | Path, limit: int | None = None, error: type[GgslamE
         error: class of the error to raise.
 
     Raises:
-        error: as `open_foreign`, or larger than `limit`.
+        error: as `open_untrusted`, or larger than `limit`.
         MemoryFullError: a file that could be held was not, for memory is full.
     """
-    with open_foreign(path, error) as file:
+    with open_untrusted(path, error) as file:
         size = _size_within(file, path, limit, error)
         try:
             return file.read(size) or b""  # None: of some files in /proc, without a size
@@ -114,7 +114,7 @@ def _size_within(file: BinaryIO, path: str | Path, limit: int | None, error: typ
     return size
 
 
-def copy_foreign(
+def copy_untrusted(
     source: str | Path, target: Path, limit: int | None = None, error: type[GgslamError] = FormatError
 ) -> None:
     """Copies the content of a regular file, as many bytes as it has when it is opened.
@@ -127,10 +127,10 @@ def copy_foreign(
         error: class of the error to raise.
 
     Raises:
-        error: as `read_foreign`; nothing was written.
+        error: as `read_untrusted`; nothing was written.
         OSError: `target` cannot be written.
     """
-    with open_foreign(source, error) as file:
+    with open_untrusted(source, error) as file:
         left = _size_within(file, source, limit, error)
         with target.open("wb") as copy:
             while left > 0:
@@ -144,15 +144,15 @@ def copy_foreign(
                 left -= len(block)
 
 
-def copy_foreign_folder(
+def copy_untrusted_folder(
     source: Path, target: Path, limit: int | None = None, error: type[GgslamError] = FormatError
 ) -> None:
-    """Copies the files of a folder and of those in it, each as `copy_foreign` does; links in it are refused.
+    """Copies the files of a folder and of those in it, each as `copy_untrusted` does; links in it are refused.
 
     Args:
         source: the folder.
         target: where to; made if it is not there.
-        limit: bytes that each may have, see `copy_foreign`.
+        limit: bytes that each may have, see `copy_untrusted`.
         error: class of the error to raise.
 
     Raises:
@@ -164,19 +164,19 @@ def copy_foreign_folder(
         if path.is_symlink():
             raise error(f"{path}: is a link; files behind links are not copied")
         if path.is_dir():
-            copy_foreign_folder(path, target / path.name, limit, error)
+            copy_untrusted_folder(path, target / path.name, limit, error)
         else:
-            copy_foreign(path, target / path.name, limit, error)
+            copy_untrusted(path, target / path.name, limit, error)
 
 
-def read_foreign_text(path: str | Path, error: type[GgslamError] = FormatError, limit: int = MAX_TEXT_BYTES) -> str:
+def read_untrusted_text(path: str | Path, error: type[GgslamError] = FormatError, limit: int = MAX_TEXT_BYTES) -> str:
     """Text of a file in UTF-8, with or without a byte order mark; line ends become `\\n`.
 
     Raises:
-        error: as `read_foreign`, or not text.
+        error: as `read_untrusted`, or not text.
     """
     try:
-        text = read_foreign(path, limit, error).decode("utf-8-sig")
+        text = read_untrusted(path, limit, error).decode("utf-8-sig")
     except UnicodeDecodeError as reason:
         raise error(f"{path}: cannot be read as text: {reason}") from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
