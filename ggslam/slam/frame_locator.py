@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from ggslam.features.orb import FeatureView
 from ggslam.scene.frame import Frame
 from ggslam.slam.color_poses import ColorPoses
