@@ -73,7 +73,7 @@ class FrameLocator:
         start = self.part_start
         if len(self._surface) > start.keyframe:
             start.target = None
-        return start.target or published
+        return published if start.target is None else start.target
 
     def move(self, T_new_old: np.ndarray) -> None:
         """The world about the camera was moved by a correction [4, 4]; a locator of its own kind may hold a pose."""
