@@ -9,21 +9,31 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from typing import Protocol
 
+import numpy as np
 import torch
 
 import ggslam
-from ggslam import Keyframe, RenderBuffers
-
-Loss = Callable[[RenderBuffers, Keyframe], torch.Tensor]
+from ggslam import RenderBuffers
 
 
-def no_fog(view: RenderBuffers, keyframe: Keyframe) -> torch.Tensor:
+class Seen(Protocol):
+    """What these losses read of a keyframe."""
+
+    color: np.ndarray
+    """uint8 [H, W, 3]."""
+
+
+Loss = Callable[[RenderBuffers, Seen], torch.Tensor]
+
+
+def no_fog(view: RenderBuffers, keyframe: Seen) -> torch.Tensor:
     """Pixels are covered wholly or not at all."""
     return 0.05 * (view.alpha * (1 - view.alpha)).mean()
 
 
-def same_saturation(view: RenderBuffers, keyframe: Keyframe) -> torch.Tensor:
+def same_saturation(view: RenderBuffers, keyframe: Seen) -> torch.Tensor:
     """Colours are as far from grey as in the keyframe's image. What a keyframe holds is on the host: it goes to the
     device of what was rendered."""
     seen = torch.from_numpy(keyframe.color).to(view.image.device).permute(2, 0, 1) / 255

@@ -47,7 +47,6 @@ if _TYPE_CHECKING:
     from ggslam.jobs.run.evaluate_run import evaluate_run as evaluate_run
     from ggslam.jobs.run.pipeline import RunOutcome as RunOutcome
     from ggslam.jobs.run.run_recording import run_recording as run_recording
-    from ggslam.mapping.keyframe import Keyframe as Keyframe
     from ggslam.objects.lookup import objects_at as objects_at
     from ggslam.objects.table import ObjectTable as ObjectTable
     from ggslam.rendering import GaussianModel as GaussianModel
@@ -134,7 +133,6 @@ _HOMES = {
     "ggslam.sequences.live": ("LiveSequence",),
     "ggslam.slam.config": ("Config", "load_config"),
     "ggslam.slam.result": ("SlamResult", "StepReport"),
-    "ggslam.mapping.keyframe": ("Keyframe",),
     "ggslam.slam.slam": ("Slam",),
     "ggslam.synthetic": ("write_synthetic_sequence",),
     "ggslam.volumes.esdf": ("DistanceField",),

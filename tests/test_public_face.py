@@ -18,7 +18,7 @@ import ggslam
 ROOT = Path(__file__).parents[1]
 NAMES = """
     Camera CodecSettings Config ConfigError DistanceField Edit FormatError Frame GaussianMap GaussianModel
-    GgslamError InputError Keyframe LiveSequence MissingDependency ObjectTable OccupancyMap RenderBuffers RenderError
+    GgslamError InputError LiveSequence MissingDependency ObjectTable OccupancyMap RenderBuffers RenderError
     RunFolder RunFolderError RunOutcome SegmentationCounts Sequence SequenceError Slam SlamResult StepReport Trajectory
     TsdfMap collate_frames color_loss decode_cloud depth_loss edit_run encode_cloud evaluate_run export_run
     identity_loss load_config neighbour_loss objects_at open_sequence read_gaussian_ply read_point_cloud read_splats
@@ -30,7 +30,7 @@ PUBLIC = NAMES.split()
 
 def test_the_list() -> None:
     assert sorted(ggslam.__all__) == sorted([*PUBLIC, "__version__"])
-    assert dir(ggslam) == sorted(ggslam.__all__) and len(PUBLIC) <= 60
+    assert dir(ggslam) == sorted(ggslam.__all__) and len(PUBLIC) < 60
 
 
 @pytest.mark.parametrize("name", PUBLIC)
