@@ -28,7 +28,7 @@ packed = set(zipfile.ZipFile(wheel).namelist())
 source = {"/".join(name.split("/")[1:]) for name in tarfile.open(sdist).getnames()}
 presets = [path.name for path in Path("configs").glob("*.yaml")]
 data = [p for p in Path("ggslam").rglob("*") if p.suffix in (".js", ".css", ".html", ".typed", ".cu", ".cuh")]
-data += Path("ggslam/interface").rglob("*.?pp")
+data += Path("ggslam/abi").rglob("*.hpp")
 needed = {"ggslam/native/_lib/libggslam_core.so", *(f"ggslam/configs/{name}" for name in presets), *map(str, data)}
 assert any("viewer/static" in name for name in needed) and "ggslam/py.typed" in needed and len(presets) > 5
 junk = [n for n in packed if n.startswith(("tests/", "scripts/", "docs/", "examples/")) or "/src/" in n or n.endswith(".pyc")]
@@ -38,7 +38,7 @@ assert any(n.endswith("licenses/LICENSE") for n in packed), f"{wheel} lacks the 
 needed = {"LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "CMakeLists.txt", "pyproject.toml", "ggslam/py.typed",
           "configs/default.yaml", "tests/conftest.py", "ggslam/native/src/common/dispatch.hpp", "examples/run_slam.py",
           "docs/index.md", "ggslam/cuda/kernels/rendering/api.cu", "ggslam/cuda/kernels/rendering/tile.cuh",
-          "ggslam/interface/cuda/rendering.hpp"}
+          "ggslam/abi/cuda/rendering.hpp"}
 ends = (".so", ".pyc", ".whl", ".o")
 junk = [n for n in source if n.endswith(ends) or n.split("/")[0] in (".git", "build", "dist", "runs", "demo", ".ci")]
 assert needed <= source, f"{sdist} lacks {needed - source}"

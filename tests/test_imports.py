@@ -19,7 +19,7 @@ FLOORS = (
      "reporting"},
     {"rendering", "sequences", "formats", "features", "synthetic", "geometry", "sight"},
     {"scene", "native", "cuda"},
-    {"system", "interface"},
+    {"system", "abi"},
     {"errors"},
 )
 """From the top down. A room imports from floors below its own only."""

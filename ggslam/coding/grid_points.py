@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.interface.core.codec import Grid, Points
+from ggslam.abi.core import Grid, Points
 from ggslam.native.loader import load_library
 
 _KINDS = {np.dtype(kind): number for number, kind in enumerate((np.int32, np.int64, np.float32, np.float64))}

@@ -8,16 +8,16 @@ from collections.abc import Sequence
 from ctypes import c_int32, c_uint8
 from dataclasses import dataclass
 
-from ggslam.coding.attribute_syntax import LIFTING, AttributeHeader, AttributeParameters
-from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
-from ggslam.coding.sequence_parameters import AttributeDescription
-from ggslam.interface.core.codec import (
+from ggslam.abi.core import (
     DetailSettings,
     OctreeSettings,
     PredictiveSettings,
     RahtSettings,
     TreeSettings,
 )
+from ggslam.coding.attribute_syntax import LIFTING, AttributeHeader, AttributeParameters
+from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
+from ggslam.coding.sequence_parameters import AttributeDescription
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from ggslam.abi.core import RahtSettings, Status
 from ggslam.coding.attribute_syntax import RAHT, RAW
 from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
 from ggslam.coding.native_settings import (
@@ -23,7 +24,6 @@ from ggslam.coding.native_settings import (
 )
 from ggslam.coding.sequence_parameters import AttributeDescription
 from ggslam.errors import FormatError
-from ggslam.interface.core.codec import RahtSettings, Status
 from ggslam.native.loader import NativeContext, load_library
 
 _REASONS = {

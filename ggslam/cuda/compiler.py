@@ -13,16 +13,26 @@ import tempfile
 from functools import lru_cache
 from pathlib import Path
 
+from ggslam.abi import cuda as abi
+from ggslam.abi.binding import cuda_hash
 from ggslam.errors import MissingDependency
-from ggslam.interface.binding import cuda_hash
+from ggslam.system.tuning import Tuning
 
 KERNELS = Path(__file__).parent / "kernels"
 """Folder of the CUDA sources."""
-INTERFACE = KERNELS.parents[1] / "interface"
+ABI = KERNELS.parents[1] / "abi"
 """Folder of the headers that say what callers see."""
 
 _FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-shared", "-Xcompiler", "-fPIC,-fvisibility=hidden", "--threads", "0")
-_ERROR_LINES = 12
+
+
+class CompilerTuning(Tuning):
+    """What is told of a failed compilation."""
+
+    error_lines = 12
+    """Lines of the compiler's output that an error quotes."""
+
+
 _USUAL_HOME = "/usr/local/cuda"
 
 
@@ -74,17 +84,19 @@ def compiler_version(nvcc: Path) -> str:
 
 def source_files() -> list[Path]:
     """All sources and headers."""
-    return [*sorted(KERNELS.rglob("*.cu*")), *sorted(INTERFACE.rglob("*.?pp"))]
+    return [*sorted(KERNELS.rglob("*.cu*")), *sorted(ABI.rglob("*.hpp"))]
 
 
 def translation_units() -> list[Path]:
     """Those of them that the compiler is given."""
-    return [*sorted(KERNELS.rglob("*.cu")), *sorted((INTERFACE / "cuda").glob("*.cpp"))]
+    return sorted(KERNELS.rglob("*.cu"))
 
 
 def common_arguments() -> list[str]:
-    """What every compiler of these sources is told: where headers are, and the version of the interface."""
-    return ["-I", str(KERNELS), "-I", str(INTERFACE.parent), f"-DGGSLAM_INTERFACE_HASH={cuda_hash()}"]
+    """What every compiler of these sources is told: where headers are, and version and structures of the interface."""
+    structures = ",".join(abi.DECLARED.structures)
+    definitions = [f"-DGGSLAM_ABI_HASH={cuda_hash()}", f"-DGGSLAM_STRUCTURES={structures}"]
+    return ["-I", str(KERNELS), "-I", str(ABI.parent), *definitions]
 
 
 def library_path(nvcc: Path, architecture: str) -> Path:
@@ -137,6 +149,6 @@ def compiled_library(architecture: str) -> Path:
 def _run(command: list[str]) -> None:
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     if run.returncode != 0:
-        lines = (run.stderr + run.stdout).strip().splitlines()[:_ERROR_LINES] or [f"exit status {run.returncode}"]
-        reason = "\n".join(lines)
+        lines = (run.stderr + run.stdout).strip().splitlines() or [f"exit status {run.returncode}"]
+        reason = "\n".join(lines[: CompilerTuning.error_lines])
         raise MissingDependency(f"the cuda backend: compiling failed: {reason}\nthe command: {shlex.join(command)}")

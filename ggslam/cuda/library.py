@@ -9,9 +9,9 @@ from pathlib import Path
 
 import torch
 
+from ggslam.abi.binding import bind_cuda
 from ggslam.cuda.compiler import compiled_library
 from ggslam.errors import DeviceError, MissingDependency
-from ggslam.interface.binding import bind_cuda
 
 
 class CudaLibrary:

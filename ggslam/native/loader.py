@@ -10,8 +10,8 @@ import sys
 from functools import lru_cache
 from pathlib import Path
 
+from ggslam.abi.binding import bind_core
 from ggslam.errors import NativeCoreError
-from ggslam.interface.binding import bind_core
 from ggslam.system.forks import refuse_lost_threads
 
 INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
@@ -56,9 +56,9 @@ def _installed_library() -> ctypes.CDLL | None:
 
 
 def source_hash(package: Path) -> str:
-    """SHA-256 of the C++ sources in a package's native/src and interface, as CMakeLists.txt computes it: of lines of
+    """SHA-256 of the C++ sources in a package's native/src and abi, as CMakeLists.txt computes it: of lines of
     path and SHA-256, sorted by path."""
-    files = [p for folder in ("native/src", "interface") for p in (package / folder).rglob("*.?pp")]
+    files = [p for folder in ("native/src", "abi") for p in (package / folder).rglob("*.?pp")]
     paths = {p.relative_to(package).as_posix(): p for p in files}
     lines = [f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n" for name, path in sorted(paths.items())]
     return hashlib.sha256("".join(lines).encode()).hexdigest()

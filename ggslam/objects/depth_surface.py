@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ggslam.interface.arrays import address
-from ggslam.interface.core import objects as core
+from ggslam.abi import core
+from ggslam.abi.arrays import address
 from ggslam.native.loader import load_library
 from ggslam.scene.camera import Camera
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.abi import core
+from ggslam.abi.arrays import address
 from ggslam.errors import InputError
-from ggslam.interface.arrays import address
-from ggslam.interface.core import objects as core
 from ggslam.native.loader import load_library
 from ggslam.objects.depth_surface import DepthSurface
 from ggslam.objects.settings import GeometricSettings
@@ -212,7 +212,7 @@ def strange_colors(
     shade: tuple[float, float],
 ) -> np.ndarray:  # fmt: skip
     """Pixels of a plane whose colour occurs in few places of it, uint8 [H, W], see `find_strange_colors`; what the
-    numbers are, tells `StrangeColorsJob` in interface/core/objects.hpp."""
+    numbers are, tells `StrangeColorsJob` in abi/core/objects.hpp."""
     lab, inside = np.ascontiguousarray(lab, np.float32), np.ascontiguousarray(inside, bool)
     pieces, kind = np.ascontiguousarray(pieces, np.int32), np.empty(inside.shape, np.uint8)
     job = core.StrangeColorsJob(

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
 from ggslam.errors import RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.core import rendering as structures
 from ggslam.rendering.types import (
     PARAMETERS,
     Gaussians,

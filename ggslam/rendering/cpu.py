@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
 from ggslam.errors import RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.core import rendering as structures
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.arguments import (

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
 from ggslam.errors import CoreInputError, RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.core import rendering as structures
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.gaussian_map import GaussianMap
 

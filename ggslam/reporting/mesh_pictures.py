@@ -7,7 +7,7 @@ import ctypes
 
 import numpy as np
 
-from ggslam.interface.core.rendering import MeshPictureInput
+from ggslam.abi.core import MeshPictureInput
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.reporting.cloud_pictures import CloudView
 from ggslam.scene.poses import inverse

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ggslam.interface.arrays import address
-from ggslam.interface.core.sight import (
+from ggslam.abi.arrays import address
+from ggslam.abi.core import (
     DepthPlacesJob,
     OtherPlacesView,
     PlacesEvidenceJob,

@@ -19,8 +19,8 @@ from enum import IntEnum
 import cv2
 import numpy as np
 
-from ggslam.interface.arrays import address
-from ggslam.interface.core.sight import SightCode, SightJob, SightMargin
+from ggslam.abi.arrays import address
+from ggslam.abi.core import SightCode, SightJob, SightMargin
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from ggslam.interface.arrays import address
-from ggslam.interface.core import tracking as structures
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.origin import moved_pose

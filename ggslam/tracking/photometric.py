@@ -13,8 +13,8 @@ from functools import reduce
 import cv2
 import numpy as np
 
-from ggslam.interface.arrays import address
-from ggslam.interface.core import tracking as structures
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
 from ggslam.scene.camera import Camera
 from ggslam.scene.origin import moved_pose
 from ggslam.scene.poses import inverse

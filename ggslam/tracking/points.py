@@ -10,8 +10,8 @@ from typing import Annotated, Protocol
 
 import numpy as np
 
-from ggslam.interface.arrays import address
-from ggslam.interface.core import tracking as structures
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, Points32

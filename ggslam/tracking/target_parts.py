@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ggslam.interface.arrays import address
-from ggslam.interface.core import tracking as structures
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.tracking.gicp import GicpTarget, native_target_settings
 from ggslam.tracking.settings import TargetSettings

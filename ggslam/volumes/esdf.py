@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.abi.core import FieldStats
 from ggslam.errors import ConfigError, InputError
-from ggslam.interface.core.volumes import FieldStats
 from ggslam.native.loader import load_library
 from ggslam.system.settings import setting, settings_class
 from ggslam.volumes.tsdf import VOXELS, TsdfMap

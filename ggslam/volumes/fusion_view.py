@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ggslam.abi.core import FusionInput
 from ggslam.errors import InputError
-from ggslam.interface.core.volumes import FusionInput
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 

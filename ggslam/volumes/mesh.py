@@ -10,8 +10,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from ggslam.abi.core import MeshArrays
 from ggslam.formats.triangle_mesh import TriangleMesh, majority_labels
-from ggslam.interface.core.volumes import MeshArrays
 from ggslam.native.loader import load_library
 from ggslam.scene.origin import stored_positions
 from ggslam.scene.poses import transform_points

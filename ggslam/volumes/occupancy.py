@@ -17,9 +17,9 @@ from typing import Literal
 
 import numpy as np
 
+from ggslam.abi import core as volumes
+from ggslam.abi.core import DepthImage, InsertResult, InsertSettings
 from ggslam.errors import ConfigError, InputError
-from ggslam.interface.core import volumes
-from ggslam.interface.core.volumes import DepthImage, InsertResult, InsertSettings
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.origin import local_origin, moved_pose

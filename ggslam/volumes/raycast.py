@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.abi.core import RaycastView, SurfaceImages
 from ggslam.errors import InputError
-from ggslam.interface.core.volumes import RaycastView, SurfaceImages
 from ggslam.native.loader import load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.origin import moved_pose

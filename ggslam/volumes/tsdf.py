@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from ggslam.abi.core import FusionSettings, FusionStats, VoxelArrays
 from ggslam.errors import CoreInputError, InputError, VoxelError
-from ggslam.interface.core.volumes import FusionSettings, FusionStats, VoxelArrays
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame_checks import wrong_unit

@@ -103,9 +103,9 @@ print(compiled_library(architecture), f"{time.perf_counter() - start:.1f} s")
 CODE
   local arch source
   arch=$("$python" -c 'import torch; print("".join(map(str, torch.cuda.get_device_capability())))')
-  find ggslam/cuda/kernels -name '*.cu' ! -name sorting.cu -print0 | sort -z | xargs -0 -P "$(nproc)" -I{} sh -c '
+  find ggslam/cuda/kernels -name '*.cu' ! -name sorting.cu ! -name library.cu -print0 | sort -z | xargs -0 -P "$(nproc)" -I{} sh -c '
     nvcc -O3 -std=c++17 -ftz=true -Xptxas -v -gencode "arch=compute_$0,code=sm_$0" -c -o /dev/null \
-      -I ggslam/cuda/kernels -I ggslam -DGGSLAM_INTERFACE_HASH=none "$1" >"$2/$(basename "$1").ptxas" 2>&1' "$arch" {} "$folder"
+      -I ggslam/cuda/kernels -I ggslam "$1" >"$2/$(basename "$1").ptxas" 2>&1' "$arch" {} "$folder"
   for source in "$folder"/*.ptxas; do
     grep -E "Compiling|spill|Used|error|warning" "$source" | { c++filt 2>/dev/null || cat; }
     rm "$source"

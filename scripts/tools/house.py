@@ -81,7 +81,7 @@ def circles() -> list[str]:
 
 PURPOSES = {
     "SLAM": "sight slam tracking mapping loops movers objects rendering scene geometry features native cuda",
-    "recordings, files and stores": "sequences formats coding runs submaps system interface errors __init__ __main__",
+    "recordings, files and stores": "sequences formats coding runs submaps system abi errors __init__ __main__",
     "work on finished runs": "jobs localization merging changes volumes evaluation viewer reporting",
     "command line": "cli",
     "generated recordings": "synthetic",

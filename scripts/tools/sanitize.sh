@@ -9,7 +9,7 @@ set -eu
 cd "$(dirname "$0")/../.."
 kind=${1:-}; shift || true
 case $kind in address|undefined|thread) ;; *) sed -n 's/^# //p' "$0" | sed -n 2,8p; exit 2 ;; esac
-tests=(tests/native tests/interface tests/volumes tests/coding tests/rendering tests/tracking tests/mapping tests/submaps)
+tests=(tests/native tests/abi tests/volumes tests/coding tests/rendering tests/tracking tests/mapping tests/submaps)
 if [ "${1:-}" = --all ]; then shift; tests=(tests); elif [ $# -gt 0 ]; then tests=(); fi
 
 # --- build ------------------------------------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ for path in sorted(folder.iterdir()):
     lines = path.read_text(errors="replace").splitlines()
     starts = [i for i, line in enumerate(lines) if re.search(begin, line)] + [len(lines)]
     for first, end in zip(starts, starts[1:]):
-        place = next((m for line in lines[first:end] for m in re.findall(r"ggslam/(?:native/src|interface)/([\w/.]+:\d+)", line)), None)
+        place = next((m for line in lines[first:end] for m in re.findall(r"ggslam/(?:native/src|abi)/([\w/.]+:\d+)", line)), None)
         if place is None and not any("libggslam_core" in line for line in lines[first:end]):
             others += 1
             continue

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.errors import CoreInputError, GgslamError
-from ggslam.interface.binding import CORE
-from ggslam.interface.core.common import CoreFault
-from ggslam.interface.core.mapping import CrossEntropyOfPixels
-from ggslam.interface.core.rendering import (
+from ggslam.abi.core import (
+    DECLARED,
     AdamArguments,
     AdamArrays,
+    CoreFault,
+    CrossEntropyOfPixels,
     FeatureAdam,
     GaussianGradients,
     ImageGradients,
@@ -25,6 +24,7 @@ from ggslam.interface.core.rendering import (
     PixelTerms,
     TermVotes,
 )
+from ggslam.errors import CoreInputError, GgslamError
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.cpu import CpuRasterizer
@@ -59,8 +59,8 @@ def some_map(count: int = COUNT) -> GaussianMap:
 
 # --- nothing at all --------------------------------------------------------------------------------------------------
 
-WITHOUT_ARGUMENTS = {"ggslam_interface_hash", "ggslam_source_hash", "ggslam_best_isa"}
-FUNCTIONS = [(name, arguments) for part in CORE for name, (_, arguments) in part.FUNCTIONS.items()]
+WITHOUT_ARGUMENTS = {"ggslam_abi_hash", "ggslam_structure_sizes", "ggslam_source_hash", "ggslam_best_isa"}
+FUNCTIONS = [(name, arguments) for name, (_, arguments) in DECLARED.functions.items()]
 
 
 @pytest.mark.parametrize("number", [0, 1, -1, INT_MAX, INT_MIN])

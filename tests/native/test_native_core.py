@@ -30,7 +30,7 @@ def loaded(checkout: Path) -> subprocess.CompletedProcess[str]:
 @pytest.mark.skipif("GGSLAM_CORE" in os.environ, reason="another core was asked for")
 def test_a_checkout_takes_the_installed_core_of_its_own_sources_alone(tmp_path: Path) -> None:
     native = tmp_path / "ggslam" / "native"
-    for folder in ("native", "interface", "system"):
+    for folder in ("native", "abi", "system"):
         ignored = shutil.ignore_patterns("_lib", "__pycache__")
         shutil.copytree(CHECKOUT / "ggslam" / folder, native.with_name(folder), ignore=ignored)
     for name in ("__init__.py", "errors.py"):

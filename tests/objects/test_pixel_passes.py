@@ -18,9 +18,9 @@ import pytest
 from test_geometric_segmenter import CAMERA, ray_cast
 
 import ggslam.objects
+from ggslam.abi import core
+from ggslam.abi.arrays import address
 from ggslam.errors import CoreInputError, InputError
-from ggslam.interface.arrays import address
-from ggslam.interface.core import objects as core
 from ggslam.native.loader import load_library
 from ggslam.objects import depth_surface, pixel_passes
 from ggslam.objects.depth_surface import surface_of

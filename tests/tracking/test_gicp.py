@@ -7,7 +7,7 @@ import gicp_reference as reference
 import numpy as np
 import pytest
 
-from ggslam.interface.arrays import address
+from ggslam.abi.arrays import address
 from ggslam.native.loader import NativeContext, available_instruction_sets, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, se3_exp, se3_log

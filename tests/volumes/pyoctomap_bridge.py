@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.abi.core import InsertResult
 from ggslam.errors import FormatError, MissingDependency
-from ggslam.interface.core.volumes import InsertResult
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.volumes.occupancy import OccupancyMap, ScanCounts
 from ggslam.volumes.occupancy_arrays import contiguous_points, output_bytes

@@ -176,7 +176,7 @@ def _version(distribution: str) -> str | None:
 
 
 def _core() -> Iterator[Finding]:
-    from ggslam.interface.binding import core_hash
+    from ggslam.abi.binding import core_hash
     from ggslam.native import loader
 
     advice = "run `pip install .` or, in a checkout, `bash scripts/build_native.sh`; see the message above"

@@ -7,8 +7,8 @@ import ctypes
 
 import numpy as np
 
+from ggslam.abi.core import CrossEntropyOfPixels
 from ggslam.errors import RenderError
-from ggslam.interface.core.mapping import CrossEntropyOfPixels
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
 

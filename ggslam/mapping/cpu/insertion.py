@@ -8,9 +8,9 @@ import ctypes
 import cv2
 import numpy as np
 
+from ggslam.abi.arrays import address
+from ggslam.abi.core import InsertionJob
 from ggslam.errors import InputError
-from ggslam.interface.arrays import address
-from ggslam.interface.core.mapping import InsertionJob
 from ggslam.mapping.new_gaussians import NewGaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.native.loader import NativeContext, load_library

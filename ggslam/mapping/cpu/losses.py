@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ggslam.abi.arrays import address
+from ggslam.abi.core import ImageLossJob
 from ggslam.errors import NativeCoreError, RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.core.mapping import ImageLossJob
 from ggslam.mapping.losses import LOSS_WEIGHTS, LossGradients, LossTarget, LossValues, RenderedImages
 from ggslam.mapping.settings import LossSettings
 from ggslam.native.loader import NativeContext, load_library

@@ -8,8 +8,8 @@ import ctypes
 
 import torch
 
+from ggslam.abi.cuda import ClassAdamJob, CrossEntropyJob, NeighbourLossJob, PixelClassJob
 from ggslam.cuda.library import CudaLibrary
-from ggslam.interface.cuda.mapping import ClassAdamJob, CrossEntropyJob, NeighbourLossJob, PixelClassJob
 
 
 class ClassKernels:

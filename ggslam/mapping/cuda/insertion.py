@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ggslam.abi.arrays import address
+from ggslam.abi.cuda import InsertionJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.cuda.mapping import InsertionJob
 from ggslam.mapping.new_gaussians import NewGaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.rendering.types import check_pose

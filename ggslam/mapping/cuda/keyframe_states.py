@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ggslam.abi.cuda import KeyframeState, KeyframeStepJob, KeyframeWriteJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.streams import let_go
 from ggslam.errors import RenderError
-from ggslam.interface.cuda.mapping import KeyframeState, KeyframeStepJob, KeyframeWriteJob
 from ggslam.mapping.losses import LossValues
 from ggslam.mapping.settings import ExposureSettings
 

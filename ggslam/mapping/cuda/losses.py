@@ -14,10 +14,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
+from ggslam.abi.cuda import ImageLossJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
-from ggslam.interface.cuda.mapping import ImageLossJob
 from ggslam.mapping.losses import LOSS_WEIGHTS, LossGradients, LossTarget, LossValues, RenderedImages
 from ggslam.mapping.settings import LossSettings
 

@@ -8,9 +8,9 @@ import ctypes
 
 import torch
 
+from ggslam.abi.cuda import MOST_NEIGHBOURS, NeighbourJob
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.interface.cuda.mapping import MOST_NEIGHBOURS, NeighbourJob
 
 _DISTANCES_AT_ONCE = 1 << 24
 """Distances that the search for many neighbours keeps at a time."""

@@ -8,9 +8,9 @@ import ctypes
 
 import torch
 
+from ggslam.abi.cuda import PixelPoolJob
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.interface.cuda.mapping import PixelPoolJob
 from ggslam.mapping.identity import IDS
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool

@@ -7,10 +7,10 @@ import math
 
 import torch
 
+from ggslam.abi.arrays import address
+from ggslam.abi.core import AdamArrays
+from ggslam.abi.cuda import AdamStep
 from ggslam.errors import RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.core.rendering import AdamArrays
-from ggslam.interface.cuda.rendering import AdamStep
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cuda.finished import MapState
 from ggslam.scene.gaussian_map import GaussianMap

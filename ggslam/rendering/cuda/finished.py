@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 
 import torch
 
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
+from ggslam.abi.cuda import Rendering, Sizes
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.core import rendering as structures
-from ggslam.interface.cuda.rendering import Rendering, Sizes
 from ggslam.rendering.types import GaussianTensors, RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 

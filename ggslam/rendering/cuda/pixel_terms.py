@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 
 import torch
 
+from ggslam.abi.arrays import address
+from ggslam.abi.core import AdamArrays
+from ggslam.abi.cuda import AdamStep, PixelTerms, Rendering, TermsByGaussian
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.core.rendering import AdamArrays
-from ggslam.interface.cuda.rendering import AdamStep, PixelTerms, Rendering, TermsByGaussian
 from ggslam.rendering.adam import ADAM_GROUPS
 from ggslam.rendering.pixel_terms import MAX_CHANNELS, FeatureAdamSettings
 from ggslam.scene.gaussian_map import VOTE_SLOTS, GaussianMap

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from ggslam.abi import core as structures
+from ggslam.abi.arrays import address
+from ggslam.abi.cuda import AdamStep, Rendering, Sizes
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
-from ggslam.interface.arrays import address
-from ggslam.interface.core import rendering as structures
-from ggslam.interface.cuda.rendering import AdamStep, Rendering, Sizes
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.arguments import (
     camera_view,

@@ -18,11 +18,11 @@ import weakref
 import numpy as np
 import torch
 
+from ggslam.abi import core as structures
+from ggslam.abi.cuda import AlignJob, AlignResult, DepthPointsJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Download, Upload
-from ggslam.interface.core import tracking as structures
-from ggslam.interface.cuda.tracking import AlignJob, AlignResult, DepthPointsJob
 from ggslam.scene.camera import Camera
 from ggslam.tracking.cuda.points import CudaPoints
 from ggslam.tracking.cuda.results import cuda_alignment

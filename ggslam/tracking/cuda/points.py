@@ -9,7 +9,7 @@ from itertools import accumulate
 import numpy as np
 import torch
 
-from ggslam.interface.cuda.tracking import PointArrays, PointsHeader
+from ggslam.abi.cuda import PointArrays, PointsHeader
 from ggslam.tracking.points import FramePoints
 
 _ROWS = {"points": 3, "normals": 3, "covariances": 6, "pixels": 2, "weights": 1}

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ggslam.interface.cuda.tracking import AlignResult
+from ggslam.abi.cuda import AlignResult
 from ggslam.tracking.gicp import AlignmentResult, PointMatches, judge
 from ggslam.tracking.observability import PointSpread, about_point
 from ggslam.tracking.settings import AlignSettings

@@ -10,12 +10,12 @@ from ctypes import sizeof
 import numpy as np
 import torch
 
+from ggslam.abi.arrays import address
+from ggslam.abi.core import Voxel, VoxelMoments
+from ggslam.abi.cuda import VoxelBlock, VoxelLevel, VoxelLevelJob, VoxelSlot
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Upload
-from ggslam.interface.arrays import address
-from ggslam.interface.core.tracking import Voxel, VoxelMoments
-from ggslam.interface.cuda.tracking import VoxelBlock, VoxelLevel, VoxelLevelJob, VoxelSlot
 from ggslam.native.loader import load_library
 from ggslam.tracking.gicp import GicpTarget
 

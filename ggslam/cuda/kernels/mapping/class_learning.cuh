@@ -3,7 +3,7 @@
 // with the classifier's matrix are left to the caller: what is here turns logits into gradients, a warp for each row.
 #pragma once
 #include "common/platform.cuh"
-#include "interface/cuda/mapping.hpp"
+#include "abi/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 

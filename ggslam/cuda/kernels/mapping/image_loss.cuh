@@ -3,7 +3,7 @@
 // native/src/mapping/image_loss.hpp, stated in ggslam/mapping/cpu/losses.py.
 #pragma once
 #include "common/carver.cuh"
-#include "interface/cuda/mapping.hpp"
+#include "abi/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 

@@ -4,7 +4,7 @@
 #pragma once
 #include "common/carver.cuh"
 #include "common/sorting.cuh"
-#include "interface/cuda/mapping.hpp"
+#include "abi/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 

@@ -4,7 +4,7 @@
 // se3_exp (ggslam/scene/poses.py).
 #pragma once
 #include "common/platform.cuh"
-#include "interface/cuda/mapping.hpp"
+#include "abi/cuda/mapping.hpp"
 #include "mapping/image_loss.cuh"
 
 namespace ggslam::cuda {

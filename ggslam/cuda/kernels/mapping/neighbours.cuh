@@ -8,7 +8,7 @@
 // those of the lowest numbers are taken, whatever the parts.
 #pragma once
 #include "common/carver.cuh"
-#include "interface/cuda/mapping.hpp"
+#include "abi/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 

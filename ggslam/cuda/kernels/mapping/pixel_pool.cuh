@@ -7,7 +7,7 @@
 // same in every run, whatever the order of additions.
 #pragma once
 #include "common/platform.cuh"
-#include "interface/cuda/mapping.hpp"
+#include "abi/cuda/mapping.hpp"
 
 namespace ggslam::cuda {
 

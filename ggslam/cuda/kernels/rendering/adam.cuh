@@ -4,7 +4,7 @@
 // are computed here rather than looked up, so that other rates need nothing but other arguments.
 #pragma once
 #include "common/platform.cuh"
-#include "interface/cuda/rendering.hpp"
+#include "abi/cuda/rendering.hpp"
 
 namespace ggslam::cuda {
 

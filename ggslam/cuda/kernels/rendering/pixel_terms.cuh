@@ -8,7 +8,7 @@
 // map that a kernel is given are passed over, so that terms of another map lead nowhere.
 #pragma once
 #include "common/platform.cuh"
-#include "interface/cuda/rendering.hpp"
+#include "abi/cuda/rendering.hpp"
 
 namespace ggslam::cuda {
 

@@ -2,7 +2,7 @@
 // The rendering rules, stated in ggslam/rendering/reference.py.
 #pragma once
 #include "common/platform.cuh"
-#include "interface/cuda/rendering.hpp"
+#include "abi/cuda/rendering.hpp"
 
 namespace ggslam::cuda {
 

@@ -6,7 +6,7 @@
 // points are written in the order of the image whatever the order of the blocks.
 #pragma once
 #include "common/platform.cuh"
-#include "interface/cuda/tracking.hpp"
+#include "abi/cuda/tracking.hpp"
 #include "tracking/symmetric3.cuh"
 
 namespace ggslam::cuda {

@@ -3,7 +3,7 @@
 // the same order as native/src/tracking/kernels/voxel_lookup.hpp.
 #pragma once
 #include "common/platform.cuh"
-#include "interface/cuda/tracking.hpp"
+#include "abi/cuda/tracking.hpp"
 
 namespace ggslam::cuda {
 

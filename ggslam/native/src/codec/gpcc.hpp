@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "common/dispatch.hpp"
-#include "interface/core/codec.hpp"
+#include "abi/core/codec.hpp"
 
 namespace ggslam::gpcc {
 

@@ -10,7 +10,7 @@
 
 #include "common/context.hpp"
 #include "common/guard.hpp"
-#include "interface/core/codec.hpp"
+#include "abi/core/codec.hpp"
 
 namespace ggslam::gpcc {
 namespace {

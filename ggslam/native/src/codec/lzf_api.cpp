@@ -8,7 +8,7 @@
 
 #include "common/context.hpp"
 #include "common/guard.hpp"
-#include "interface/core/codec.hpp"
+#include "abi/core/codec.hpp"
 
 namespace {
 

@@ -1,10 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/context.hpp"
 #include "common/guard.hpp"
-#include "interface/core/common.hpp"
-
-#define GGSLAM_TEXT(macro) GGSLAM_TEXT_OF(macro)
-#define GGSLAM_TEXT_OF(words) #words
+#include "abi/core/codec.hpp"
+#include "abi/core/common.hpp"
+#include "abi/core/mapping.hpp"
+#include "abi/core/objects.hpp"
+#include "abi/core/rendering.hpp"
+#include "abi/core/sight.hpp"
+#include "abi/core/tracking.hpp"
+#include "abi/core/volumes.hpp"
 
 namespace ggslam {
 
@@ -35,7 +39,13 @@ Isa best_isa() {
 
 }  // namespace ggslam
 
-GGSLAM_EXPORT const char* ggslam_interface_hash() { return GGSLAM_TEXT(GGSLAM_INTERFACE_HASH); }
+GGSLAM_EXPORT const char* ggslam_abi_hash() { return GGSLAM_TEXT(GGSLAM_ABI_HASH); }
+
+GGSLAM_EXPORT const std::size_t* ggslam_structure_sizes(int* count) {
+  using Sizes = ggslam::SizesOf<GGSLAM_STRUCTURES>;
+  *count = Sizes::count;
+  return Sizes::bytes;
+}
 
 GGSLAM_EXPORT const char* ggslam_source_hash() { return GGSLAM_TEXT(GGSLAM_SOURCE_HASH); }
 

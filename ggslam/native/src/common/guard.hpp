@@ -16,7 +16,7 @@
 #include <stdexcept>
 #include <type_traits>
 
-#include "interface/core/common.hpp"
+#include "abi/core/common.hpp"
 
 #define GGSLAM_CATCH_ALL \
   catch (...) { return ::ggslam::note_failure(); }

@@ -5,7 +5,7 @@
 #include <cstdint>
 
 #include "common/dispatch.hpp"
-#include "interface/core/mapping.hpp"
+#include "abi/core/mapping.hpp"
 
 namespace ggslam {
 

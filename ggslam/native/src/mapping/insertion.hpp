@@ -4,7 +4,7 @@
 #include <cstdint>
 
 #include "common/dispatch.hpp"
-#include "interface/core/mapping.hpp"
+#include "abi/core/mapping.hpp"
 
 namespace ggslam {
 

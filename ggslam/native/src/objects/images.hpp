@@ -7,7 +7,7 @@
 #include <cstdint>
 
 #include "common/guard.hpp"
-#include "interface/core/objects.hpp"
+#include "abi/core/objects.hpp"
 
 namespace ggslam {
 

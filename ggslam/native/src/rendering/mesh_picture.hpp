@@ -4,7 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "interface/core/rendering.hpp"
+#include "abi/core/rendering.hpp"
 
 // Column, row and inverse depth; the latter is 0 in front of the nearest plane.
 struct ProjectedVertex {

@@ -17,7 +17,7 @@
 
 #include "common/buffer.hpp"
 #include "common/context.hpp"
-#include "interface/core/rendering.hpp"
+#include "abi/core/rendering.hpp"
 
 namespace ggslam {
 

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Parts of what `interface/core/sight.hpp` describes.
+// Parts of what `abi/core/sight.hpp` describes.
 #pragma once
 #include <cstddef>
 
 #include "common/dispatch.hpp"
-#include "interface/core/sight.hpp"
+#include "abi/core/sight.hpp"
 
 namespace ggslam {
 

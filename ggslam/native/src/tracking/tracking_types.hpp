@@ -4,7 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "interface/core/tracking.hpp"
+#include "abi/core/tracking.hpp"
 
 namespace ggslam {
 

@@ -6,7 +6,7 @@
 
 #include "common/buffer.hpp"
 #include "common/context.hpp"
-#include "interface/core/volumes.hpp"
+#include "abi/core/volumes.hpp"
 #include "volumes/esdf_types.hpp"
 #include "volumes/tsdf.hpp"
 

@@ -2,7 +2,7 @@
 // What is asked of a map.
 #pragma once
 #include "common/context.hpp"
-#include "interface/core/volumes.hpp"
+#include "abi/core/volumes.hpp"
 #include "volumes/occupancy_tree.hpp"
 
 namespace ggslam {

@@ -4,7 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "interface/core/volumes.hpp"
+#include "abi/core/volumes.hpp"
 #include "volumes/surface_cells.hpp"
 
 namespace ggslam::volumes {

@@ -5,7 +5,7 @@
 
 #include "common/context.hpp"
 #include "common/guard.hpp"
-#include "interface/core/volumes.hpp"
+#include "abi/core/volumes.hpp"
 #include "volumes/tsdf.hpp"
 
 using ggslam::volumes::Block;

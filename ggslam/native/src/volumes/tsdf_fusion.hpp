@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "common/vector.hpp"
-#include "interface/core/volumes.hpp"
+#include "abi/core/volumes.hpp"
 #include "volumes/tsdf.hpp"
 
 namespace ggslam {

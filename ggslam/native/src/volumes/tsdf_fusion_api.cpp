@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "common/context.hpp"
 #include "common/guard.hpp"
-#include "interface/core/volumes.hpp"
+#include "abi/core/volumes.hpp"
 #include "volumes/tsdf_scratch.hpp"
 
 namespace {

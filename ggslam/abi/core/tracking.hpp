@@ -1,0 +1,185 @@
+// SPDX-License-Identifier: Apache-2.0
+// The compiled core's tracking: points of a depth image, the voxels they are aligned to, alignment.
+#pragma once
+#include <cstddef>
+#include <cstdint>
+
+#include "abi/export.hpp"
+
+namespace ggslam {
+
+// How points are taken from a depth image.
+struct DepthPointsSettings {
+  float fx, fy, cx, cy;                // pixels; the centre of the top-left pixel is (0, 0)
+  float noise_constant, noise_square;  // sigma(z) = constant + square z^2, metres
+  float min_depth, max_depth;          // metres
+  float min_thickness, max_elongation;  // of the regularised covariance, see regularized_axes()
+  float min_neighbours;                // share of the window that must lie on the same surface
+  float max_weight;                    // of a point
+  int32_t width, height;
+  int32_t stride;       // pixels between points
+  int32_t window;       // the window has (2 window + 1)^2 samples
+  int32_t window_step;  // pixels between samples of the window
+};
+
+// Points to write.
+struct DepthPointsOutput {
+  float* points;       // [n, 3] camera frame, metres
+  float* normals;      // [n, 3] unit, towards the camera
+  float* covariances;  // [n, 6] xx xy xz yy yz zz, median eigenvalue 1
+  int32_t* pixels;     // [n, 2] u, v
+  float* weights;      // [n] (sigma(1 m) / sigma(z))^2, at most max_weight
+};
+
+// Gaussians of a map.
+struct TargetInput {
+  const float* means;           // [n, 3]
+  const float* quaternions;     // [n, 4] wxyz
+  const float* log_scales;      // [n, 3]
+  const float* opacity_logits;  // [n]
+  const int32_t* birth;         // [n] row of camera_positions, or negative: not known
+  const float* camera_positions;  // [cameras, 3]
+  int32_t count, cameras;
+};
+
+// How Gaussians are gathered in voxels.
+struct TargetSettings {
+  float voxel;              // edge of a fine voxel, metres; coarse voxels are 4 times as wide
+  float min_opacity_logit;
+  float min_thickness, max_thickness, max_elongation;
+  float scatter_weight;     // weight of the scatter of the means against the members' own covariances
+  float neighbour_weight;   // weight of the 26 neighbours in a voxel's scatter
+};
+
+// Sums over the members of a voxel.
+struct VoxelMoments {
+  float weight;
+  float offset[3];  // sum of w (mean - centre)
+  float outer[6];   // sum of w (mean - centre)(mean - centre)^T
+  float own[6];     // sum of w C with C the members' regularised covariances
+  float normal[3];  // sum of w (1 - thickness) n
+  float centre[3];
+};
+
+// A voxel of a target.
+struct alignas(64) Voxel {
+  float mean[3];
+  float weight;
+  float normal[3];
+  float reserved;
+  float covariance[6];  // regularised: median eigenvalue 1
+  float padding[2];
+};
+
+// How points are aligned to voxels.
+struct AlignSettings {
+  double translation_tolerance, rotation_tolerance;  // metres, radians
+  double coarse_kernel_factor;   // the robust kernel of the coarse level is this much wider
+  float noise_constant, noise_square;
+  float kernel_constant, kernel_sigmas;    // width of the Geman-McClure kernel: constant + sigmas sigma(z)
+  float overlap_constant, overlap_sigmas;  // a match is an inlier under this point-to-plane distance, likewise
+  float min_normal_dot;          // normals of a match agree to this cosine
+  float plane_variance;          // variance of a match along the normal in units of the regularised covariances
+  int32_t coarse_iterations, fine_iterations, coarse_points, min_matches;
+  float photometric_weight;      // factor of the photometric part
+  float huber;                   // grey levels in [0, 1]
+  float depth_tolerance;         // relative depth difference above which a pixel is occluded
+};
+
+// The points of a frame, as DepthPointsOutput has them.
+struct AlignPoints {
+  const float* points;
+  const float* normals;
+  const float* covariances;
+  const float* weights;
+  const float* depths;  // [n] along the axis of the camera that saw each, of which their noise follows; null: points' z
+  int32_t count;
+};
+
+// Points whose grey is compared.
+struct PhotometricPoints {
+  const float* points;     // [n, 3] frame's camera
+  const float* intensity;  // [n] grey in [0, 1]
+  int32_t count;
+};
+
+// What their grey is compared with.
+struct PhotometricReferenceView {
+  const float* pixels;  // [h, w, 4] grey, d grey / du, d grey / dv, depth
+  float fx, fy, cx, cy;
+  int32_t width, height;
+  float rotation[9], translation[3];  // T_reference_world
+};
+
+// What an alignment found.
+struct AlignResult {
+  double pose[16];         // T_world_camera, row by row
+  double normal_matrix[36];  // of the last linearisation, twist about the camera centre, world axes
+  double information[36];  // point-to-plane, 1 / sigma^2, twist about the camera centre
+  double cost;             // per unit of weight
+  double overlap, rmse;    // share of all points; metres
+  double photometric_residual, photometric_share, gain, bias;
+  int32_t coarse_iterations, fine_iterations, matches, inliers, converged, usable;
+};
+
+}  // namespace ggslam
+
+// Points on the grid of pixels `stride` apart, row by row; returns their number. The outputs have room for
+// ceil(width / stride) ceil(height / stride) points.
+GGSLAM_EXPORT int ggslam_depth_points(void* context, const float* depth, const ggslam::DepthPointsSettings* settings,
+                                      const ggslam::DepthPointsOutput* out);
+GGSLAM_EXPORT void* ggslam_gicp_target_create();
+GGSLAM_EXPORT int ggslam_gicp_target_destroy(void* target);
+GGSLAM_EXPORT int ggslam_gicp_target_build(void* context, void* target, const void* base,
+                                           const ggslam::TargetInput* input, const ggslam::TargetSettings* settings);
+
+// As ggslam_gicp_target_build without a base. The shapes of voxels that lie in `like`, a target made by one of the two,
+// with the same surroundings are copied from there; the result is the same.
+GGSLAM_EXPORT int ggslam_gicp_target_build_like(void* context, void* target, const void* like,
+                                                const ggslam::TargetInput* input,
+                                                const ggslam::TargetSettings* settings);
+
+// As ggslam_gicp_target_build, but leaves the voxels without shapes. Until ggslam_gicp_target_finish has been called, the
+// target may be a base, and be asked for its size, its moments and its blocks.
+GGSLAM_EXPORT int ggslam_gicp_target_gather(void* context, void* target, const void* base,
+                                            const ggslam::TargetInput* input, const ggslam::TargetSettings* settings);
+GGSLAM_EXPORT int ggslam_gicp_target_finish(void* context, void* target, const ggslam::TargetSettings* settings);
+
+// Number of voxels of a level (0 fine, 1 coarse).
+GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target, int level);
+
+// Copies the moments of a level's voxels, [n, 22] in the order of struct VoxelMoments.
+GGSLAM_EXPORT int ggslam_gicp_target_moments(const void* target, int level, float* out);
+
+// Copies a level's voxels, [n, 16] in the order of struct Voxel.
+GGSLAM_EXPORT int ggslam_gicp_target_voxels(const void* target, int level, float* out);
+
+// Copies the unit normals of some fine voxels, [n, 3]; zero where the index is negative.
+GGSLAM_EXPORT int ggslam_gicp_target_normals(const void* target, const int32_t* voxels, int64_t count, float* out);
+
+// Number of blocks of a level. Copies them unless `out` is null: [n, 3] key, occupied, first.
+GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target, int level, uint64_t* out);
+
+// Uses no thread but the caller's.
+GGSLAM_EXPORT void* ggslam_target_part_create(const void* context, const ggslam::TargetInput* input,
+                                              const ggslam::TargetSettings* settings, uint64_t rank);
+GGSLAM_EXPORT int ggslam_target_part_destroy(void* part);
+GGSLAM_EXPORT int64_t ggslam_target_part_bytes(const void* part);
+
+// `before` may be null; `target` is neither it nor in use.
+GGSLAM_EXPORT int ggslam_gicp_target_compose(void* context, void* target, const void* before, const void* const* parts,
+                                             int count, const ggslam::TargetSettings* settings);
+
+// Aligns points to a target from the guess `pose` (T_world_camera, row by row). `photometric_points` and `reference`
+// may be null. `match` and `squared_distance` have room for one entry per point.
+GGSLAM_EXPORT int ggslam_gicp_align(void* context, const void* target, const ggslam::AlignPoints* points,
+                                    const ggslam::AlignSettings* settings,
+                                    const ggslam::PhotometricPoints* photometric_points,
+                                    const ggslam::PhotometricReferenceView* reference, const double* pose_guess,
+                                    int32_t* match, float* squared_distance, ggslam::AlignResult* result);
+
+// One linearisation at a pose, for tests: level 0 fine, 1 coarse. h [36], b [6] in sums over points, twist about the
+// camera centre; returns the cost.
+GGSLAM_EXPORT double ggslam_gicp_linearize(void* context, const void* target, const ggslam::AlignPoints* points,
+                                           const ggslam::AlignSettings* settings, int level, const double* pose,
+                                           int32_t* match, float* squared_distance, double* h, double* b);
