@@ -1,0 +1,16 @@
+// SPDX-License-Identifier: Apache-2.0
+// The formulas that CPU and GPU share, for a vector of Gaussians: see ggslam/native/formulas.
+#pragma once
+#include "common/kernels/columns.hpp"
+#include "rendering/rasterizer.hpp"
+
+#define GGSLAM_FORMULAS ggslam::GGSLAM_ISA
+#define GGSLAM_FORMULA static inline
+#define GGSLAM_HOST_FORMULA static inline
+
+namespace ggslam::GGSLAM_ISA {
+
+typedef Float Number;
+typedef Mask Verdict;
+
+}  // namespace ggslam::GGSLAM_ISA
