@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.changes.fits import Fit, Judge
+from ggslam.changes.alignment_score import Fit, Judge
 from ggslam.changes.motions import ALIKE, likeliest_motions
+from ggslam.changes.rotation_ambiguity import upright_starts
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape, Target
 from ggslam.changes.sightings import Sightings
-from ggslam.changes.turns import upright_starts
 from ggslam.changes.upright import LEVEL, along_level, tilt, upright, without_tilt
 from ggslam.scene.poses import transform_points, turning_angle
 

@@ -14,7 +14,7 @@ from ggslam.cli.observer import ProgressObserver
 
 if TYPE_CHECKING:
     from ggslam.changes.change import Change
-    from ggslam.changes.found import ChangeTable
+    from ggslam.changes.change_table import ChangeTable
 
 EPILOG = """
 Poses and boxes are in the world of the older run. Things of which the newer visit saw too little are listed as unseen:

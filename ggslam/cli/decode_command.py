@@ -48,8 +48,8 @@ def decode(
     threads: options.Threads = None,
 ) -> None:
     """Decode an MPEG G-PCC stream, or one slice or box of it."""
-    from ggslam.jobs.code.coded_cells import is_cells_file
-    from ggslam.jobs.code.coding import decode_file
+    from ggslam.jobs.encode.coded_cells import is_cells_file
+    from ggslam.jobs.encode.coding import decode_file
     from ggslam.runs.map_container import is_container
 
     if is_cells_file(source):
@@ -74,7 +74,7 @@ def _unpack(source: Path, out: Path, in_part: bool, threads: int | None) -> None
 
 def _unpack_cells(source: Path, out: Path, in_part: bool, threads: int | None) -> None:
     """A grid store from a file of coded cells."""
-    from ggslam.jobs.code.coded_cells import decode_store
+    from ggslam.jobs.encode.coded_cells import decode_store
 
     if in_part:
         raise ConfigError("--slice and --box are for streams; a .ggc is decoded as a whole")

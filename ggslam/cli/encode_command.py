@@ -118,8 +118,8 @@ def encode(
 ) -> None:
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
     from ggslam.coding import CodecSettings
-    from ggslam.jobs.code.coded_cells import is_cells_file
-    from ggslam.jobs.code.coding import encode_file
+    from ggslam.jobs.encode.coded_cells import is_cells_file
+    from ggslam.jobs.encode.coding import encode_file
     from ggslam.jobs.submaps.stores import is_store
     from ggslam.runs.map_container import is_container
 
@@ -151,7 +151,7 @@ def _encode_store(
 ) -> None:  # fmt: skip
     """The Gaussians of a store, cell by cell."""
     from ggslam.cli.observer import ProgressObserver
-    from ggslam.jobs.code.store_coding import encode_store
+    from ggslam.jobs.encode.store_coding import encode_store
     from ggslam.jobs.tasks.engines import Engine
 
     with progress_bar() as bar:
@@ -241,8 +241,8 @@ def _rate(size: int, points: int) -> str:
 
 def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], plots: bool) -> None:
     from ggslam.coding.study import sweep_steps
-    from ggslam.jobs.code.coding import study_cloud
-    from ggslam.jobs.code.study import write_study
+    from ggslam.jobs.encode.coding import study_cloud
+    from ggslam.jobs.encode.study import write_study
 
     steps = sweep_steps(kinds)
     cloud = study_cloud(source, settings)

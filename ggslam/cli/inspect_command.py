@@ -150,8 +150,8 @@ def _print_formats() -> None:
 
 def _print_contents(path: Path) -> None:
     """What is in a .ggz or .ggc."""
-    from ggslam.jobs.code.coded_cells import is_cells_file
-    from ggslam.jobs.code.contents import contents_of_cells, contents_of_run
+    from ggslam.jobs.encode.coded_cells import is_cells_file
+    from ggslam.jobs.encode.contents import contents_of_cells, contents_of_run
 
     found = contents_of_cells(path) if is_cells_file(path) else contents_of_run(path)
     for name, value in found.facts:
@@ -166,7 +166,7 @@ def _print_contents(path: Path) -> None:
 
 
 def _print_stream(path: Path) -> None:
-    from ggslam.jobs.code.coding import list_stream
+    from ggslam.jobs.encode.coding import list_stream
 
     listing = list_stream(path)
     for unit in listing.units:

@@ -13,7 +13,7 @@ from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.jobs.changes.shown import ChangesShown
+    from ggslam.jobs.changes.saved_changes import ChangesShown
 
 EPILOG = """
 [bold]Examples[/]

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from ggslam.objects.border_kinds import is_convex, is_hollow, is_painted, lies_on
+from ggslam.objects.concave_parts import join_insides, join_panes
 from ggslam.objects.depth_surface import DepthSurface, surface_of
-from ggslam.objects.hollows import join_insides, join_panes
 from ggslam.objects.overhangs import join_overhangs
 from ggslam.objects.pixel_passes import connected_pieces, grow_regions, link_surfaces, share_near_planes
 from ggslam.objects.plane_colors import colors_to_compare, find_flat_things

@@ -11,9 +11,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from ggslam.objects.outlier_colors import HUE, SHADE, find_outlier_colors
 from ggslam.objects.pixel_passes import connected_pieces, count_alike
 from ggslam.objects.settings import GeometricSettings
-from ggslam.objects.strange_colors import HUE, SHADE, find_strange_colors
 
 _WIDTH = 160
 """Pixels across of the image in which colours are compared."""
@@ -64,8 +64,8 @@ def find_flat_things(color: np.ndarray, plane_of: np.ndarray, settings: Geometri
     things = np.zeros(plane.shape, np.int32)
     pieces = connected_pieces(plane, _links(plane, lab, _LINK * settings.color_contrast))
     for number in np.flatnonzero(large):
-        strange = _strange_pieces(pieces, plane == number, lab, settings.color_contrast)
-        kind = find_strange_colors(lab, plane == number, pieces, settings.color_contrast)
+        strange = _outlier_pieces(pieces, plane == number, lab, settings.color_contrast)
+        kind = find_outlier_colors(lab, plane == number, pieces, settings.color_contrast)
         _add_compact(things, strange | (kind > 0), strange | (kind == HUE), plane == number)
     enlarged = cv2.resize(things.astype(np.float32), plane_of.shape[::-1], interpolation=cv2.INTER_NEAREST)
     found = enlarged.astype(np.int32)
@@ -83,7 +83,7 @@ def _links(plane: np.ndarray, lab: np.ndarray, limit: float) -> tuple[np.ndarray
     return links[0], links[1]
 
 
-def _strange_pieces(pieces: np.ndarray, inside: np.ndarray, lab: np.ndarray, contrast: float) -> np.ndarray:
+def _outlier_pieces(pieces: np.ndarray, inside: np.ndarray, lab: np.ndarray, contrast: float) -> np.ndarray:
     """Pixels of the pieces of a plane (bool [h, w]) whose colour is their own, bool [h, w]."""
     out = np.zeros(inside.shape, bool)
     numbers, colors = pieces[inside], lab[inside]

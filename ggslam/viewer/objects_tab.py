@@ -14,8 +14,8 @@ from ggslam.errors import ConfigError
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
 from ggslam.viewer.cameras import upright_axes
 from ggslam.viewer.model import EditableMap, ListedObject
+from ggslam.viewer.safe_text import plain
 from ggslam.viewer.stage import Stage
-from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser

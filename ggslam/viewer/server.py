@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.scene.camera import Camera
+from ggslam.viewer.access import Gate, guard
 from ggslam.viewer.cameras import fitting_fov
-from ggslam.viewer.gate import Gate, guard
 
 if TYPE_CHECKING:
     import viser

@@ -15,8 +15,8 @@ import numpy as np
 from ggslam.errors import GgslamError
 from ggslam.viewer.cameras import Viewpoint, best_view, top_view, view_of_pose
 from ggslam.viewer.model import Box, Coloring, ViewedMap
+from ggslam.viewer.safe_text import plain
 from ggslam.viewer.scene_nodes import SceneNodes
-from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser

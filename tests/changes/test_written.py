@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from small_visits import Box, SmallVisit
 
+from ggslam.changes.change_table import ChangeTable
 from ggslam.changes.detection import ChangeDetector
-from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
 from ggslam.jobs.changes.changes import ChangesOutcome, write_changes
 from ggslam.jobs.changes.pictures import NEW_COLOR, OLD_COLOR

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError, RunFolderError
-from ggslam.jobs.changes.shown import ChangesShown, changes_of, read_changes, sentence_of
+from ggslam.jobs.changes.saved_changes import ChangesShown, changes_of, read_changes, sentence_of
 from ggslam.jobs.report.change_section import changes_part
 from ggslam.objects.history import History, VisitRecord
 from ggslam.runs.folder import RunFolder

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 from ggslam.cli.main import app
 from ggslam.coding.listing import list_units
 from ggslam.errors import FormatError, GgslamError, RunFolderError
-from ggslam.jobs.code.contents import contents_of_run
+from ggslam.jobs.encode.contents import contents_of_run
 from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_container import read_container

@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 
 from ggslam.cli.main import app
 from ggslam.errors import FormatError, RunFolderError
+from ggslam.jobs.eval.run import score_run
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.report.gather import load_run
 from ggslam.jobs.report.pages import write_comparison, write_report
-from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.slam.step_log import COLUMNS, read_table

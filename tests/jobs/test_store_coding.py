@@ -18,9 +18,9 @@ from small_runs import store_of
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.splats import gaussians_of, splat_attributes, splat_settings
 from ggslam.errors import FormatError
-from ggslam.jobs.code.coded_cells import CodedCells, decode_store
-from ggslam.jobs.code.contents import contents_of_cells
-from ggslam.jobs.code.store_coding import encode_store
+from ggslam.jobs.encode.coded_cells import CodedCells, decode_store
+from ggslam.jobs.encode.contents import contents_of_cells
+from ggslam.jobs.encode.store_coding import encode_store
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, cell_arrays, gaussians_of_cell, gaussians_to_bytes
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.runs.folder import RunFolder

@@ -19,8 +19,8 @@ from ggslam.objects.hole_refinement import Recorded
 from ggslam.objects.hole_views import CameraView, HoleView
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.plane_filling import Chart, as_seen, paint
+from ggslam.objects.removal_artifacts import drop_artifacts, places
 from ggslam.objects.segmented_rows import copies_of, join_gaussians
-from ggslam.objects.traces import drop_traces, places
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
@@ -148,7 +148,7 @@ def test_traces_that_bear_another_label_go_and_the_rest_stays(table: TableScene)
     gaussians.keep(rest)
     table.scene.votes = None
     count = len(gaussians)
-    dropped = drop_traces(table.scene, removed, table.views)
+    dropped = drop_artifacts(table.scene, removed, table.views)
     left = sum(row.tobytes() in wrong for row in gaussians.means.numpy())
     assert left < 0.05 * len(wrong)
     assert dropped == count - len(gaussians) < 3 * len(wrong)

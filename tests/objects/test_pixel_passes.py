@@ -31,7 +31,7 @@ from ggslam.sequences import open_sequence
 
 NAMES = (
     "link_surfaces", "connected_pieces", "grow_regions", "claim_planes", "share_near_planes", "find_bodies",
-    "count_borders", "count_contacts", "normals_of_inverse", "count_alike", "strange_colors",
+    "count_borders", "count_contacts", "normals_of_inverse", "count_alike", "outlier_colors",
 )  # fmt: skip
 PASSES = {name: getattr(depth_surface if name == "normals_of_inverse" else pixel_passes, name) for name in NAMES}
 Image = tuple[np.ndarray, np.ndarray, Camera]

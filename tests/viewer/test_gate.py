@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from ggslam.viewer.gate import MAX_MESSAGE_BYTES, Gate
+from ggslam.viewer.access import MAX_MESSAGE_BYTES, Gate
 from ggslam.viewer.server import address, close_server, open_server
 
 pytest.importorskip("viser")

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ggslam.changes.change import Change
-from ggslam.changes.found import ChangeTable
+from ggslam.changes.change_table import ChangeTable
 from ggslam.changes.sightings import Visit
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer

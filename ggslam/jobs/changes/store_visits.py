@@ -12,7 +12,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.changes.changes import ChangesOutcome, find_changes
-from ggslam.jobs.changes.ghosts import own_keyframes
+from ggslam.jobs.changes.stale_gaussians import own_keyframes
 from ggslam.jobs.changes.store_events import (
     add_evidence,
     events_of_changes,

@@ -32,10 +32,10 @@ from ggslam.objects.hole_refinement import Recorded
 from ggslam.objects.hole_views import CameraView
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.recoloring import parse_color
+from ggslam.objects.removal_artifacts import drop_artifacts, places
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import join_gaussians
 from ggslam.objects.table import ObjectTable
-from ggslam.objects.traces import drop_traces, places
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import MapFile, open_map
 from ggslam.runs.recordings import open_recording_of
@@ -291,7 +291,7 @@ def _mend(
     if settings is not None:
         filling = inpaint(scene, removed, source.views, displaced, recording, settings)
     else:
-        filling = Filling(dropped=sum(drop_traces(scene, part, source.views, displaced) for part in places(removed)))
+        filling = Filling(dropped=sum(drop_artifacts(scene, part, source.views, displaced) for part in places(removed)))
     rebuild_table(scene)
     return filling
 

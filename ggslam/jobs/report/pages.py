@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
-from ggslam.jobs.changes.shown import ChangesShown, changes_of
+from ggslam.jobs.changes.saved_changes import ChangesShown, changes_of
 from ggslam.jobs.report.comparison_page import by_recording, comparison_page
 from ggslam.jobs.report.gather import has_limit, load_run, save_truth
 from ggslam.jobs.report.run_data import FrameView, RunData

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from ggslam.jobs.report.change_section import changes_part
-from ggslam.jobs.report.metric_words import MEANINGS, METRICS, TILES
+from ggslam.jobs.report.metrics import MEANINGS, METRICS, TILES
 from ggslam.jobs.report.mover_section import movers_part
 from ggslam.jobs.report.run_data import RunData, stage_seconds
 from ggslam.jobs.report.run_plots import (

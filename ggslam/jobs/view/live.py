@@ -21,10 +21,10 @@ from ggslam.scene.poses import inverse
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
 from ggslam.viewer.cameras import vertical_fov, view_from_behind
+from ggslam.viewer.safe_text import plain
 from ggslam.viewer.scene_nodes import SceneNodes
 from ggslam.viewer.server import keep_fitting
 from ggslam.viewer.splats import most_visible, splats_of
-from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser

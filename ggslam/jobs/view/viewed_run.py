@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
-from ggslam.jobs.changes.shown import ChangesShown, changes_of, read_changes, sentence_of
+from ggslam.jobs.changes.saved_changes import ChangesShown, changes_of, read_changes, sentence_of
 from ggslam.jobs.edit.edited_file import edited_name
 from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.objects.pixel_passes import strange_colors
+from ggslam.objects.pixel_passes import outlier_colors
 
 BRIGHTNESS, HUE = 1, 2
 
@@ -29,7 +29,7 @@ _SAME_HUE = 0.2
 _LEAST_CELLS = 6
 
 
-def find_strange_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray, contrast: float) -> np.ndarray:
+def find_outlier_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray, contrast: float) -> np.ndarray:
     """Pixels of a plane whose colour occurs in few places of it.
 
     Args:
@@ -48,7 +48,7 @@ def find_strange_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray,
     if np.count_nonzero(np.bincount(rows // size * _CELLS * 2 + columns // size) >= least) < _LEAST_CELLS:
         return np.zeros(inside.shape, np.uint8)
     width = max(contrast, _LEAST_WIDTH)
-    return strange_colors(
+    return outlier_colors(
         lab, inside, pieces, light=_light(rows, columns, lab[rows, columns, 0]),
         bins=(_BRIGHTNESS * width, _HUE * width, _HUE * width), cell=size, least_cell=least, occurs=_OCCURS,
         usual=_USUAL, base=_BASE, same_hue=_SAME_HUE * contrast, shade=SHADE,

@@ -18,7 +18,7 @@ UNNAMED = 1 << 16
 
 
 @dataclass
-class Thing:
+class Candidate:
     """Something in the map of one visit.
 
     Attributes:
@@ -62,21 +62,21 @@ class JudgedSurface:
     other: Evidence
     within: np.ndarray
 
-    def thing(self, label: int, ids: tuple[int, ...], rows: np.ndarray, settings: ChangeSettings) -> Thing:
+    def thing(self, label: int, ids: tuple[int, ...], rows: np.ndarray, settings: ChangeSettings) -> Candidate:
         """Some rows as a thing."""
         other = self.other.at(rows)
         gone, there = other.is_gone(settings.min_views), other.is_there(settings.min_views)
         judged = int(gone.sum() + there.sum())
         apart = color_apart(self.colors[rows[there]], other.color[there])
-        return Thing(label, ids, rows, judged / max(1, len(rows)), int(gone.sum()) / max(1, judged), apart)
+        return Candidate(label, ids, rows, judged / max(1, len(rows)), int(gone.sum()) / max(1, judged), apart)
 
-    def extent(self, thing: Thing) -> float:
+    def extent(self, thing: Candidate) -> float:
         """A thing's size: the diagonal of the box that holds the middle nine tenths of it, metres."""
         low, high = np.percentile(self.points[thing.rows], [5, 95], axis=0)
         return float(np.linalg.norm(high - low))
 
 
-def things_by_id(judged: JudgedSurface, settings: ChangeSettings) -> list[Thing]:
+def candidates_by_id(judged: JudgedSurface, settings: ChangeSettings) -> list[Candidate]:
     """Every object of the map as a thing, and what is gone of what belongs to none."""
     found = []
     for i in np.unique(judged.ids[judged.ids > 0]).tolist():
@@ -86,7 +86,7 @@ def things_by_id(judged: JudgedSurface, settings: ChangeSettings) -> list[Thing]
     return found + _gone_parts(judged, judged.ids == 0, settings)
 
 
-def things_by_surface(judged: JudgedSurface, settings: ChangeSettings) -> list[Thing]:
+def candidates_by_surface(judged: JudgedSurface, settings: ChangeSettings) -> list[Candidate]:
     """What is gone, in connected pieces, each with the whole of those objects that are gone for the most part: an
     object that one visit cut in two is one thing, and of one that the visit took for one with the table the part that
     is gone. Objects that stayed follow, for their looks."""
@@ -110,12 +110,12 @@ def color_apart(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.median(np.abs(gain * one - other), axis=0).mean())
 
 
-def _gone_parts(judged: JudgedSurface, among: np.ndarray, settings: ChangeSettings) -> list[Thing]:
+def _gone_parts(judged: JudgedSurface, among: np.ndarray, settings: ChangeSettings) -> list[Candidate]:
     gone = judged.other.is_gone(settings.min_views)
     whole = _ids_mostly_gone(judged, gone, settings)
     part_of_whole = np.isin(judged.ids, whole)
     rows = np.flatnonzero(among & (gone | part_of_whole) & (judged.other.through + judged.other.present > 0))
-    found: list[Thing] = []
+    found: list[Candidate] = []
     for piece in connected_pieces(judged.points[rows], settings.linking_m):
         members = rows[piece]
         if gone[members].sum() < settings.min_points:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from ggslam.errors import SequenceError
-from ggslam.jobs.changes.ghosts import without_ghosts
+from ggslam.jobs.changes.stale_gaussians import without_stale_gaussians
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -54,7 +54,7 @@ BIRTHS = [0, 0, 0, 0, 1]
 
 def test_what_the_earlier_map_shows_before_a_wall_goes() -> None:
     source, placed = visit(POINTS, BIRTHS, own=2, depth=np.full((30, 40), WALL_M))
-    kept = without_ghosts(source, placed, []).means.numpy()
+    kept = without_stale_gaussians(source, placed, []).means.numpy()
     assert np.allclose(kept, np.array(POINTS[1:], np.float32)) and len(placed.gaussians) == len(POINTS)
 
 
@@ -62,7 +62,7 @@ def test_each_keyframe_looks_from_where_it_is() -> None:
     """Two metres beside the first, nothing of the earlier map is in view."""
     source, placed = visit(POINTS, BIRTHS, own=2, depth=np.full((30, 40), WALL_M))
     placed.T_world_camera[2, 0, 3] = -5.0
-    assert len(without_ghosts(source, placed, [])) == len(POINTS)
+    assert len(without_stale_gaussians(source, placed, [])) == len(POINTS)
 
 
 @pytest.mark.parametrize("case", ["one keyframe", "no depth", "an edge beside it", "no recording", "no earlier map"])
@@ -77,7 +77,7 @@ def test_what_is_not_surely_gone_stays(case: str) -> None:
     if case == "no earlier map":
         source.record.keyframes = source.record.keyframes[1:]
     notes: list[str] = []
-    assert len(without_ghosts(source, placed, notes)) == 1
+    assert len(without_stale_gaussians(source, placed, notes)) == 1
     assert bool(notes) == (case == "no recording") and all("tuesday" in note for note in notes)
 
 
@@ -90,7 +90,7 @@ def test_an_object_in_whose_place_own_masks_show_another_has_become_it(
     """Masks show another; itself; none; another in front of it."""
     mask, depth = np.full((30, 40), shown, np.uint16), np.full((30, 40), wall_m)
     source, placed = visit([[0, 0, 1.99], [0.1, 0, 2.0], [0, 0, 2.5]], [0, 0, 0], own=2, depth=depth, mask=mask)
-    assert without_ghosts(source, placed, []).object_id.tolist() == [expected] * 3
+    assert without_stale_gaussians(source, placed, []).object_id.tolist() == [expected] * 3
     assert placed.gaussians.object_id.tolist() == [7] * 3
 
 
@@ -103,7 +103,7 @@ def test_an_object_that_masks_show_elsewhere_moved_and_keeps_what_the_visit_made
     mask[20:23, 20:23] = elsewhere
     points, births = [[0, 0, 1.99], [0.1, 0, 2.0], [0.1, 0.45, 2.0]], [0, 0, 1]
     source, placed = visit(points, births, own=2, depth=np.full((30, 40), WALL_M), mask=mask)
-    assert without_ghosts(source, placed, []).object_id.tolist() == [29, 29, expected]
+    assert without_stale_gaussians(source, placed, []).object_id.tolist() == [29, 29, expected]
 
 
 def test_frames_that_cannot_be_read_are_left_out_and_named() -> None:
@@ -116,5 +116,5 @@ def test_frames_that_cannot_be_read_are_left_out_and_named() -> None:
         return whole(index, masks)
 
     source.sequence.frame = frame
-    assert len(without_ghosts(source, placed, notes)) == len(POINTS) - 1
+    assert len(without_stale_gaussians(source, placed, notes)) == len(POINTS) - 1
     assert notes == ["tuesday: left out: depth/000001.png: ends too early"]

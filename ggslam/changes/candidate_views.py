@@ -47,7 +47,7 @@ class Residuals:
     points: np.ndarray
 
 
-class ThingViews:
+class CandidateViews:
     """A thing in the pictures of a visit.
 
     Args:

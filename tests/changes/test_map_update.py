@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 from small_visits import Box, SmallVisit, detect
 
-from ggslam.changes.renewal import NEW, OLD, Renewal
+from ggslam.changes.map_update import NEW, OLD, MapUpdate
 from ggslam.changes.settings import ChangeSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, transform_points
@@ -26,7 +26,7 @@ MOVED = Box(2, (-0.05, -0.3), turn=50)
 class Pair:
     """The maps of two visits, and what tells which of their Gaussians hold."""
 
-    renewal: Renewal
+    map_update: MapUpdate
     old: GaussianMap
     new: GaussianMap
 
@@ -37,7 +37,7 @@ class Pair:
 def pair_of(old: SmallVisit, new: SmallVisit) -> Pair:
     found, detector = detect(old, new)
     maps = [visit.gaussians for visit in detector.visits]
-    return Pair(Renewal(detector, found, ChangeSettings()), maps[0], maps[1])
+    return Pair(MapUpdate(detector, found, ChangeSettings()), maps[0], maps[1])
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +49,8 @@ def pair() -> Pair:
 @pytest.mark.long("visits to a small scene are rendered and compared")
 def test_what_went_is_gone_and_what_stayed_is_not(pair: Pair) -> None:
     before, ids = pair.old.means.numpy().astype(float), pair.ids(OLD).copy()
-    came = pair.renewal.came(pair.new)
-    fate = pair.renewal.renew(pair.old)
+    came = pair.map_update.came(pair.new)
+    fate = pair.map_update.renew(pair.old)
     assert fate.gone[ids == CRATE.id].all() and not fate.gone[ids == BRICK.id].any()
     assert fate.gone[ids == 1].mean() < 0.01  # the floor
     assert came[np.isin(pair.ids(NEW), (MOVED.id, PLATE.id))].all() and not came[pair.ids(NEW) == BRICK.id].any()
@@ -67,20 +67,20 @@ def test_what_went_is_gone_and_what_stayed_is_not(pair: Pair) -> None:
 
 def test_measured_points_of_what_went_count_nothing_and_of_what_came_most(pair: Pair) -> None:
     def weights(number: int, box: Box) -> np.ndarray:
-        return pair.renewal.weights(number, box.surface(0.02)[0])
+        return pair.map_update.weights(number, box.surface(0.02)[0])
 
     assert weights(OLD, CRATE).mean() < 0.1 and weights(OLD, BRICK).min() == 1
     favour = ChangeSettings().favour
     assert np.median(weights(NEW, PLATE)) > 1e5 and np.median(weights(NEW, BRICK)) == favour
     middle = SmallVisit([])
-    assert pair.renewal.holds(np.zeros((0, 3))).shape == (0,) and middle.boxes == []
+    assert pair.map_update.holds(np.zeros((0, 3))).shape == (0,) and middle.boxes == []
 
 
 def test_views_that_hold_what_changed_are_known(pair: Pair) -> None:
     visit = SmallVisit([BRICK], target=(0.1, 0.5, 0.0), distance=0.15, around=(80, 100)).build()
-    assert pair.renewal.shows_changes(visit.cameras, visit.T_world_camera, 20).tolist() == [False, False]
+    assert pair.map_update.shows_changes(visit.cameras, visit.T_world_camera, 20).tolist() == [False, False]
     everything = SmallVisit([]).build()
-    assert pair.renewal.shows_changes(everything.cameras, everything.T_world_camera, 20).all()
+    assert pair.map_update.shows_changes(everything.cameras, everything.T_world_camera, 20).all()
 
 
 def test_what_the_newer_visit_did_not_see_stays_as_it_was() -> None:
@@ -88,18 +88,18 @@ def test_what_the_newer_visit_did_not_see_stays_as_it_was() -> None:
     corner = SmallVisit([], target=(-0.55, 0.55, 0.0), distance=0.2, around=(100, 135, 170))
     pair = pair_of(SmallVisit([CUP, CRATE, BRICK]), corner)
     before = pair.old.means.clone()
-    fate = pair.renewal.renew(pair.old)
-    assert pair.renewal.found.changes == []
+    fate = pair.map_update.renew(pair.old)
+    assert pair.map_update.found.changes == []
     assert not fate.gone.any() and not fate.moved.any() and bool((pair.old.means == before).all())
 
 
 def test_an_object_of_another_look_is_taken_from_the_newer_visit() -> None:
     painted = Box(2, CUP.at, hue=3.0)
     pair = pair_of(SmallVisit([CUP, CRATE]), SmallVisit([painted, CRATE]))
-    assert [change.kind for change in pair.renewal.found.changes] == ["look"]
-    fate = pair.renewal.renew(pair.old)
+    assert [change.kind for change in pair.map_update.found.changes] == ["look"]
+    fate = pair.map_update.renew(pair.old)
     ids = pair.ids(OLD)
-    tree = cKDTree(pair.new.means.numpy()[pair.renewal.came(pair.new)])
+    tree = cKDTree(pair.new.means.numpy()[pair.map_update.came(pair.new)])
     assert fate.gone[ids == CUP.id].mean() > 0.9 and not fate.gone[ids == CRATE.id].any()
     assert tree.query(pair.old.means.numpy()[fate.gone])[0].max() < 0.01
 
@@ -114,6 +114,6 @@ def test_what_was_brought_to_another_things_old_place_is_not_that_things() -> No
     assert [change.kind for change in found.changes] == ["moved", "removed"]
     gaussians = detector.visits[OLD].gaussians
     ids = gaussians.object_id.numpy().copy()
-    fate = Renewal(detector, found, ChangeSettings()).renew(gaussians)
+    fate = MapUpdate(detector, found, ChangeSettings()).renew(gaussians)
     assert fate.moved[ids == 2].any() and not (fate.moved & fate.gone).any()
     assert fate.gone[np.isin(ids, (3, 4))].all()

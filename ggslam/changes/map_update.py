@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from ggslam.changes.candidates import Candidate
 from ggslam.changes.change import Change, Detection
 from ggslam.changes.detection import ChangeDetector
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Evidence
-from ggslam.changes.things import Thing
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, transform_points
@@ -41,7 +41,7 @@ class Fate:
     moved: np.ndarray
 
 
-class Renewal:
+class MapUpdate:
     """Tells what two visits' maps have to hold of the state at the newer one.
 
     Args:
@@ -92,7 +92,7 @@ class Renewal:
                 found.append((change, own))
         return found
 
-    def rows_of(self, number: int, thing: Thing, gaussians: GaussianMap) -> np.ndarray:
+    def rows_of(self, number: int, thing: Candidate, gaussians: GaussianMap) -> np.ndarray:
         """bool [N]: the Gaussians of a thing of the older (0) or newer (1) visit: those of its objects, and of what
         belongs to no object those whose surface is the thing's."""
         ids = gaussians.object_id.numpy()

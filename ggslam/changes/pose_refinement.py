@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.changes.thing_views import ThingViews
+from ggslam.changes.candidate_views import CandidateViews
 from ggslam.changes.upright import LEVEL, tilt, upright, without_tilt
 from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.scene.poses import inverse, se3_exp, transform_points, translation
@@ -46,7 +46,7 @@ class _Terms:
     g: np.ndarray
 
 
-class Placing:
+class PoseRefinement:
     """A thing in two visits.
 
     Args:
@@ -54,7 +54,7 @@ class Placing:
         views: of it in the older and the newer visit.
     """
 
-    def __init__(self, old: ColoredSurface, new: ColoredSurface, views: tuple[ThingViews, ThingViews]) -> None:
+    def __init__(self, old: ColoredSurface, new: ColoredSurface, views: tuple[CandidateViews, CandidateViews]) -> None:
         rng = np.random.default_rng(0)
         self._old, self._new = (s.at(rng.permutation(len(s))[:_SAMPLE]) for s in (old, new))
         self._views = views

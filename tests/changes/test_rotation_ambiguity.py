@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from small_visits import Box, SmallVisit, detect
 
-from ggslam.changes import turns
-from ggslam.changes.fits import Fit
+from ggslam.changes import rotation_ambiguity
+from ggslam.changes.alignment_score import Fit
+from ggslam.changes.rotation_ambiguity import hidden_sector, with_rotation_ambiguity
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
-from ggslam.changes.turns import hidden_sector, tell_turn
 from ggslam.scene.poses import inverse, rotation_about, transform_points, turning_angle
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -69,12 +69,12 @@ def test_visits_that_saw_different_sides_do_not_tell_a_turn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """Where no other turn fits as well, and the thing may stand there turned otherwise."""
-    monkeypatch.setattr(turns, "_others", lambda *args: iter(()))
+    monkeypatch.setattr(rotation_ambiguity, "_others", lambda *args: iter(()))
     T = np.eye(4)
     if tilts:
         T[:3, :3] = rotation_about(np.array([1.0, 0, 0]), 90)
     judge: Any = SimpleNamespace(settings=ChangeSettings(), clashes=lambda motions: np.zeros(len(motions)))
-    found = tell_turn(Fit(T, share, 1.0, color_apart), shape, shape, judge, hidden, UP)
+    found = with_rotation_ambiguity(Fit(T, share, 1.0, color_apart), shape, shape, judge, hidden, UP)
     assert found.turn_known == known
     assert known or "different sides" in str(found.turn_reason)
 
@@ -91,9 +91,9 @@ def test_what_fell_over_is_also_tried_rolled_and_upright(monkeypatch: pytest.Mon
         return Fit(T, 0.9 if np.allclose(T[:3, :3], rolled, atol=1e-6) else 0.0, 1.0, 0.0)
 
     target = SimpleNamespace(refine=lambda sample, T, reach, free: T)
-    monkeypatch.setattr(turns, "Target", lambda *args, **kwargs: target)
+    monkeypatch.setattr(rotation_ambiguity, "Target", lambda *args, **kwargs: target)
     judge: Any = SimpleNamespace(fit=fit, settings=ChangeSettings())
-    found = tell_turn(Fit(lying, 0.9, 1.0, 0.0), THING, THING, judge, (0, 0), UP)
+    found = with_rotation_ambiguity(Fit(lying, 0.9, 1.0, 0.0), THING, THING, judge, (0, 0), UP)
     assert found.as_good_deg == 60
     assert any(np.allclose(T[:3, :3], np.eye(3)) for T in tried)
 
@@ -103,7 +103,7 @@ def test_a_shape_of_which_visits_saw_parts_tells_a_turn_if_others_find_no_room(
     free_m: float, known: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its middle may be so far aside if it is turned by 90 degrees more; everywhere else the visits saw through."""
-    monkeypatch.setattr(turns, "_others", lambda *args: iter(()))
+    monkeypatch.setattr(rotation_ambiguity, "_others", lambda *args: iter(()))
 
     def clashes(motions: list[np.ndarray]) -> np.ndarray:
         place = np.array([*THING.points.mean(0), 1.0])
@@ -113,7 +113,8 @@ def test_a_shape_of_which_visits_saw_parts_tells_a_turn_if_others_find_no_room(
         return np.where(fits, 0.01, 0.2)
 
     judge: Any = SimpleNamespace(settings=ChangeSettings(), clashes=clashes)
-    assert tell_turn(Fit(np.eye(4), 1.0, 1.0, 0.0), THING, THING, judge, (240, 240), UP).turn_known == known
+    found = with_rotation_ambiguity(Fit(np.eye(4), 1.0, 1.0, 0.0), THING, THING, judge, (240, 240), UP)
+    assert found.turn_known == known
 
 
 @pytest.mark.long("shapes are compared from starts all around")
@@ -149,9 +150,9 @@ def test_another_turn_between_the_probed_ones_that_fits_about_as_well(
         fits = share if np.allclose(T, np.eye(4)) else other_share if np.allclose(T, other) else 0.0
         return Fit(T, share=fits, seen=1.0, color_apart=0.0)
 
-    monkeypatch.setattr(turns, "Target", lambda *args, **kwargs: SimpleNamespace(refine=refine))
+    monkeypatch.setattr(rotation_ambiguity, "Target", lambda *args, **kwargs: SimpleNamespace(refine=refine))
     judge: Any = SimpleNamespace(fit=fit, settings=ChangeSettings())
-    found = tell_turn(fit(np.eye(4)), THING, THING, judge, (60, 60), UP)
+    found = with_rotation_ambiguity(fit(np.eye(4)), THING, THING, judge, (60, 60), UP)
     assert found.as_good_deg == told and found.turn_known == (told is None)
 
 

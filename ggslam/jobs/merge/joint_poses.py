@@ -11,7 +11,7 @@ from ggslam.jobs.progress import Observer
 from ggslam.merging.common_ground import CommonGround, find_common_ground
 from ggslam.merging.coverage import PlacedRun
 from ggslam.merging.joint_graph import JointPoses, Pair, attachment_order, solve_joint_graph
-from ggslam.merging.moving import move_map, with_channels
+from ggslam.merging.joint_map import move_map, with_channels
 from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.scene.identity import IDENTITY_CHANNELS

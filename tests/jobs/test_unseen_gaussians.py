@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ggslam.jobs.merge.unseen import UnseenGaussians, find_seen
+from ggslam.jobs.merge.unseen_gaussians import UnseenGaussians, find_seen
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame

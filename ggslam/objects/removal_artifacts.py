@@ -49,10 +49,10 @@ def places(removed: GaussianTensors, touching: float = 0.05) -> list[GaussianTen
     return [copies_of(removed, part == k) for k in large]
 
 
-def drop_traces(
+def drop_artifacts(
     scene: SegmentedMap, removed: GaussianTensors, views: Sequence[CameraView], ignored: Sequence[int] = ()
 ) -> int:
-    """Drops the traces of what was removed; returns how many Gaussians.
+    """Drops what a removed object left in its surroundings; returns how many Gaussians.
 
     Args:
         scene: the map without what was removed; changed in place.
@@ -62,12 +62,12 @@ def drop_traces(
     """
     around = ~np.isin(scene.gaussians.object_id.numpy(), list(ignored))
     dropped = np.zeros(len(around), bool)
-    dropped[around] = traces(copies_of(scene.gaussians, around), removed, views)
+    dropped[around] = find_artifacts(copies_of(scene.gaussians, around), removed, views)
     keep_rows(scene, ~dropped)
     return int(dropped.sum())
 
 
-def traces(kept: Gaussians, removed: Gaussians, views: Sequence[CameraView]) -> np.ndarray:
+def find_artifacts(kept: Gaussians, removed: Gaussians, views: Sequence[CameraView]) -> np.ndarray:
     """Which of the kept Gaussians are no observation of what is there without the object, bool [N].
 
     What such a Gaussian adds to the views goes mostly to pixels that the object covers, or nowhere: it was trained to
@@ -98,7 +98,7 @@ def traces(kept: Gaussians, removed: Gaussians, views: Sequence[CameraView]) -> 
 
 
 def _before(points: np.ndarray, removed: Gaussians, view: CameraView) -> np.ndarray:
-    """Which points [N, 3] stand clearly before an object, bool [N]: what they hide of it is no trace of it."""
+    """Which points [N, 3] stand clearly before an object, bool [N]: what they hide of it is no artifact of it."""
     out = CpuRasterizer().forward(removed, view.camera, view.T_camera_world, features=False)
     depth = np.where(out.alpha.numpy() > COVERED, out.expected_depth.numpy(), np.inf).astype(np.float32)
     nearest = cv2.erode(depth, np.ones((5, 5), np.uint8))

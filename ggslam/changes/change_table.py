@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.changes.candidates import Candidate, JudgedSurface
 from ggslam.changes.change import Change, Detection
-from ggslam.changes.things import JudgedSurface, Thing
 from ggslam.objects.boxes import oriented_box
 from ggslam.scene.object_names import object_label
 from ggslam.scene.oriented_box import OrientedBox
@@ -83,7 +83,7 @@ class ChangeTable:
             entry["fit"] = {k: v for k, v in asdict(change.fit).items() if k != "T_new_old"}
         return entry
 
-    def _side(self, change: Change, number: int, thing: Thing) -> dict[str, Any]:
+    def _side(self, change: Change, number: int, thing: Candidate) -> dict[str, Any]:
         box = self.box(change, number)
         return {
             "ids": list(thing.ids), "points": len(thing), "seen_by_other": thing.seen, "not_there": thing.changed,

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ggslam.changes.candidates import color_apart
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
 from ggslam.changes.sightings import Evidence, Sightings
-from ggslam.changes.things import color_apart
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sight.margin import Margin
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from ggslam.changes.placing import Placing
+from ggslam.changes.candidate_views import CandidateViews
+from ggslam.changes.pose_refinement import PoseRefinement
 from ggslam.changes.shape import Shape
 from ggslam.changes.sightings import Picture
-from ggslam.changes.thing_views import ThingViews
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, se3_exp, transform_points
 
@@ -62,11 +62,11 @@ def points_on_board(pictures: list[Picture]) -> tuple[np.ndarray, np.ndarray]:
     return points, ways / np.linalg.norm(ways, axis=1, keepdims=True)
 
 
-def visit(angles: tuple[int, ...], T_world_board: np.ndarray) -> tuple[Shape, ThingViews]:
+def visit(angles: tuple[int, ...], T_world_board: np.ndarray) -> tuple[Shape, CandidateViews]:
     pictures = [picture(angle, T_world_board) for angle in angles]
     points, toward = points_on_board(pictures)
     shape = Shape.from_views(points, np.full(points.shape, 0.5, np.float32), toward)
-    return shape, ThingViews(pictures, cKDTree(points), np.arange(len(points)), (1,))
+    return shape, CandidateViews(pictures, cKDTree(points), np.arange(len(points)), (1,))
 
 
 def off(T: np.ndarray) -> tuple[float, float]:
@@ -83,13 +83,13 @@ def test_a_board_is_as_thick_as_it_is_whichever_side_was_seen(
     start = MOVED.copy()
     start[:3, 3] += MOVED[:3, :3] @ [0.01, 2 * HALF[1], 0]  # its front laid upon its back
     start = start @ se3_exp(np.array([0, 0, 0, 0, 0, np.radians(turned)]))
-    shift, turn = off(Placing(old[0], new[0], (old[1], new[1])).place(start, UP))
+    shift, turn = off(PoseRefinement(old[0], new[0], (old[1], new[1])).place(start, UP))
     assert shift < within and turn < 1.5
 
 
 def test_faces_that_are_laid_upon_the_other_sides_are_where_they_cannot_be() -> None:
     old, new = visit(FRONT, np.eye(4)), visit(BACK, MOVED)
-    placing = Placing(old[0], new[0], (old[1], new[1]))
+    placing = PoseRefinement(old[0], new[0], (old[1], new[1]))
     wrong = MOVED.copy()
     wrong[:3, 3] += MOVED[:3, :3] @ [0, 2 * HALF[1], 0]
     assert placing.cost(MOVED) < 0.3 * placing.cost(wrong)
@@ -106,7 +106,7 @@ def test_a_face_is_not_where_it_would_be_seen_from_behind() -> None:
 def test_what_tilts_a_little_stands_upright() -> None:
     old, new = visit(FRONT, np.eye(4)), visit(FRONT, MOVED)
     leaning = MOVED @ se3_exp(np.array([0, 0, 0, np.radians(4), 0, 0]))
-    T = Placing(old[0], new[0], (old[1], new[1])).place(leaning, UP)
+    T = PoseRefinement(old[0], new[0], (old[1], new[1])).place(leaning, UP)
     assert T[2, 2] > 1 - 1e-9 and off(T)[0] < 0.004
 
 
@@ -115,14 +115,14 @@ def test_it_is_placed_near_by_or_not_at_all() -> None:
     old, new = visit(FRONT, np.eye(4)), visit(FRONT, MOVED)
     start = MOVED.copy()
     start[0, 3] += 0.12
-    T = Placing(old[0], new[0], (old[1], new[1])).place(start, UP)
+    T = PoseRefinement(old[0], new[0], (old[1], new[1])).place(start, UP)
     assert np.linalg.norm((T - start)[:3, 3]) < 0.08
 
 
 def test_what_no_picture_shows_stays_where_it_was_found() -> None:
     old, new = visit(FRONT, np.eye(4)), visit(BACK, MOVED)
-    none = ThingViews([], cKDTree(new[0].points), np.arange(len(new[0])), (1,))
-    assert np.array_equal(Placing(old[0], new[0], (old[1], none)).place(MOVED, UP), MOVED)
+    none = CandidateViews([], cKDTree(new[0].points), np.arange(len(new[0])), (1,))
+    assert np.array_equal(PoseRefinement(old[0], new[0], (old[1], none)).place(MOVED, UP), MOVED)
     assert len(old[1]) == len(FRONT) and not len(none)
 
 

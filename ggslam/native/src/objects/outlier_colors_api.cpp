@@ -15,7 +15,7 @@ enum Kind : uint8_t { kOrdinary = 0, kInAnotherLight = 1, kOfAnotherHue = 2 };
 // The colours of a plane in bins, and where in the image each bin occurs.
 class PlaneColors {
  public:
-  explicit PlaneColors(const StrangeColorsJob& job) : job_(job) {
+  explicit PlaneColors(const OutlierColorsJob& job) : job_(job) {
     place_pixels();
     number_bins();
     count();
@@ -109,7 +109,7 @@ class PlaneColors {
       for (double& mean : means_[bin]) mean /= static_cast<double>(counts[bin]);
   }
 
-  const StrangeColorsJob& job_;
+  const OutlierColorsJob& job_;
   std::vector<std::int64_t> pixels_;  // and of each:
   std::vector<std::size_t> cell_, bin_;
   std::vector<std::array<int, 3>> of_pixel_;
@@ -135,9 +135,9 @@ std::vector<Kind> kinds_of(const PlaneColors& colors) {
 }  // namespace
 }  // namespace ggslam
 
-GGSLAM_EXPORT int ggslam_strange_colors(const ggslam::StrangeColorsJob* job_) try {
+GGSLAM_EXPORT int ggslam_outlier_colors(const ggslam::OutlierColorsJob* job_) try {
   using namespace ggslam;
-  const StrangeColorsJob& job = object_of<StrangeColorsJob>(job_);
+  const OutlierColorsJob& job = object_of<OutlierColorsJob>(job_);
   check_size(job.height, job.width);
   check_range("cell", job.cell, 1, kMostPixelsAlong);
   const std::int64_t pixels = static_cast<std::int64_t>(job.height) * job.width;

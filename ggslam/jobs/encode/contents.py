@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ggslam.coding.listing import list_units
 from ggslam.errors import FormatError, RunFolderError
-from ggslam.jobs.code.coded_cells import CodedCells
+from ggslam.jobs.encode.coded_cells import CodedCells
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.map_container import MAP, TABLE, Container, open_container
 from ggslam.runs.records.keyframes import KeyframesRecord

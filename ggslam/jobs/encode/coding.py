@@ -38,7 +38,7 @@ from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_point_cloud
 from ggslam.formats.splat_formats import open_splats, splat_format
 from ggslam.formats.voxel_cloud import join_clouds
-from ggslam.jobs.code.attributes import attributes_to_code, restored_attributes
+from ggslam.jobs.encode.attributes import attributes_to_code, restored_attributes
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.map_file import open_map
 from ggslam.runs.opened_points import opened_points

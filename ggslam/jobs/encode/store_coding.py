@@ -35,7 +35,7 @@ from ggslam.coding.splats import (
     splat_settings,
 )
 from ggslam.errors import ConfigError, FormatError
-from ggslam.jobs.code.coded_cells import HEAD, OBJECTS, VISIT
+from ggslam.jobs.encode.coded_cells import HEAD, OBJECTS, VISIT
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.stores.over_cells import over_cells
 from ggslam.jobs.submaps.cell_gaussians import (

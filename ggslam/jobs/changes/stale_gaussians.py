@@ -37,7 +37,7 @@ def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
     return own or range(len(record.keyframes))
 
 
-def without_ghosts(source: MergeSource, placed: PlacedRun, notes: list[str]) -> GaussianMap:
+def without_stale_gaussians(source: MergeSource, placed: PlacedRun, notes: list[str]) -> GaussianMap:
     """The map of a run without Gaussians of the map it began with that its own keyframes look through. Objects of that
     map in whose places its own masks always show others have become these: something else stands there. The map as it
     is if the run began with none, or its recording is not there.
@@ -58,9 +58,9 @@ def without_ghosts(source: MergeSource, placed: PlacedRun, notes: list[str]) -> 
     rows = np.flatnonzero(began)
     seen = _look(source, placed, own, rows)
     notes += [f"{source.name}: left out: {problem}" for problem in seen.problems]
-    ghosts = rows[seen.counts.is_looked_through(_TIMES, _TIMES)]
+    stale = rows[seen.counts.is_looked_through(_TIMES, _TIMES)]
     replaced = _find_replaced(gaussians.object_id.numpy()[rows], seen)
-    if not len(ghosts) and not replaced:
+    if not len(stale) and not replaced:
         return gaussians
     cleared = gaussians.copy(gaussians.device)
     for old, new in replaced.items():
@@ -68,7 +68,7 @@ def without_ghosts(source: MergeSource, placed: PlacedRun, notes: list[str]) -> 
         taken = (gaussians.object_id == old) & torch.from_numpy(began | (old not in seen.shown))
         cleared.object_id[taken] = new
     kept = torch.ones(len(gaussians), dtype=torch.bool)
-    kept[torch.from_numpy(ghosts)] = False
+    kept[torch.from_numpy(stale)] = False
     cleared.keep(kept)
     return cleared
 

@@ -16,10 +16,10 @@ from ggslam.evaluation.image_sets import RenderedView, score_images
 from ggslam.evaluation.images import ImageScores
 from ggslam.evaluation.lpips import Lpips
 from ggslam.evaluation.trajectory import score_trajectory
+from ggslam.jobs.eval.objects import ObjectScorer
+from ggslam.jobs.eval.rig import RigScores, shows_anything
+from ggslam.jobs.eval.surface import SurfaceScorer
 from ggslam.jobs.progress import Observer
-from ggslam.jobs.score.objects import ObjectScorer
-from ggslam.jobs.score.rig import RigScores, shows_anything
-from ggslam.jobs.score.surface import SurfaceScorer
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.exposure import identity_exposure, measure_exposure
 from ggslam.rendering.types import RenderBuffers

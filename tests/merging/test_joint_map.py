@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.merging.moving import append_map, move_map, with_channels
+from ggslam.merging.joint_map import append_map, move_map, with_channels
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ggslam.changes.fits import Fit, Judge
+from ggslam.changes.alignment_score import Fit, Judge
 from ggslam.changes.motions import ALIKE
 from ggslam.changes.shape import Shape, Target
 from ggslam.changes.upright import LEVEL, tilt, turned_about, upright
@@ -54,7 +54,9 @@ def hidden_sector(toward: np.ndarray, up: np.ndarray) -> float:
     return float(_SIDE * (np.diff(np.append(seen, seen[0] + len(counts))) - 1).max())
 
 
-def tell_turn(fit: Fit, old: Shape, new: Shape, judge: Judge, hidden: tuple[float, float], up: np.ndarray) -> Fit:
+def with_rotation_ambiguity(
+    fit: Fit, old: Shape, new: Shape, judge: Judge, hidden: tuple[float, float], up: np.ndarray
+) -> Fit:
     """The fit, with what makes its turn doubtful.
 
     Args:
