@@ -18,7 +18,7 @@ from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Visit
 from ggslam.errors import ConfigError
 from ggslam.jobs.changes.pictures import picture_of_change
-from ggslam.jobs.changes.saved_changes import MOST_PICTURES, ChangesShown
+from ggslam.jobs.changes.saved_changes import ChangesShown, SavedChangesTuning
 from ggslam.jobs.changes.stale_gaussians import own_keyframes, without_stale_gaussians
 from ggslam.jobs.merge.joint_poses import find_joint_poses, place_maps
 from ggslam.jobs.merge.sources import MergeSource, read_sources
@@ -143,7 +143,9 @@ def make_folder_of_changes(out: Path) -> None:
         raise write_failure(out, error) from None
 
 
-def show_changes(outcome: ChangesOutcome, old: str | Path, new: str | Path, most: int = MOST_PICTURES) -> ChangesShown:
+def show_changes(
+    outcome: ChangesOutcome, old: str | Path, new: str | Path, most: int = SavedChangesTuning.pictures
+) -> ChangesShown:
     """What `find_changes` found, as pages show it, with so many pictures; `old`, `new`: as the runs are named there."""
     found = outcome.table.found.changes
     record = ChangesRecord.of({"old": str(old), "new": str(new), **outcome.table.to_dict()})

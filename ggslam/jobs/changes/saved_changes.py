@@ -15,12 +15,17 @@ from ggslam.runs.records.changes import ChangeRecord, ChangesRecord
 from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.oriented_box import Vector
 from ggslam.system.images import MAX_PIXELS, read_picture
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import refuse_links
 
-MOST_PICTURES = 12
-"""Pictures that a page shows."""
-_MOST_PIXELS = 16_000_000
-"""Of one of them: two views of 8 megapixels. All of a page together have `MAX_PIXELS` at most."""
+
+class SavedChangesTuning(Tuning):
+    """How many pictures of changes are read."""
+
+    pictures = 12
+    """Pictures that a page shows."""
+    max_pixels = 16_000_000
+    """Largest picture that is read, in pixels: two views of 8 megapixels. `MAX_PIXELS` limits the whole page."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,7 @@ class ChangesShown:
     unreadable: list[str] = field(default_factory=list)
 
 
-def changes_of(folder: RunFolder, most: int = MOST_PICTURES) -> ChangesShown | None:
+def changes_of(folder: RunFolder, most: int = SavedChangesTuning.pictures) -> ChangesShown | None:
     """What `ggslam update` noted in a run's folder, with so many pictures; None: it is no updated run.
 
     Raises:
@@ -61,7 +66,7 @@ def changes_of(folder: RunFolder, most: int = MOST_PICTURES) -> ChangesShown | N
     return ChangesShown(shown.record, shown.pictures, table.history, middles, shown.left_out, shown.unreadable)
 
 
-def read_changes(place: Path, most: int = MOST_PICTURES) -> ChangesShown:
+def read_changes(place: Path, most: int = SavedChangesTuning.pictures) -> ChangesShown:
     """A folder that `ggslam changes` wrote, with so many pictures.
 
     Raises:
@@ -77,7 +82,7 @@ def read_changes(place: Path, most: int = MOST_PICTURES) -> ChangesShown:
     for number in named[:most]:
         name = Path(record.changes[number].picture).name
         try:
-            found[number] = read_picture(place / name, min(_MOST_PIXELS, left), RunFolderError)
+            found[number] = read_picture(place / name, min(SavedChangesTuning.max_pixels, left), RunFolderError)
         except RunFolderError:
             unreadable.append(name)  # without it the table still tells
         else:

@@ -22,12 +22,18 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sight.counts import SightCounts
 from ggslam.sight.margin import Margin
 from ggslam.sight.view import View
+from ggslam.system.tuning import Tuning
 
-_TIMES = 2
-"""Keyframes that look through it at least, and so many times as many as see something there."""
-_MOST, _NEVER = 0.5, 0.01
-"""Share of an object's Gaussians in whose places masks show others; and share of sights that show itself, where masks
-err at outlines."""
+
+class StaleGaussianTuning(Tuning):
+    """When a Gaussian of the earlier map is gone."""
+
+    min_views = 2
+    """Fewest keyframes that look through it, and how many times more these are than those that see it."""
+    max_replaced = 0.5
+    """Share of an object's Gaussians where masks show another object, above which it was replaced."""
+    max_own_share = 0.01
+    """Largest share of views in which masks still show a replaced object; masks err at outlines."""
 
 
 def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
@@ -58,7 +64,7 @@ def without_stale_gaussians(source: MergeSource, placed: PlacedRun, notes: list[
     rows = np.flatnonzero(began)
     seen = _look(source, placed, own, rows)
     notes += [f"{source.name}: left out: {problem}" for problem in seen.problems]
-    stale = rows[seen.counts.is_looked_through(_TIMES, _TIMES)]
+    stale = rows[seen.counts.is_looked_through(StaleGaussianTuning.min_views, StaleGaussianTuning.min_views)]
     replaced = _find_replaced(gaussians.object_id.numpy()[rows], seen)
     if not len(stale) and not replaced:
         return gaussians
@@ -99,8 +105,11 @@ def _find_replaced(ids: np.ndarray, seen: _Seen) -> dict[int, int]:
     found = {}
     for i in np.unique(ids[ids > 0]).tolist():
         own = ids == i
-        others = own & (seen.other >= _TIMES)
-        if others.sum() > _MOST * own.sum() and seen.alike[own].sum() < _NEVER * seen.other[own].sum():
+        others = own & (seen.other >= StaleGaussianTuning.min_views)
+        if (
+            others.sum() > StaleGaussianTuning.max_replaced * own.sum()
+            and seen.alike[own].sum() < StaleGaussianTuning.max_own_share * seen.other[own].sum()
+        ):
             found[i] = int(np.bincount(seen.latest[others]).argmax())
     return found
 

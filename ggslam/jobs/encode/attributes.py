@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,8 +13,10 @@ from ggslam.errors import FormatError
 from ggslam.formats.point_cloud import ColoredCloud
 from ggslam.formats.positions import left_out_words
 
-_MOST_IDS = 1 << 16
-_LEVELS = (1 << 16) - 1
+_MOST_IDS: Final = 1 << 16
+"""Ids are coded in 16 bits."""
+_LEVELS: Final = (1 << 16) - 1
+"""The highest value of an attribute of 16 bits."""
 
 
 @dataclass

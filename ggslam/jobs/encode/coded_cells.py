@@ -13,7 +13,7 @@ from ggslam.coding import decode_cloud
 from ggslam.coding.splats import gaussians_of, is_splat_cloud
 from ggslam.errors import ConfigError, FormatError
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, arrays_of_map, gaussians_to_bytes
-from ggslam.jobs.submaps.stores import INDOORS
+from ggslam.jobs.submaps.stores import INDOORS, StoreMakingTuning
 from ggslam.runs.records.cells import CellMember, CellsRecord
 from ggslam.runs.records.mark import FileRecord
 from ggslam.runs.records.visit import VisitRecord
@@ -30,7 +30,6 @@ from ggslam.system.zip_files import ZIP_DAMAGE, open_zip
 SUFFIX = ".ggc"
 HEAD, OBJECTS, VISIT = "cells.json", "objects.json.xz", "visits/{}.json.xz"
 _MEMBER = re.compile(r"cells/(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})\.bin", re.ASCII)
-_CELLS_AT_ONCE = 64
 _DAMAGE = (*ZIP_DAMAGE, KeyError)
 
 
@@ -160,8 +159,9 @@ def decode_store(path: Path, out: Path, threads: int | None = None) -> int:
             record = records[number] if number < len(records) else None
             if record is not None:
                 write_visit(store, record)
-            for begin in range(0, len(keys), _CELLS_AT_ONCE):
-                writes = [_write_of(cells, key, threads) for key in keys[begin : begin + _CELLS_AT_ONCE]]
+            step = StoreMakingTuning.cells_at_once
+            for begin in range(0, len(keys), step):
+                writes = [_write_of(cells, key, threads) for key in keys[begin : begin + step]]
                 store.put_cells(writes)
                 count += sum(write.counts[GAUSSIANS] for write in writes)
         if objects is not None:

@@ -20,14 +20,21 @@ from ggslam.reporting.pictures import color_of_ids, identity_picture
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.objects_in_parts import ObjectsInParts
 from ggslam.scene.frame import Frame
+from ggslam.system.tuning import Tuning
 
-VOTE_STRIDE = 2
-"""Labels by votes are scored at every second pixel of every second row: at all of them they would cost more than
-everything else that is scored."""
+
+class ObjectScoreTuning(Tuning):
+    """At which pixels and views objects are scored."""
+
+    vote_stride = 2
+    """Labels by votes are scored at every n-th pixel of every n-th row: at all pixels they would cost more than all
+    other scores."""
+    truth_stride = 3
+    """Every n-th view votes for the true labels of Gaussians: many views see each Gaussian."""
+
+
 _NOTHING = np.empty(0, np.int32), np.empty(0, np.float32)
 
-TRUTH_STRIDE = 3
-"""The true labels of Gaussians are voted for by every third view: each Gaussian is seen by many."""
 
 
 class ObjectScorer:
@@ -82,13 +89,13 @@ class ObjectScorer:
             counts.add(ids, truth)
             self._merge(self._learned, frame.index, counts)
             rows = self.map.shown_rows()
-            if (self._learned["all"].frames - 1) % TRUTH_STRIDE == 0:
+            if (self._learned["all"].frames - 1) % ObjectScoreTuning.truth_stride == 0:
                 means = scene.gaussians.means.numpy()
                 self._truth.add(frame.camera, T_camera_world, frame.depth, truth, means, rows)
             if self._votes is not None:
                 voted = SegmentationCounts(boundary=None)
-                labels = vote_label_image(rasterizer, view, self._votes[rows], stride=VOTE_STRIDE)
-                voted.add(labels, truth[::VOTE_STRIDE, ::VOTE_STRIDE])
+                labels = vote_label_image(rasterizer, view, self._votes[rows], stride=ObjectScoreTuning.vote_stride)
+                voted.add(labels, truth[::ObjectScoreTuning.vote_stride, ::ObjectScoreTuning.vote_stride])
                 self._merge(self._voted, frame.index, voted)
         if pictured is None:
             return None

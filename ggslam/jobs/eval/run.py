@@ -36,15 +36,20 @@ from ggslam.sequences.rig import RigSequence
 from ggslam.slam.filters.camera_fixtures import CameraFixtures, find_fixtures
 from ggslam.system.atomic import make_folder, write_text
 from ggslam.system.csv_text import csv_text
+from ggslam.system.tuning import Tuning
 
-PICTURES = 6
-"""Comparison pictures written to renders/, spread over the recording."""
-DARK_IMAGES = 30
-"""Mean colour of 255 under which PSNR, whose range is from black to white, flatters."""
-ONE_OBJECT = 0.85
-"""Share of a map from which one object is named that holds it."""
-LOOKED_AT = 48
-"""Frames in which is looked for what is fixed to the camera, spread likewise, if there is anything."""
+
+class ScoreTuning(Tuning):
+    """What is written and noted beside the scores."""
+
+    pictures = 6
+    """Pictures in renders/, spread over the recording."""
+    dark_level = 30
+    """Mean colour, of 255, below which a note says that PSNR flatters dark images."""
+    one_object_share = 0.85
+    """Share of a map above which a note names the object that holds it."""
+    fixture_frames = 48
+    """Frames that are searched for what is fixed to the camera."""
 
 
 def score_run(
@@ -79,7 +84,7 @@ def _score(
     scorer = _object_scorer(folder, sequence, sets)
     rig = RigScores(sequence, sets) if isinstance(sequence, RigSequence) else None
     asked = sets if rig is None else {**sets, **rig.sets()}
-    looked_at = _spread(poses, LOOKED_AT if rig is None else 0)
+    looked_at = _spread(poses, ScoreTuning.fixture_frames if rig is None else 0)
     fixtures = find_fixtures((sequence.frame(i) for i in looked_at), poses)
     surface = SurfaceScorer(folder)
     images = _images(folder, record, sequence, asked, scorer, metric, observer, fixtures, surface, notes)
@@ -164,7 +169,7 @@ def _one_object_notes(folder: RunFolder) -> list[str]:
     counts = {record.id: record.gaussians for record in table.objects}
     largest = max(counts, key=counts.__getitem__, default=0)
     share = counts.get(largest, 0) / max(1, sum(counts.values()) + table.unlabelled_gaussians)
-    if table.supervision != "geometry" or share <= ONE_OBJECT:
+    if table.supervision != "geometry" or share <= ScoreTuning.one_object_share:
         return []
     return [f"object {largest} holds {share:.0%} of the map: geometry does not tell what lies flat from its ground; "
             "masks of a segmentation model do (masks.model)"]  # fmt: skip
@@ -195,7 +200,7 @@ def _images(
 ) -> dict[str, Any]:  # fmt: skip
     poses = record.poses()
     keyframes, held_out = sets["keyframes"], sets["held_out"]
-    pictured = set(_spread(poses, PICTURES))
+    pictured = set(_spread(poses, ScoreTuning.pictures))
     make_folder(folder.path / "renders")
     typical = record.typical_exposure() if any(k.is_exposed for k in record.keyframes) else None
     show = _shower(folder, sequence, poses, pictured, scorer, typical)
@@ -218,7 +223,7 @@ def _images(
     observer.advance(len(sequence), len(sequence))
     _write_rows(folder, rows)
     usual = float(np.median(brightness or [255]))
-    if usual < DARK_IMAGES:
+    if usual < ScoreTuning.dark_level:
         notes.append(f"the images are dark (mean colour {usual:.0f} of 255), and every error is small against white: "
                      "do not compare PSNR with that of other recordings")  # fmt: skip
     return {name: mean.to_dict() for name, mean in means.items()}

@@ -15,12 +15,17 @@ from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.mesh import extract_mesh
 from ggslam.volumes.surface_points import LEAST_WEIGHT, surface_settings
 from ggslam.volumes.tsdf import TsdfMap
 
-MOST_BLOCKS = 150_000
-"""Of the fused depth: 770 MB. Larger recordings are scored up to there."""
+
+class SurfaceScoreTuning(Tuning):
+    """How much of a recording is scored."""
+
+    max_blocks = 150_000
+    """Blocks of fused depth after which no more is fused: 770 MB."""
 
 
 class SurfaceScorer:
@@ -65,7 +70,7 @@ class SurfaceScorer:
         """Counts a frame in."""
         if self._tsdf is None:
             return
-        if self._tsdf.dense_blocks > MOST_BLOCKS:
+        if self._tsdf.dense_blocks > SurfaceScoreTuning.max_blocks:
             self.reason = f"{METRIC_FILE} is scored against the depth of the frames up to {frame.index}"
             return
         depth = frame.depth if frame.moving is None else np.where(frame.moving, np.float32(0), frame.depth)

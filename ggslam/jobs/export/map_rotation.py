@@ -15,9 +15,17 @@ from ggslam.jobs.export.up_axis import UpAxis
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import skew
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.map_upright import upright_of
 
-_SAMPLED = 100_000
+
+class MapRotationTuning(Tuning):
+    """How the direction up is found."""
+
+    samples = 100_000
+    """Gaussians that it is found from, about."""
+
+
 _R_AXES_LEVEL = {
     UpAxis.y: UPRIGHT, UpAxis.minus_y: np.eye(3), UpAxis.z: np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]),
 }  # fmt: skip
@@ -89,7 +97,7 @@ def _sample(folder: RunFolder) -> GaussianMap:
     """Some of the Gaussians, of all parts of the map."""
     rows = folder.map_in_parts().rows
     out = GaussianMap(rows.like.sh_degree, rows.like.feature_channels, with_moments=False)
-    step = max(1, len(rows) // _SAMPLED)
+    step = max(1, len(rows) // MapRotationTuning.samples)
     for block in rows.blocks():
         out.append(block.take(torch.arange(0, len(block), step)))
     return out

@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ggslam.errors import GgslamError, RunFolderError
+from ggslam.jobs.submaps.stores import StoreMakingTuning
 from ggslam.submaps.cell_files import wait_for_disk
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellWrite
@@ -26,7 +27,6 @@ from ggslam.system.links import refuse_link, remove_folder
 FOLDER = "refining"
 _FINISHED = "finished"
 _GONE = f".{FOLDER}-*"
-_CELLS_AT_ONCE = 64
 
 
 class CellsDone:
@@ -95,7 +95,7 @@ class CellsDone:
         for write in self._changes(self._done):
             waiting.append(write)
             changed += 1
-            if len(waiting) == _CELLS_AT_ONCE:
+            if len(waiting) == StoreMakingTuning.cells_at_once:
                 self._store.put_cells(waiting)
                 waiting = []
         self._store.put_cells(waiting)

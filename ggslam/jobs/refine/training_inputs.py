@@ -22,9 +22,14 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
+from ggslam.system.tuning import Tuning
 
-_CELLS_IN_MEMORY = 64
-"""Neighbours that are remembered: each is asked for up to 27 times."""
+
+class CellTrainingTuning(Tuning):
+    """How neighbours of a cell are kept."""
+
+    cells_in_memory = 64
+    """Neighbours that are kept in memory: each is asked for up to 27 times."""
 
 
 class StoreCells:
@@ -103,7 +108,7 @@ class StoreCells:
             self.damaged[key] = str(error)
             return None
         self._known[key] = found
-        if len(self._known) > _CELLS_IN_MEMORY:
+        if len(self._known) > CellTrainingTuning.cells_in_memory:
             self._known.popitem(last=False)
         return found
 

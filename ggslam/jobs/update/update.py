@@ -32,9 +32,14 @@ from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.tuning import Tuning
 
-_FEW_POINTS = 20
-"""Points of what changed that a keyframe of the older visit may show and yet be trained on."""
+
+class UpdateTuning(Tuning):
+    """Which older keyframes are still trained on."""
+
+    max_changed_points = 20
+    """Points of changed surface that an older keyframe may show."""
 
 
 @dataclass
@@ -204,5 +209,7 @@ class _Update:
         shows, or what changed; and those of the older one that see the newer map and nothing that changed."""
         coverage, share = Coverage(self.merging.seams, self.context), self.merging.seams.share
         shared = [coverage.shared_views(placed[1 - k].gaussians, run) >= share for k, run in enumerate(placed)]
-        changed = [map_update.shows_changes(run.cameras, run.T_world_camera, _FEW_POINTS) for run in placed]
+        changed = [
+            map_update.shows_changes(run.cameras, run.T_world_camera, UpdateTuning.max_changed_points) for run in placed
+        ]
         return [shared[OLD] & ~changed[OLD], shared[NEW] | changed[NEW]]
