@@ -14,14 +14,22 @@ from ggslam.changes.shape import Shape
 from ggslam.changes.sightings import Evidence, Sightings
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sight.margin import Margin
+from ggslam.system.tuning import Tuning
 
-_APART_M = 0.05
-"""Metres that surfaces lie apart which count as much as all that fits."""
-_TURN_SEEN = 0.5
-"""Share of the surfaces that both visits saw, from which they tell a turn: sides of a thing look alike."""
-_OVERLAP, _JUDGED, _CLASHING = 0.6, 3000, 300
-"""Share of the points, the nearest, that tell how far surfaces lie apart, points that motions are judged by, and of
-these so many for whether many motions are possible."""
+
+class AlignmentScoreTuning(Tuning):
+    """How the alignment of two surfaces is scored."""
+
+    apart_m = 0.05
+    """Distance between surfaces that costs as much as a full share of fit, in metres."""
+    min_seen = 0.5
+    """Share of the surfaces that both visits must see to know a rotation: sides look alike."""
+    overlap = 0.6
+    """Share of the points, the nearest, that measure the distance between surfaces."""
+    points = 3000
+    """Points that a motion is scored by."""
+    quick_points = 300
+    """Points that many motions are checked by."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +59,7 @@ class Fit:
 
     def quality(self) -> float:
         """For choosing among fits: more is better."""
-        return self.share - self.color_apart - self.apart_m / _APART_M
+        return self.share - self.color_apart - self.apart_m / AlignmentScoreTuning.apart_m
 
     @property
     def turn_known(self) -> bool:
@@ -63,7 +71,7 @@ class Fit:
         """Why the thing's turn cannot be told; None: it can."""
         if self.as_good_deg is not None:
             return f"turned by {self.as_good_deg:g} degrees more it fits about as well"
-        if self.seen < _TURN_SEEN:
+        if self.seen < AlignmentScoreTuning.min_seen:
             return f"both visits saw only {100 * self.seen:.0f} % of it"
         if self.sides_may_differ:
             return "the visits may have seen different sides of it"
@@ -81,7 +89,7 @@ class Judge:
         self.settings = settings
         self._within = Margin(settings.fit_m, settings.tolerance_relative)
         rng = np.random.default_rng(0)
-        old, new = old.sample(_JUDGED, rng), new.sample(_JUDGED, rng)
+        old, new = old.sample(AlignmentScoreTuning.points, rng), new.sample(AlignmentScoreTuning.points, rng)
         self._sides = [
             (shape, sights, cKDTree(other.points), cKDTree(other.joint()))
             for shape, other, sights in ((old, new, sights_new), (new, old, sights_old))
@@ -98,7 +106,7 @@ class Judge:
             seen.append(judged)
             colors.append(color_apart(shape.colors, found.color))
             off = np.sort(joint.query(moved.joint(), workers=-1)[0])
-            apart.append(float(off[: max(1, round(_OVERLAP * len(off)))].mean()))
+            apart.append(float(off[: max(1, round(AlignmentScoreTuning.overlap * len(off)))].mean()))
         known = [value for value in colors if np.isfinite(value)]
         return Fit(T, min(shares), min(seen), max(known) if known else 1.0, max(apart))
 
@@ -107,7 +115,7 @@ class Judge:
         worse of the two ways. What is hidden there clashes with nothing."""
         worst = np.zeros(len(motions))
         for k, (shape, sights, _, _) in enumerate(self._sides):
-            few = shape.points[:_CLASHING]
+            few = shape.points[:AlignmentScoreTuning.quick_points]
             moved = [transform_points(few, inverse(T) if k else T) for T in motions]
             found = sights.look_up(np.concatenate(moved), self._within)
             worst = np.maximum(worst, _is_gone(found).reshape(len(motions), -1).mean(1))

@@ -14,20 +14,30 @@ from ggslam.changes.sightings import AROUND, Picture, back_project
 from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.scene.poses import transform_points
 from ggslam.sight.margin import Margin
+from ggslam.system.tuning import Tuning
 
-_FEWEST_PIXELS, _MOST_VIEWS = 12, 24
-"""Pixels of the thing that a picture has to show, and pictures that are looked at."""
-_OWN_M, _WINDOW = 0.015, 3
-"""Metres from the thing's points that its pixels lie at most, and pixels around them that are looked at."""
-_FACING = 0.35
-"""Cosine of the angle between a face and the way to the camera; of what is seen at a smaller one nothing is said: there
-maps err."""
-_NEAR_M = 0.1
-"""What is nearer to the camera is not looked up."""
-_THIN_M = 0.01
-"""Metres that a face lies behind the other face of the same board, at least."""
-_EDGE_PX = 0.75
-"""Pixels beyond the middle of the thing's outermost ones that still are the thing's."""
+
+class CandidateViewTuning(Tuning):
+    """Which pixels of a candidate are compared."""
+
+    min_pixels = 12
+    """Fewest pixels of the candidate in a picture."""
+    max_views = 24
+    """Most pictures that are compared."""
+    own_m = 0.015
+    """Largest distance of a pixel from the candidate's points, in metres."""
+    window = 3
+    """Pixels that are searched on each side of its points."""
+    min_facing = 0.35
+    """Smallest cosine between a face's normal and the direction to the camera: maps err at grazing angles."""
+    near_m = 0.1
+    """Depth from which points are looked up, in metres."""
+    min_thickness_m = 0.01
+    """Smallest distance between the two faces of a board, in metres."""
+    edge_px = 0.75
+    """Pixels beyond the outermost pixel's centre that still belong to the candidate."""
+
+
 _HIDDEN = Margin(0.015, 0.008)
 """What was measured nearer than a point by more hides it."""
 
@@ -62,8 +72,8 @@ class CandidateViews:
         is_own[rows] = True
         points = tree.data[rows]
         masks = [_own_pixels(picture, tree, is_own, points, ids) for picture in pictures]
-        shown = np.flatnonzero([mask.sum() >= _FEWEST_PIXELS for mask in masks])
-        some = np.unique(np.linspace(0, max(0, len(shown) - 1), _MOST_VIEWS).round().astype(int))
+        shown = np.flatnonzero([mask.sum() >= CandidateViewTuning.min_pixels for mask in masks])
+        some = np.unique(np.linspace(0, max(0, len(shown) - 1), CandidateViewTuning.max_views).round().astype(int))
         chosen = [(pictures[k], masks[k]) for k in shown[some[some < len(shown)]]]
         self._poses = np.array([picture.T_camera_world for picture, _ in chosen]).reshape(-1, 4, 4)
         cameras = [picture.camera for picture, _ in chosen]
@@ -85,7 +95,7 @@ class CandidateViews:
         R, t = self._poses[:, :3, :3], self._poses[:, :3, 3]
         p, n = shape.points @ R.transpose(0, 2, 1) + t[:, None], shape.normals @ R.transpose(0, 2, 1)
         fx, fy, cx, cy = (self._lens[:, k, None] for k in range(4))
-        ahead = np.where(p[..., 2] > _NEAR_M, p[..., 2], np.inf)
+        ahead = np.where(p[..., 2] > CandidateViewTuning.near_m, p[..., 2], np.inf)
         u, v = p[..., 0] / ahead * fx + cx, p[..., 1] / ahead * fy + cy
         column, row = np.rint(u), np.rint(v)
         width, height = self._sizes[:, :1], self._sizes[:, 1:]
@@ -99,11 +109,11 @@ class CandidateViews:
         before = (n * (p - depth[:, None] * seen)).sum(1)  # of the surface that was measured, along the point's normal
         facing = -(n * p).sum(1) / np.linalg.norm(p, axis=1)
         hidden = depth <= p[:, 2] - _HIDDEN(p[:, 2])
-        front, back = own & (facing > _FACING), own & (facing < -_FACING)
+        front, back = own & (facing > CandidateViewTuning.min_facing), own & (facing < -CandidateViewTuning.min_facing)
         outside = (depth > 0) & ~own & ~hidden
         out = self._outward[pixel]
-        beyond = self._beyond[pixel] + out[:, 0] * (u - column) + out[:, 1] * (v - row) - _EDGE_PX
-        off = np.where(front, before, np.where(back, np.maximum(0, _THIN_M - before), 0.0))
+        beyond = self._beyond[pixel] + out[:, 0] * (u - column) + out[:, 1] * (v - row) - CandidateViewTuning.edge_px
+        off = np.where(front, before, np.where(back, np.maximum(0, CandidateViewTuning.min_thickness_m - before), 0.0))
         off[outside] = (np.maximum(0, beyond) * p[:, 2] / lens[:, 0])[outside]
         sideways = np.concatenate([out, -(out * p[:, :2]).sum(1, keepdims=True) / p[:, 2:]], 1)
         along = np.where(front[:, None], n, np.where(back[:, None], -n, sideways))
@@ -121,12 +131,17 @@ def _own_pixels(
     row, column = row[inside], column[inside]
     if not len(row):
         return own
-    window = tuple(slice(max(0, k.min() - _WINDOW), k.max() + _WINDOW + 1) for k in (row, column))
+    window = tuple(
+        slice(max(0, k.min() - CandidateViewTuning.window), k.max() + CandidateViewTuning.window + 1)
+        for k in (row, column)
+    )
     where = np.zeros(shape, bool)
     where[window] = picture.depth[window] > 0
     around = back_project(picture, where)
-    near = ((around > points.min(0) - _OWN_M) & (around < points.max(0) + _OWN_M)).all(1)
-    apart, nearest = tree.query(around[near], distance_upper_bound=_OWN_M)
+    near = (
+        (around > points.min(0) - CandidateViewTuning.own_m) & (around < points.max(0) + CandidateViewTuning.own_m)
+    ).all(1)
+    apart, nearest = tree.query(around[near], distance_upper_bound=CandidateViewTuning.own_m)
     same = np.isfinite(apart)
     same[same] = is_own[nearest[same]]
     at = np.flatnonzero(where)[near][same]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -13,8 +14,8 @@ from scipy.spatial import cKDTree
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Evidence
 
-UNNAMED = 1 << 16
-"""Labels from here on are those of things that no object of the map is."""
+UNNAMED: Final = 1 << 16
+"""First label of candidates without an object id: ids are 16 bits."""
 
 
 @dataclass

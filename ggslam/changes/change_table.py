@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -16,8 +16,8 @@ from ggslam.scene.object_names import object_label
 from ggslam.scene.oriented_box import OrientedBox
 from ggslam.scene.poses import motion_of
 
-VERSION = 1
-"""Of changes.json."""
+VERSION: Final = 1
+"""Version of changes.json."""
 Names = Mapping[int, str | None]
 """Of objects, by id."""
 

@@ -13,7 +13,7 @@ from ggslam.changes.alignment_score import Fit, Judge
 from ggslam.changes.candidate_views import CandidateViews
 from ggslam.changes.candidates import UNNAMED, Candidate, JudgedSurface, candidates_by_id, candidates_by_surface
 from ggslam.changes.change import HARDLY_SEEN, UNCLEAR, Change, Detection
-from ggslam.changes.motions import ALIKE
+from ggslam.changes.motions import MotionTuning
 from ggslam.changes.pose_refinement import PoseRefinement
 from ggslam.changes.rotation_ambiguity import hidden_sector, with_rotation_ambiguity
 from ggslam.changes.settings import ChangeSettings
@@ -23,16 +23,23 @@ from ggslam.changes.sightings import Sightings, Surface, Visit
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points, turning_angle
 from ggslam.sight.margin import Margin
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.upright import estimate_up
 
-_SAME_PLACE = 0.03
-"""Metres: points of two visits so near to each other may be one thing's."""
-_TAKEN = 0.4
-"""Share of what seems to have stayed where other things of the same shape may stand now."""
-_TURNED = 1500
-"""Points of a thing that other turns are tried with."""
-_SAMPLE, _FAR_TOLERANCES = 20_000, 4
-"""Points that usual differences are measured at, up to so many times the least tolerance."""
+
+class DetectionTuning(Tuning):
+    """How two visits are compared."""
+
+    same_place_m = 0.03
+    """Largest distance between points of two visits that may be of one object, in metres."""
+    max_replaced = 0.4
+    """Share of the objects that seem to have stayed which may be others of the same shape."""
+    rotation_points = 1500
+    """Points of a candidate that other rotations are tried with."""
+    samples = 20_000
+    """Points that usual differences are measured at, about."""
+    max_tolerances = 4
+    """Differences above this many times the smallest tolerance are not usual."""
 
 
 class ChangeDetector:
@@ -80,8 +87,10 @@ class ChangeDetector:
         """How near surfaces have to be to be one: by how much the visits differ where nothing changed."""
         s, offsets = self.settings, []
         for number, surface in enumerate(surfaces):
-            sample = surface.points[:: max(1, len(surface.points) // _SAMPLE)]
-            least = Margin(_FAR_TOLERANCES * s.tolerance_m, _FAR_TOLERANCES * s.tolerance_relative)
+            sample = surface.points[:: max(1, len(surface.points) // DetectionTuning.samples)]
+            least = Margin(
+                DetectionTuning.max_tolerances * s.tolerance_m, DetectionTuning.max_tolerances * s.tolerance_relative
+            )
             other = self.sights[1 - number].look_up(sample, least)
             offsets.append(np.abs(other.offset[np.isfinite(other.offset)]))
         usual = np.concatenate(offsets)
@@ -111,7 +120,9 @@ class ChangeDetector:
                 count += 1
                 same += int(there == i)
                 taken += int(there not in (0, i))
-        return same > 0 and same >= self.settings.ids_alike * (count - min(taken, int(_TAKEN * count)))
+        return same > 0 and same >= self.settings.ids_alike * (
+            count - min(taken, int(DetectionTuning.max_replaced * count))
+        )
 
     # --- verdicts ----------------------------------------------------------------------------------------------------
 
@@ -167,7 +178,7 @@ class ChangeDetector:
         judge = Judge(before, after, self.sights[0], self.sights[1], self.settings)
         toward = [judged.toward[thing.rows] for judged, thing in zip(self.judged, (old, new), strict=True)]
         hidden = hidden_sector(toward[0], self._up), hidden_sector(toward[1], self._up)
-        sample = before.sample(_TURNED, np.random.default_rng(0))
+        sample = before.sample(DetectionTuning.rotation_points, np.random.default_rng(0))
         return with_rotation_ambiguity(fit, sample, after, judge, hidden, self._up)
 
     def _motion_change(self, old: Candidate, new: Candidate, fit: Fit) -> Change | None:
@@ -176,7 +187,7 @@ class ChangeDetector:
         if not self._has_moved(old, T) or not self._has_moved(old, T := self._place(old, new, T)):
             return None
         placed, fit = turning_angle(T, fit.T_new_old), self._with_turn(old, new, fit)
-        if placed > ALIKE and fit.turn_known:  # surfaces and pictures tell two turns
+        if placed > MotionTuning.same_rotation_rad and fit.turn_known:  # surfaces and pictures tell two turns
             fit = replace(fit, as_good_deg=round(float(np.degrees(placed))))
         fit = replace(fit, T_new_old=T)
         return Change("moved", old, new, T, fit, fit.share * min(1.0, max(0.0, 1 - fit.color_apart)))
@@ -293,7 +304,7 @@ class ChangeDetector:
         tree = self._trees[number]
         if tree is None:
             return np.zeros(0, np.int64)
-        apart, nearest = tree.query(points, distance_upper_bound=_SAME_PLACE)
+        apart, nearest = tree.query(points, distance_upper_bound=DetectionTuning.same_place_m)
         return self.judged[number].ids[nearest[np.isfinite(apart)]]
 
     def _has_shifted(self, old: Candidate, new: Candidate) -> bool:

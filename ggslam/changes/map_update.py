@@ -5,6 +5,7 @@ still hold."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,13 +19,22 @@ from ggslam.changes.sightings import Evidence
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, transform_points
+from ggslam.system.tuning import Tuning
 
-OLD, NEW = 0, 1
-_ON_THING = 0.015
-"""Metres: what was measured so near to a thing is its surface."""
-_CAME = 1e6
-"""Weight of a measured point that shows what came: its place is the newer visit's, however well the older one measured
-what is not there any more."""
+OLD: Final = 0
+"""Number of the older visit."""
+NEW: Final = 1
+"""Number of the newer visit."""
+
+
+class MapUpdateTuning(Tuning):
+    """Which points of the older visit are replaced."""
+
+    on_candidate_m = 0.015
+    """Largest distance of a measured point from the surface it belongs to, in metres."""
+    new_weight = 1e6
+    """Weight of a point measured where something came: the newer visit owns its place, however well the older one
+    measured what stood there."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,7 @@ class MapUpdate:
         place one is: nothing if they show what is gone."""
         if number == OLD:
             return self.holds(points).astype(float)
-        return np.where(self._is_gone(OLD, points), _CAME, self._settings.favour)
+        return np.where(self._is_gone(OLD, points), MapUpdateTuning.new_weight, self._settings.favour)
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """bool [n]: whether points that the older visit measured are not of what is gone."""
@@ -138,7 +148,7 @@ class MapUpdate:
         if things:
             rows = np.concatenate([thing.rows for thing in things])
             tree = cKDTree(self._detector.judged[OLD].points[rows])
-            gone |= np.isfinite(tree.query(points, distance_upper_bound=_ON_THING)[0])
+            gone |= np.isfinite(tree.query(points, distance_upper_bound=MapUpdateTuning.on_candidate_m)[0])
         return ~gone
 
     def came(self, gaussians: GaussianMap) -> np.ndarray:

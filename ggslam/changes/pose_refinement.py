@@ -12,29 +12,43 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.changes.candidate_views import CandidateViews
-from ggslam.changes.upright import LEVEL, tilt, upright, without_tilt
+from ggslam.changes.upright import UprightTuning, tilt, upright, without_tilt
 from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.scene.poses import inverse, se3_exp, transform_points, translation
+from ggslam.system.tuning import Tuning
 
-_SAMPLE = 400
-"""Points of either surface that are looked up in pictures."""
-_BESIDE_M = 0.035
-"""Metres beside a motion that others start at, on its eight sides: by a board's or a post's thickness it may be off."""
-_FALLEN, _STANDING_COSTS = np.radians(30), 0.01
-"""What tilts a thing less may be noise, and so much more cost of a motion that keeps it upright."""
-_FARTHEST_M, _AWAY_COSTS = 0.08, 0.1
-"""Metres from a motion that the thing is placed within, and cost of each: of places about as good the nearest
-is told."""
-_TURNED = np.radians(12)
-"""What others are turned by."""
-_COARSE_M, _FINE_M = 0.02, 0.01
-"""Residuals that count half."""
-_COARSE_STEPS, _FINE_STEPS, _KEPT = 8, 15, 3
-"""Steps of the two stages, and motions that are kept after the first."""
-_DAMPING = (1e-3, 1e-5, 1e3)
-"""Of Levenberg and Marquardt: at the start, the least, and the most."""
-_ENOUGH = 1e-5
-"""Less of the cost gained ends the steps."""
+
+class PlacementTuning(Tuning):
+    """How the exact pose of a moved object is found."""
+
+    points = 400
+    """Points of each surface that are looked up in pictures."""
+    start_shift_m = 0.035
+    """Shift of further starts to eight sides, in metres: a first pose may be off by a board's thickness."""
+    fallen_rad = np.radians(30)
+    """An object tilted less may still stand upright, in radians."""
+    upright_gain = 0.01
+    """Cost that an upright pose may have more."""
+    max_shift_m = 0.08
+    """Largest shift of the refined pose, in metres."""
+    cost_per_m = 0.1
+    """Cost of a metre of shift: of poses about as good the nearest is taken."""
+    start_rotation_rad = np.radians(12)
+    """Rotation of further starts, in radians."""
+    coarse_m = 0.02
+    """Residual that counts half in the first stage, in metres."""
+    fine_m = 0.01
+    """Residual that counts half in the second stage, in metres."""
+    coarse_steps = 8
+    """Steps of the first stage."""
+    fine_steps = 15
+    """Steps of the second stage."""
+    kept = 3
+    """Poses kept after the first stage."""
+    damping = (1e-3, 1e-5, 1e3)
+    """Levenberg-Marquardt damping: first, smallest, largest."""
+    min_gain = 1e-5
+    """A step that lowers the cost by less is the last."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +70,7 @@ class PoseRefinement:
 
     def __init__(self, old: ColoredSurface, new: ColoredSurface, views: tuple[CandidateViews, CandidateViews]) -> None:
         rng = np.random.default_rng(0)
-        self._old, self._new = (s.at(rng.permutation(len(s))[:_SAMPLE]) for s in (old, new))
+        self._old, self._new = (s.at(rng.permutation(len(s))[:PlacementTuning.points]) for s in (old, new))
         self._views = views
 
     def place(self, T: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -65,42 +79,44 @@ class PoseRefinement:
         if not len(self._views[0]) or not len(self._views[1]):
             return T
         tilted = tilt(T, up)
-        if tilted >= _FALLEN:
+        if tilted >= PlacementTuning.fallen_rad:
             return self._search(T, np.eye(6), up)[0]
         level = self._search(without_tilt(T, up, self._old.points.mean(0)), upright(up), up)
-        if tilted < LEVEL:
+        if tilted < UprightTuning.max_tilt_rad:
             return level[0]
         free = self._search(T, np.eye(6), up)
-        return level[0] if level[1] <= free[1] + _STANDING_COSTS else free[0]
+        return level[0] if level[1] <= free[1] + PlacementTuning.upright_gain else free[0]
 
     def _search(self, T: np.ndarray, free: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, float]:
         """The best motion near one, by twists [6, k] about the thing's middle, and its cost."""
-        beside = np.linalg.svd(up[None])[2][1:] * _BESIDE_M
+        beside = np.linalg.svd(up[None])[2][1:] * PlacementTuning.start_shift_m
         starts = [translation(a * beside[0] + b * beside[1]) @ T for a in (-1, 0, 1) for b in (-1, 0, 1)]
-        found = [self._refine(start, free, _COARSE_M, _COARSE_STEPS) for start in starts]
+        found = [self._refine(start, free, PlacementTuning.coarse_m, PlacementTuning.coarse_steps) for start in starts]
         best = min(found, key=_cost)[0]
         middle = self._middle(best)
-        for angle in (-_TURNED, _TURNED):
+        for angle in (-PlacementTuning.start_rotation_rad, PlacementTuning.start_rotation_rad):
             turn = se3_exp(angle * np.append(np.zeros(3), up))
             start = translation(middle) @ turn @ translation(-middle) @ best
-            found.append(self._refine(start, free, _COARSE_M, _COARSE_STEPS))
-        kept = sorted(found, key=_cost)[:_KEPT]
-        ends = [self._refine(start, free, _FINE_M, _FINE_STEPS) for start, _ in kept]
-        near = [end for end in ends if self._away(end[0], T) < _FARTHEST_M]
-        return min(near, key=lambda end: end[1] + _AWAY_COSTS * self._away(end[0], T), default=(T, self.cost(T)))
+            found.append(self._refine(start, free, PlacementTuning.coarse_m, PlacementTuning.coarse_steps))
+        kept = sorted(found, key=_cost)[:PlacementTuning.kept]
+        ends = [self._refine(start, free, PlacementTuning.fine_m, PlacementTuning.fine_steps) for start, _ in kept]
+        near = [end for end in ends if self._away(end[0], T) < PlacementTuning.max_shift_m]
+        return min(
+            near, key=lambda end: end[1] + PlacementTuning.cost_per_m * self._away(end[0], T), default=(T, self.cost(T))
+        )
 
     def _away(self, T: np.ndarray, other: np.ndarray) -> float:
         """Metres between the thing's middles after two motions."""
         return float(np.linalg.norm(self._middle(T) - self._middle(other)))
 
-    def cost(self, T: np.ndarray, scale: float = _FINE_M) -> float:
+    def cost(self, T: np.ndarray, scale: float = PlacementTuning.fine_m) -> float:
         """How little the pictures agree, 0 to 1."""
         return self._terms(T, scale, np.zeros(3)).cost
 
     def _refine(self, T: np.ndarray, free: np.ndarray, scale: float, steps: int) -> tuple[np.ndarray, float]:
         """A motion after so many steps, and its cost."""
         middle = self._middle(T)
-        terms, (damping, least, most) = self._terms(T, scale, middle), _DAMPING
+        terms, (damping, least, most) = self._terms(T, scale, middle), PlacementTuning.damping
         for _ in range(steps):
             H = free.T @ terms.H @ free
             H[np.diag_indices(len(H))] += damping * np.diag(H) + 1e-9
@@ -110,7 +126,7 @@ class PoseRefinement:
             if after.cost < terms.cost:
                 gained = terms.cost - after.cost
                 T, terms, damping = tried, after, max(damping / 4, least)
-                if gained < _ENOUGH:
+                if gained < PlacementTuning.min_gain:
                     break
             else:
                 damping *= 8

@@ -13,12 +13,11 @@ from ggslam.errors import ConfigError
 from ggslam.mapping.votes import merge_votes
 from ggslam.objects.encoding import code_of, with_class
 from ggslam.objects.same_object import LabelledVoxels, find_counterparts, sizes_of
-from ggslam.objects.settings import SameObjectSettings
+from ggslam.objects.settings import IDS, SameObjectSettings
 from ggslam.objects.table import ObjectTable, Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 
-_IDS = 1 << 16
 _SMALL = 4
 """Things that fill fewer than this many times the voxels that two have to share are compared in finer ones, too."""
 _SUREST: tuple[Supervision, ...] = ("geometry", "model", "associated masks", "masks")
@@ -140,13 +139,13 @@ class UnitedObjects:
         objects_before = {i for of_run in self.ids for i in of_run.values()}
         self.united += [(new, len(self.ids), old) for old, new in ids.items() if new in objects_before]
         taken = known | set(ids.values()) | (set() if told is None else told.taken)
-        free = iter([i for i in range(1, _IDS) if i not in taken and i not in own])
+        free = iter([i for i in range(1, IDS) if i not in taken and i not in own])
         for i in own:
             if i not in ids:
                 ids[i] = i if i not in taken else next(free, 0)
                 taken.add(ids[i])
         if 0 in ids.values():
-            raise ConfigError(f"the runs have more than {_IDS - 1} objects together")
+            raise ConfigError(f"the runs have more than {IDS - 1} objects together")
         return ids
 
     def _by_source(self, objects: RunObjects) -> dict[int, int] | None:
@@ -191,7 +190,7 @@ class UnitedObjects:
 
     def _relabel(self, base: GaussianMap, gaussians: GaussianMap, objects: RunObjects, ids: Mapping[int, int]) -> None:
         """A run's Gaussians get ids, votes and vectors of the whole."""
-        table = np.zeros(_IDS, np.int32)
+        table = np.zeros(IDS, np.int32)
         table[list(ids)] = list(ids.values())
         alias = torch.from_numpy(table)
         gaussians.object_id[:] = alias[gaussians.object_id.long()]

@@ -25,7 +25,7 @@ from ggslam.objects.removal_artifacts import drop_artifacts, places
 from ggslam.objects.rim_planes import RimPlane, find_rim_planes, rim_points
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.segmented_rows import copies_of
-from ggslam.objects.view_filling import LEAST_PIXELS, close, open_pixels
+from ggslam.objects.view_filling import ViewFillingTuning, close, open_pixels
 from ggslam.rendering.types import GaussianTensors
 from ggslam.system.settings import setting, settings_class
 
@@ -148,7 +148,7 @@ class _Hole:
         for _ in range(self.settings.closings):
             kept = copies_of(self.scene.gaussians, self.surroundings())
             counts = np.array([open_pixels(kept, view).sum() for view in views])
-            order = np.argsort(-counts, kind="stable")[: int((counts >= LEAST_PIXELS).sum())]
+            order = np.argsort(-counts, kind="stable")[: int((counts >= ViewFillingTuning.min_pixels).sum())]
             patch = next((p for p in (close(kept, views[i], views) for i in order) if p is not None), None)
             if patch is None:
                 return

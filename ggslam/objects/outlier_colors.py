@@ -4,29 +4,42 @@ many colours, all of which come again all over the plane; those of a picture or 
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from ggslam.objects.pixel_passes import outlier_colors
+from ggslam.system.tuning import Tuning
 
-BRIGHTNESS, HUE = 1, 2
+BRIGHTNESS: Final = 1
+"""Code of a piece that differs in brightness; the compiled core gives it."""
+HUE: Final = 2
+"""Code of a piece that differs in hue."""
 
-_CELLS = 12
-"""Cells of the image across, in which it is noted which colours occur."""
-_BRIGHTNESS, _HUE = 1.0, 0.5
-"""Width of bins of L and of a and b, as shares of the contrast."""
-_LEAST_WIDTH = 8.0
-"""Contrast that bins are at least made for: their number goes with its third power."""
-_OCCURS = 0.03
-"""Share of a cell's pixels from which a colour occurs in it."""
-_USUAL = 0.3
-"""Share of a plane's cells in which its own colours occur at least."""
-_BASE = 0.3
-"""A piece without edges that is so much of the plane is the plane."""
-SHADE = (0.45, 1.6)
-"""Ratios of brightness between which a colour of the same hue may be the plane in shadow or in the sun."""
-_SAME_HUE = 0.2
-"""Difference of hue of such colours at most, as a share of the contrast."""
-_LEAST_CELLS = 6
+
+class OutlierColorTuning(Tuning):
+    """Which colours occur at one place of a plane only."""
+
+    cells = 12
+    """Cells across the image in which colours are counted."""
+    brightness_bin = 1.0
+    """Width of bins of L, as a share of the contrast."""
+    hue_bin = 0.5
+    """Width of bins of a and b, as a share of the contrast."""
+    min_contrast = 8.0
+    """Smallest contrast that bins are made for: their number grows with its third power."""
+    min_cell_share = 0.03
+    """Share of a cell's pixels from which a colour occurs in it."""
+    min_cells_share = 0.3
+    """Share of a plane's cells from which a colour is the plane's own."""
+    base_share = 0.3
+    """A piece without edges that covers this share of the plane is the plane."""
+    shade = (0.45, 1.6)
+    """Ratios of brightness between which the same hue may be the plane in shadow or sun."""
+    same_hue = 0.2
+    """Largest difference of hue then, as a share of the contrast."""
+    min_cells = 6
+    """Fewest cells of a plane that tell its own colours."""
 
 
 def find_outlier_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray, contrast: float) -> np.ndarray:
@@ -43,15 +56,17 @@ def find_outlier_colors(lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray,
         be a shadow's) or HUE.
     """
     rows, columns = np.nonzero(inside)
-    size = max(1, inside.shape[1] // _CELLS)
+    t = OutlierColorTuning
+    size = max(1, inside.shape[1] // t.cells)
     least = 0.2 * size * size
-    if np.count_nonzero(np.bincount(rows // size * _CELLS * 2 + columns // size) >= least) < _LEAST_CELLS:
+    if np.count_nonzero(np.bincount(rows // size * t.cells * 2 + columns // size) >= least) < t.min_cells:
         return np.zeros(inside.shape, np.uint8)
-    width = max(contrast, _LEAST_WIDTH)
+    width = max(contrast, t.min_contrast)
     return outlier_colors(
         lab, inside, pieces, light=_light(rows, columns, lab[rows, columns, 0]),
-        bins=(_BRIGHTNESS * width, _HUE * width, _HUE * width), cell=size, least_cell=least, occurs=_OCCURS,
-        usual=_USUAL, base=_BASE, same_hue=_SAME_HUE * contrast, shade=SHADE,
+        bins=(t.brightness_bin * width, t.hue_bin * width, t.hue_bin * width), cell=size, least_cell=least,
+        occurs=t.min_cell_share, usual=t.min_cells_share, base=t.base_share, same_hue=t.same_hue * contrast,
+        shade=t.shade,
     )  # fmt: skip
 
 

@@ -13,20 +13,25 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from ggslam.objects.hole_views import COVERED, RENDERED, CameraView, mark_removed, pick_views
+from ggslam.objects.hole_views import RENDERED, CameraView, HoleViewTuning, mark_removed, pick_views
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import copies_of, keep_rows
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors
 from ggslam.scene.poses import inverse
 from ggslam.sight.view import View
+from ggslam.system.tuning import Tuning
 
-_VIEWS = 32
-"""Views, at most, that are asked."""
-_SELDOM = 0.15
-"""Weight without the object, as a share of what it has now in the object's pixels, up to which it was just hidden."""
-_CLEAR = 0.5
-"""Share of its weight in pixels without the object up to which a Gaussian is a trace of it."""
+
+class ArtifactTuning(Tuning):
+    """When a Gaussian is left over from a removed object."""
+
+    views = 32
+    """Most views that are compared."""
+    max_hidden = 0.15
+    """It was hidden if its weight without the object is at most this share of its weight now."""
+    max_clear = 0.5
+    """It belongs to the object if at most this share of its weight lies beside the object."""
 
 
 def places(removed: GaussianTensors, touching: float = 0.05) -> list[GaussianTensors]:
@@ -81,10 +86,10 @@ def find_artifacts(kept: Gaussians, removed: Gaussians, views: Sequence[CameraVi
     both, rasterizer = mark_removed(kept, removed), CpuRasterizer()
     alone = GaussianTensors(**{name: getattr(both, name)[: len(near)] for name in PARAMETERS})
     weights = torch.zeros(len(near), 3)
-    for view in pick_views([view for view in views if view.project(means[near])[2].any()], _VIEWS):
+    for view in pick_views([view for view in views if view.project(means[near])[2].any()], ArtifactTuning.views):
         image = rasterizer.forward(both, view.camera, view.T_camera_world).features
         assert image is not None
-        covered = (image[0] > COVERED).float()
+        covered = (image[0] > HoleViewTuning.covered).float()
         covered = torch.nn.functional.max_pool2d(covered[None, None], 3, 1, 1)[0, 0]
         added = _pixel_weights(rasterizer, [1 - covered, covered])[: len(near)]
         if covered.any():
@@ -94,13 +99,13 @@ def find_artifacts(kept: Gaussians, removed: Gaussians, views: Sequence[CameraVi
             added[before] = torch.stack([added[before].sum(1), torch.zeros(int(before.sum()))], 1)
         weights[:, :2] += added
     clear, through, now = weights.numpy().T
-    return near & ((clear <= _CLEAR * (clear + through)) | (clear <= _SELDOM * now))
+    return near & ((clear <= ArtifactTuning.max_clear * (clear + through)) | (clear <= ArtifactTuning.max_hidden * now))
 
 
 def _before(points: np.ndarray, removed: Gaussians, view: CameraView) -> np.ndarray:
     """Which points [N, 3] stand clearly before an object, bool [N]: what they hide of it is no artifact of it."""
     out = CpuRasterizer().forward(removed, view.camera, view.T_camera_world, features=False)
-    depth = np.where(out.alpha.numpy() > COVERED, out.expected_depth.numpy(), np.inf).astype(np.float32)
+    depth = np.where(out.alpha.numpy() > HoleViewTuning.covered, out.expected_depth.numpy(), np.inf).astype(np.float32)
     nearest = cv2.erode(depth, np.ones((5, 5), np.uint8))
     nearest[~np.isfinite(nearest)] = 0
     sight = View.of(nearest, view.camera, inverse(view.T_camera_world), RENDERED)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,7 @@ from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_parts,
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_ply import read_points
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
-from ggslam.objects import segmented_map
-from ggslam.objects.segmented_map import ObjectVotes
+from ggslam.objects.segmented_map import ObjectVotes, SegmentedMapTuning
 from ggslam.reporting.pictures import IdentityColors
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX, MapInParts, write_map_index
@@ -31,6 +31,7 @@ from ggslam.runs.verification import accept_files
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.tuning import overridden
 
 
 @pytest.fixture(scope="module")
@@ -54,15 +55,15 @@ def stored(shared_segmented_room: Any, tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.fixture
-def pair(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[RunFolder, RunFolder]:
+def pair(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[RunFolder, RunFolder]]:
     """A run in cells, and the same run without their index."""
     for name in ("cells", "whole"):
         shutil.copytree(stored, tmp_path / name)
     (tmp_path / "whole" / MAP_INDEX).unlink()
     accept_files(tmp_path / "whole")
     monkeypatch.setattr(gaussian_rows, "BLOCK", 700)
-    monkeypatch.setattr(segmented_map, "_ROWS_AT_ONCE", 500)
-    return RunFolder.open(tmp_path / "cells"), RunFolder.open(tmp_path / "whole")
+    with overridden(SegmentedMapTuning, rows_at_once=500):
+        yield RunFolder.open(tmp_path / "cells"), RunFolder.open(tmp_path / "whole")
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -13,11 +13,13 @@ import torch
 
 from ggslam.errors import ConfigError, FormatError
 from ggslam.objects.boxes import middle_of, oriented_box
-from ggslam.objects.colors import UNLABELLED, id_palette
+from ggslam.objects.colors import PaletteTuning, id_palette
+from ggslam.objects.settings import ClassifierTuning
 from ggslam.objects.table import ObjectRecord, ObjectTable, Observation
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
 from ggslam.scene.oriented_box import OrientedBox
+from ggslam.system.tuning import overridden
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -64,14 +66,14 @@ def test_a_table_counts_names_and_observes() -> None:
         ObjectTable.build(map_of([70000]), IdentityClassifier.empty(), "masks")
 
 
-def test_confidence_is_the_mean_probability_of_the_own_class(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ggslam.objects.table._VALUES_AT_ONCE", 3)  # one Gaussian at a time
+def test_confidence_is_the_mean_probability_of_the_own_class() -> None:
     weight = np.zeros((2, 16), np.float32)
     weight[0, 0], weight[1, 1] = 1, 1
     classifier = IdentityClassifier(np.array([3, 7], np.uint16), weight, np.zeros(2, np.float32))
     features = np.zeros((3, 16))
     features[0, 0], features[1, 0], features[2, 1] = np.log(4), np.log(9), 0
-    table = ObjectTable.build(map_of([3, 3, 7], features=features), classifier, "masks")
+    with overridden(ClassifierTuning, values_at_once=3):  # one Gaussian at a time
+        table = ObjectTable.build(map_of([3, 3, 7], features=features), classifier, "masks")
     nothing = np.exp(NOTHING_LOGIT)
     assert table.record(3).confidence == pytest.approx((4 / (5 + nothing) + 9 / (10 + nothing)) / 2)
     assert table.record(7).confidence == pytest.approx(1 / (2 + nothing))
@@ -121,7 +123,7 @@ def test_a_real_segmented_map(segmented_room: Any) -> None:
 
 def test_colours_are_distinct_and_never_grey() -> None:
     colors = id_palette()
-    assert tuple(colors[0]) == UNLABELLED and not colors.flags.writeable
+    assert tuple(colors[0]) == PaletteTuning.unlabelled and not colors.flags.writeable
     first = colors[1:601].astype(int)
     steps = {step: np.abs(first[step:] - first[:-step]).sum(-1).min() for step in (1, 2, 3, 5, 8, 13, 21, 34, 144, 288)}
     assert min(steps.values()) > 50, steps  # also where hues come near each other again

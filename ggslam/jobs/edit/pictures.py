@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ggslam.objects.editing import Change
-from ggslam.objects.hole_views import COVERED, CameraView, mark_removed
+from ggslam.objects.hole_views import CameraView, HoleViewTuning, mark_removed
 from ggslam.objects.segmented_rows import join_gaussians
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians
@@ -73,7 +73,7 @@ def _areas(gaussians: Gaussians, part: Gaussians, views: Sequence[CameraView]) -
     rasterizer, both, out = CpuRasterizer(), mark_removed(gaussians, part), []
     for view in views:
         image = rasterizer.forward(both, view.camera, view.T_camera_world).features
-        out.append(0 if image is None else int((image[0].numpy() > COVERED / 2).sum()))
+        out.append(0 if image is None else int((image[0].numpy() > HoleViewTuning.covered / 2).sum()))
     return np.array(out)
 
 

@@ -19,7 +19,7 @@ from ggslam.jobs.edit.edited_file import edited_name
 from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.jobs.view.pictures import ViewPictures
-from ggslam.objects.editing import MAX_NAME
+from ggslam.objects.editing import EditingTuning
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectRecord
 from ggslam.reporting.pictures import color_of_depth, depth_range
@@ -321,7 +321,11 @@ class ViewedRun:
         with self._lock:
             if not self._edits:
                 raise ConfigError("nothing was edited, so there is nothing to save")
-            if not is_plain_name(target.strip()) or not target.isprintable() or len(target) > MAX_NAME:
+            if (
+                not is_plain_name(target.strip())
+                or not target.isprintable()
+                or len(target) > EditingTuning.max_name_length
+            ):
                 raise ConfigError(f"a name is needed to save as, of a new folder in {self.save_folder()}")
             sequence = self._sequence_path if inpaint else None
             edits = list(self._edits)
