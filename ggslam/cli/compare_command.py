@@ -14,6 +14,7 @@ from ggslam.cli.changes_command import print_changes
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
+from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
     from ggslam.geometry.clouds import Overlap
@@ -124,7 +125,7 @@ def _print(c: Comparison, max_distance: float) -> None:
             "the surface",
             highlight=False, markup=False, soft_wrap=True,
         )  # fmt: skip
-    if max(c.a_on_b.fitness, c.b_on_a.fitness) < _HARDLY:
+    if max(c.a_on_b.fitness, c.b_on_a.fitness) < CompareTuning.min_partners:
         console.print(
             "note: hardly anything of the two lies together: they show different places, or lie in different worlds "
             "(--align); the distances below mean nothing then", highlight=False, markup=False, soft_wrap=True
@@ -154,8 +155,13 @@ def _print(c: Comparison, max_distance: float) -> None:
 _ALIGNED = {
     "truth": "by the true poses", "icp": "by ICP", "trajectory": "by camera positions at common times",
 }  # fmt: skip
-_HARDLY = 0.05
-"""Share of points with a partner below which the two do not show the same thing as they lie."""
+
+
+class CompareTuning(Tuning):
+    """When two runs show different places."""
+
+    min_partners = 0.05
+    """Smallest share of points with a partner, in the better direction."""
 
 
 _COLUMNS = ["", "fitness", "inlier RMSE", "to the surface: median", "90 %"]

@@ -10,7 +10,7 @@ from enum import Enum
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.markup import escape
@@ -55,8 +55,8 @@ _WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host",
 """Options that change nothing of what a run computes."""
 
 
-STRICT_EXIT_CODE = 3
-"""Of runs that came to an end, but are bad or of a recording that seems wrong, under --strict."""
+STRICT_EXIT_CODE: Final = 3
+"""Exit code under --strict of a run that ended but is bad, or whose recording seems wrong."""
 
 
 class DeviceName(str, Enum):

@@ -17,9 +17,16 @@ from ggslam.objects.settings import IDS, SameObjectSettings
 from ggslam.objects.table import ObjectTable, Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
+from ggslam.system.tuning import Tuning
 
-_SMALL = 4
-"""Things that fill fewer than this many times the voxels that two have to share are compared in finer ones, too."""
+
+class SmallObjectTuning(Tuning):
+    """Which objects are compared in finer voxels, too."""
+
+    small = 4
+    """Those that fill fewer voxels than this many times the number that two objects have to share."""
+
+
 _SUREST: tuple[Supervision, ...] = ("geometry", "model", "associated masks", "masks")
 """What taught objects, the least sure first: a merged map's are as sure as the least sure of them."""
 
@@ -161,7 +168,10 @@ class UnitedObjects:
         voxel = self.settings.voxel
         first, second = LabelledVoxels.of_map(base, voxel), LabelledVoxels.of_map(gaussians, voxel)
         found = {pair.second: pair.first for pair in find_counterparts(first, second, self.settings)}
-        small = [np.flatnonzero(sizes_of(voxels) < _SMALL * self.settings.min_shared) for voxels in (first, second)]
+        small = [
+            np.flatnonzero(sizes_of(voxels) < SmallObjectTuning.small * self.settings.min_shared)
+            for voxels in (first, second)
+        ]
         for finer in (voxel / 2, voxel / 4):  # small things fill too few voxels
             maps = [LabelledVoxels.of_map(g, finer, only) for g, only in zip((base, gaussians), small, strict=True)]
             more = {pair.second: pair.first for pair in find_counterparts(maps[0], maps[1], self.settings)}

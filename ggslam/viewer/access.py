@@ -21,8 +21,16 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-MAX_MESSAGE_BYTES = 256 << 10
-"""Of one message of a page; clicks, poses and names take a few hundred."""
+from ggslam.system.tuning import Tuning
+
+
+class AccessTuning(Tuning):
+    """Limits of what a page sends."""
+
+    max_message_bytes = 256 << 10
+    """Largest message, in bytes; clicks, poses and names take a few hundred."""
+
+
 _unheard = logging.getLogger(f"{__name__}.connections")
 _unheard.setLevel(logging.CRITICAL + 1)
 _ANYWHERE = ("0.0.0.0", "::", "")
@@ -146,7 +154,7 @@ def guard(gate: Gate) -> Iterator[None]:
 
     def guarded_serve(handler: Any, host: str, port: int, **options: Any) -> Any:
         options["process_request"] = _process(gate, options.get("process_request"))
-        options["max_size"] = MAX_MESSAGE_BYTES
+        options["max_size"] = AccessTuning.max_message_bytes
         options["logger"] = _unheard  # who sends what is no HTTP, as scanners of ports do, gets no traceback printed
         return serve(handler, host, port, **options)
 

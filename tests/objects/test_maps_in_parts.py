@@ -23,7 +23,7 @@ from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_ply import read_points
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMapTuning
-from ggslam.reporting.pictures import IdentityColors
+from ggslam.reporting.pictures import IdentityColors, IdentityPictureTuning
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX, MapInParts, write_map_index
 from ggslam.runs.objects_in_parts import ObjectsInParts
@@ -189,15 +189,14 @@ class Counts(dict[int, int]):
         super().__init__(zip(*(column.tolist() for column in np.unique(values, return_counts=True)), strict=True))
 
 
-def test_votes_and_colors_of_parts(pair: tuple[RunFolder, RunFolder], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_votes_and_colors_of_parts(pair: tuple[RunFolder, RunFolder]) -> None:
     folder, _ = pair
     path = folder.path / "votes.npz"
     assert np.array_equal(ObjectVotes.labels_in_file(path), ObjectVotes.from_file(path).labels())
-    monkeypatch.setattr("ggslam.runs.objects_in_parts.FITTED", 300)
-    monkeypatch.setattr("ggslam.reporting.pictures.FITTED", 300)
     gaussians = folder.gaussians()
-    whole = IdentityColors(gaussians.features.numpy()[gaussians.object_id.numpy() > 0])
-    parts = ObjectsInParts.of(folder).identity_colors()
+    with overridden(IdentityPictureTuning, fitted=300):
+        whole = IdentityColors(gaussians.features.numpy()[gaussians.object_id.numpy() > 0])
+        parts = ObjectsInParts.of(folder).identity_colors()
     image = gaussians.features.numpy()[:64].T.reshape(16, 8, 8)
     assert np.array_equal(parts.picture(image, np.ones((8, 8))), whole.picture(image, np.ones((8, 8))))
     path.write_bytes(path.read_bytes()[:-3000])

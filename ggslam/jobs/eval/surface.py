@@ -17,7 +17,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.mesh import extract_mesh
-from ggslam.volumes.surface_points import LEAST_WEIGHT, surface_settings
+from ggslam.volumes.surface_points import SurfacePointTuning, surface_settings
 from ggslam.volumes.tsdf import TsdfMap
 
 
@@ -92,7 +92,7 @@ class SurfaceScorer:
         """Of the points whose depth was measured; None if that are none."""
         if self._tsdf is None or not self._measured.any():
             return None
-        mesh = extract_mesh(self._tsdf, LEAST_WEIGHT / self._times**2)
+        mesh = extract_mesh(self._tsdf, SurfacePointTuning.min_weight / self._times**2)
         if not len(mesh.vertices):
             return None
         return score_surface(self._points[self._measured], mesh.vertices, mesh.normals, self._voxel)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ggslam.jobs.report.run_data import RunData
-from ggslam.reporting.plots import COLORS, Band, Plot, Series
+from ggslam.reporting.plots import Band, Plot, PlotTuning, Series
 from ggslam.system.tuning import Tuning
 
 FRAME = "frame"
@@ -56,7 +56,7 @@ def _paths(runs: Sequence[RunData], project: Callable[[np.ndarray], tuple[np.nda
 
 def _curve(label: str, x: np.ndarray, y: np.ndarray, number: int) -> Series:
     """The curve of a run among several; after all colours they begin again, dashed."""
-    usual = COLORS - 1
+    usual = PlotTuning.colors - 1
     return Series(label, x, y, color=number % usual, dashed=number >= usual)
 
 

@@ -14,8 +14,8 @@ from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
 from ggslam.rendering.types import GaussianTensors
 from ggslam.reporting.pictures import (
-    FITTED,
     IdentityColors,
+    IdentityPictureTuning,
     color_of_depth,
     color_of_ids,
     color_to_uint8,
@@ -133,4 +133,6 @@ def _identity_colors(segmented: SegmentedMap) -> IdentityColors | None:
     labelled = np.flatnonzero(segmented.gaussians.object_id.numpy() > 0)
     if not len(labelled):
         return None
-    return IdentityColors(segmented.gaussians.features.numpy()[labelled[:: max(1, len(labelled) // FITTED)]])
+    return IdentityColors(
+        segmented.gaussians.features.numpy()[labelled[:: max(1, len(labelled) // IdentityPictureTuning.fitted)]]
+    )

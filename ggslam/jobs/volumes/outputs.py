@@ -41,13 +41,7 @@ from ggslam.system.staging import finish_saving, make_staging, publish
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name
 from ggslam.volumes.esdf import DistanceField
-from ggslam.volumes.floor_frame import (
-    BELOW_CAMERAS,
-    FLOOR_FILE,
-    floor_from_map,
-    floor_height,
-    write_floor_file,
-)
+from ggslam.volumes.floor_frame import FLOOR_FILE, FloorTuning, floor_from_map, floor_height, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh
 from ggslam.volumes.occupancy import OccupancyMap
@@ -228,7 +222,7 @@ class _Writer:
         lying = "all ROS files are in the floor's frame"
         if frame is OutputFrame.map:
             lying = "mesh and occupancy are in the map's frame, map.pgm is in the floor's"
-        guess = "" if seen else f" (z = 0 is {BELOW_CAMERAS:g} m below the lowest camera)"
+        guess = "" if seen else f" (z = 0 is {FloorTuning.below_cameras_m:g} m below the lowest camera)"
         self.tell(f"{lying}{guess}: {command}", frame=frame.value, T_floor_map=self.surface.T_floor_map)
 
     def field(self, field_: DistanceField, seconds: float) -> None:
