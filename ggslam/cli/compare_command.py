@@ -52,7 +52,7 @@ SidePath = Annotated[
     typer.Argument(metavar="A", help="Folder of a run, PLY or PCD file with a cloud or mesh, or file of Gaussians "
                    "(.sog, .spz, ...)."),
 ]  # fmt: skip
-ReferencePath = Annotated[Path, typer.Argument(metavar="B", help="The reference: a run, cloud or mesh likewise.")]
+ReferencePath = Annotated[Path, typer.Argument(metavar="B", help="The reference: a run, cloud or mesh, too.")]
 
 
 def compare(
@@ -71,7 +71,7 @@ def compare(
     thresholds: Annotated[str, typer.Option(help="Distances for precision, recall and F1, metres.")] = "0.01,0.02,0.05",
     seed: Annotated[int, typer.Option(help="Seed of the random samples.", min=0)] = 0,
     changes: Annotated[
-        bool, typer.Option("--changes", help="Of runs: also list what changed from A, the earlier visit, to B.")
+        bool, typer.Option("--changes", help="For two runs: also list what changed from A, the earlier visit, to B.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="JSON file to write all numbers to.")] = None,
 ) -> None:  # fmt: skip

@@ -38,12 +38,12 @@ def decode(
         Path,
         typer.Argument(
             metavar="OUT",
-            help="PLY or PCD file; of Gaussians a 3DGS PLY; of a .ggz a run folder, of a .ggc a grid store.",
+            help="PLY or PCD file; for Gaussians a 3DGS PLY, for a .ggz a run folder, for a .ggc a grid store.",
         ),
     ],
-    slice_id: Annotated[int | None, typer.Option("--slice", help="Decode this slice alone.", min=0)] = None,
+    slice_id: Annotated[int | None, typer.Option("--slice", help="Decode only this slice.", min=0)] = None,
     box: Annotated[
-        str | None, typer.Option(help='Decode the points in a box alone: "x0 y0 z0 x1 y1 z1", metres.')
+        str | None, typer.Option(help='Decode only the points in this box: "x0 y0 z0 x1 y1 z1", metres.')
     ] = None,
     threads: options.Threads = None,
 ) -> None:

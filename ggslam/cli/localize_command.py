@@ -55,12 +55,12 @@ StartPose = Annotated[
 ]  # fmt: skip
 NoStartPose = Annotated[
     bool,
-    typer.Option("--no-start-pose", help="Look the first frame or scan up in the map (the default)."),
+    typer.Option("--no-start-pose", help="Search for the first frame or scan in the map (default)."),
 ]
 Near = Annotated[
     str | None,
     typer.Option(metavar="PLACE", help='Roughly where the recording was made: "x y sigma" or "x y z sigma", metres in '
-                 "the map. Only places within 3 sigma are looked at."),
+                 "the map. Only places within 3 sigma are searched."),
 ]  # fmt: skip
 FullMap = Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")]

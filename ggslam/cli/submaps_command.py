@@ -64,7 +64,10 @@ Voxel = Annotated[
 ]
 Radius = Annotated[
     float | None,
-    typer.Option(help="R: record a cell from so near its centre, metres (default 1, or 0.9 S of a LiDAR).", min=0),
+    typer.Option(
+        help="R: record a cell from within this distance of its centre, metres (default 1, or 0.9 S for a LiDAR).",
+        min=0,
+    ),
 ]
 Refresh = Annotated[
     float | None, typer.Option(help="T: seconds before a cell is recorded again (default 300).", min=0)
@@ -84,7 +87,7 @@ def submaps(
         Path | None, typer.Option(help="Trajectory file in the map's world, instead of the recording's own poses.")
     ] = None,
     at: Annotated[
-        float | None, typer.Option(help="When this visit began, seconds on a clock that all visits share.")
+        float | None, typer.Option(help="Start of this visit, in seconds on a clock that all visits share.")
     ] = None,
     spacing: Spacing = None,
     axes: Axes = None,
