@@ -66,7 +66,7 @@ def test_pictures_that_are_not_shown_are_counted(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_changes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"holds no changes\.json"):
+    with pytest.raises(ConfigError, match=r"changes\.json"):
         read_changes(tmp_path)
 
 

@@ -331,7 +331,7 @@ def test_a_run_is_refined_in_place(room_run: RunFolder, tmp_path: Path) -> None:
 
 def test_runs_that_cannot_be_refined(room_run: RunFolder, tmp_path: Path) -> None:
     shutil.copytree(room_run.path, tmp_path / "run")
-    with pytest.raises(ConfigError, match="lies in the run"):
+    with pytest.raises(ConfigError, match="`out`.*better"):
         refine_run(tmp_path / "run", tmp_path / "run" / "better")
     sequence = RunFolder.open(tmp_path / "run").sequence()
     moved = sequence.open.model_copy(update={"path": str(tmp_path / "gone")})

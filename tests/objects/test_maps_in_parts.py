@@ -200,7 +200,7 @@ def test_votes_and_colors_of_parts(pair: tuple[RunFolder, RunFolder]) -> None:
     image = gaussians.features.numpy()[:64].T.reshape(16, 8, 8)
     assert np.array_equal(parts.picture(image, np.ones((8, 8))), whole.picture(image, np.ones((8, 8))))
     path.write_bytes(path.read_bytes()[:-3000])
-    with pytest.raises(FormatError, match="votes"):
+    with pytest.raises(FormatError, match=r"votes\.npz"):
         ObjectVotes.labels_in_file(path)
 
 
@@ -208,7 +208,7 @@ def test_damage_is_named_by_its_row(pair: tuple[RunFolder, RunFolder], tmp_path:
     gaussians = pair[0].gaussians()
     gaussians.means[1500, 1] = torch.nan
     write_gaussian_ply(tmp_path / "map.ply", gaussians)
-    with pytest.raises(FormatError, match="'y' of vertex 1500"):
+    with pytest.raises(FormatError, match=r"map\.ply.*'y'.*1500"):
         list(GaussianRows(tmp_path / "map.ply").blocks())
 
 
@@ -220,10 +220,10 @@ def test_other_encodings_are_read_whole(tmp_path: Path, pair: tuple[RunFolder, R
     (tmp_path / "text.ply").write_text("\n".join([*header, "end_header", *numbers, ""]))
     rows = GaussianRows(tmp_path / "text.ply")
     assert len(rows) == 2 and rows.read(1, 1).means.tolist() == [[4, 5, 6]] and len(rows.like) == 0
-    with pytest.raises(FormatError, match="file is missing"):
+    with pytest.raises(FormatError, match=r"none\.ply"):
         GaussianRows(tmp_path / "none.ply")
     index = json.loads((pair[0].path / MAP_INDEX).read_text())
     index["cells"].pop()
     (pair[0].path / MAP_INDEX).write_text(json.dumps(index))
-    with pytest.raises(FormatError, match="speaks of others"):
+    with pytest.raises(FormatError, match=r"map\.ply.*9277.*map_cells\.json"):
         pair[0].map_in_parts()

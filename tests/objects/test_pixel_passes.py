@@ -167,10 +167,10 @@ def test_numbers_outside_of_their_tables_are_refused() -> None:
     regions, points = np.array([0, 3, 1], np.int32), np.zeros((3, 3), np.float32)
     asked = core.RegionOnPlane(region=1)
     job = core.RegionsOnPlanesJob(address(points), address(regions), 3, 3, 0.1, ctypes.addressof(asked), 1)
-    with pytest.raises(CoreInputError, match="regions: expected numbers from 0 to 2, found 3"):
+    with pytest.raises(CoreInputError, match="regions:.* 0 .*2.* 3"):
         load_library().ggslam_regions_on_planes(ctypes.byref(job))
     regions[1], asked.region = 2, -1
-    with pytest.raises(CoreInputError, match="region: expected 0 to 2, found -1"):
+    with pytest.raises(CoreInputError, match="region:.* 0 .*2.* -1"):
         load_library().ggslam_regions_on_planes(ctypes.byref(job))
 
 
@@ -179,5 +179,5 @@ def test_surfaces_of_another_type_are_refused_and_depth_of_any_is_taken() -> Non
     surface = surface_of(np.full((30, 40), 2.0), camera, 8.0)  # float64
     assert pixel_passes.link_surfaces(surface, surface.valid, GeometricSettings())[0][0].all()
     wrong = replace(surface, depth=surface.depth.astype(np.float64))
-    with pytest.raises(InputError, match=r"surface: depth: expected contiguous float32 \[30, 40\], found float64"):
+    with pytest.raises(InputError, match=r"depth.*float32 \[30, 40\].*float64"):
         pixel_passes.link_surfaces(wrong, surface.valid, GeometricSettings())

@@ -150,8 +150,8 @@ def test_names_and_ids() -> None:
 
 @pytest.mark.parametrize(
     ("wanted", "hint"),
-    [("mgu", "did you mean mug"), ("bigbook", "did you mean Big Book"), ("99", "mug \\(2\\)"), ("", "''"),
-     ("-7", "no object '-7'"), ("³", "no object")],
+    [("mgu", r"'mgu'.*mug\W*$"), ("bigbook", r"'bigbook'.*Big Book\W*$"), ("99", "mug \\(2\\)"), ("", "''"),
+     ("-7", "'-7'"), ("³", "'³'")],
 )  # fmt: skip
 def test_unknown_names_are_answered_with_near_ones(wanted: str, hint: str) -> None:
     table = table_of({2: "mug", 7: "Big Book"})
@@ -160,9 +160,9 @@ def test_unknown_names_are_answered_with_near_ones(wanted: str, hint: str) -> No
 
 
 def test_unknown_names_in_long_and_empty_tables() -> None:
-    with pytest.raises(ConfigError, match="object 12 and 88 more"):
+    with pytest.raises(ConfigError, match="object 12 .*88"):
         table_of(dict.fromkeys(range(1, 101))).find("mug")
-    with pytest.raises(ConfigError, match="none"):
+    with pytest.raises(ConfigError, match="'3'"):
         table_of({}).record(3)
 
 
@@ -215,5 +215,5 @@ def test_damaged_files_are_named(tmp_path: Path, content: str, words: str) -> No
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="missing"):
+    with pytest.raises(FormatError, match=r"objects\.json"):
         ObjectTable.load(tmp_path / "objects.json")
