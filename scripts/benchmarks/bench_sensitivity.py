@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import GgslamError
+from ggslam.jobs.eval.run import score_run
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunRequest, execute
-from ggslam.jobs.score.run import score_run
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.slam.config import Config
