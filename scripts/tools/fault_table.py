@@ -44,7 +44,7 @@ Existing files are untouched wherever nothing else is said. Every fault happened
 Exit codes: 0 done (3 with `--strict` where something seems wrong), 1 the machine's fault or ours, or most frames were
 lost, 2 the input's fault, 128 + n after signal n, -9 after a kill, where the line is that of the command that goes on.
 """
-MOST = 60
+MOST = 52
 """Characters of a message on the page."""
 FEWEST = 3
 """Faults that a section of the page is made for."""
@@ -93,7 +93,7 @@ def brief(said: str) -> str:
 def kept(row: Row) -> str:
     """What was kept besides existing files, and what was bad."""
     parts = row.kept.split("; ")
-    words = "; ".join(part for part in parts if part != UNTOUCHED)
+    words = "; ".join(re.sub(r"^an? (\w+ )run of", r"\1run,", part) for part in parts if part != UNTOUCHED)
     if UNTOUCHED not in parts:
         words += ", but an existing file has changed"
     return words + (f" **{', '.join(row.problems)}**" if row.problems else "")
