@@ -18,7 +18,7 @@ from ggslam.objects.table import ObjectTable
 from ggslam.runs.records.verdict import AspectRecord, Grade, worst
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
-from ggslam.slam.verdicts import LOST_SHARE
+from ggslam.slam.verdicts import VerdictTuning
 from ggslam.tracking.tracker import TrackingStatus
 
 MOSTLY_LOST = 0.5
@@ -92,7 +92,7 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
     jumps, dropped = path_jumps(result), len(result.dropped_frames)
     codes = {verdict.code for verdict in found}
     grades: list[Grade] = [
-        _at_most((lost + doubted) / max(1, total), LOST_SHARE, BADLY_LOST),
+        _at_most((lost + doubted) / max(1, total), VerdictTuning.lost_share, BADLY_LOST),
         "doubtful" if searched > MUCH_SEARCHED * total or len(jumps) or codes & {"degenerate", "dropped"} else "good",
         "bad" if codes & {"textureless", "depth_noise"} else "good",
         "doubtful" if stopped or total < FEWEST_FRAMES or codes & {"no_motion", "both_repeat"} else "good",
