@@ -13,7 +13,7 @@ from ggslam.errors import RenderError
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians, RenderBuffers
 from ggslam.scene.camera import Camera
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IdentityClassifier, IdentityVectorTuning
 
 MIN_ALPHA = 0.5
 """Pixels that are covered less than this show no object."""
@@ -63,8 +63,8 @@ def label_image(
             logits = torch.addmm(bias, vectors[part], weight)
             best = logits.numpy().argmax(1)  # torch's own takes several times longer
             highest = logits.gather(1, torch.from_numpy(best)[:, None])
-            sums = logits.sub_(highest).exp_().sum(1).add_((NOTHING_LOGIT - highest[:, 0]).exp_())
-            something = (highest[:, 0] > NOTHING_LOGIT).numpy()
+            sums = logits.sub_(highest).exp_().sum(1).add_((IdentityVectorTuning.nothing_logit - highest[:, 0]).exp_())
+            something = (highest[:, 0] > IdentityVectorTuning.nothing_logit).numpy()
             confidence.reshape(-1)[part] = sums.reciprocal_().numpy()
             ids.reshape(-1)[part] = np.where(something, classifier.class_ids[best], 0)
     empty = (alpha < min_alpha).numpy() | (ids == 0)

@@ -16,7 +16,7 @@ from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import ViewAlignmentSettings
-from ggslam.mapping.view_alignment import BLURS, align_view, grey_of
+from ggslam.mapping.view_alignment import AlignmentTuning, align_view, grey_of
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.slam.frame_poses import FramePoses
@@ -151,7 +151,14 @@ class ColorPoses:
                     continue  # keyframes of a rig stay as the rig has them
                 depth = float(np.median(known[known > 0]))
                 hidden = _find_hidden(None, self.mapper.valid_of(keyframe))
-                T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, BLURS[-1:])
+                T = self._pose(
+                    grey_of(keyframe.color),
+                    keyframe.T_world_camera,
+                    depth,
+                    hidden,
+                    settings,
+                    AlignmentTuning.blurs[-1:],
+                )
                 if T is not None:
                     keyframe.T_camera_world = inverse(orthonormalize(T))
 
@@ -202,7 +209,7 @@ class ColorPoses:
 
     def _pose(
         self, grey: np.ndarray, T_world_camera: np.ndarray, median_depth: float, hidden: np.ndarray | None,
-        settings: ViewAlignmentSettings, blurs: Sequence[float] = BLURS,
+        settings: ViewAlignmentSettings, blurs: Sequence[float] = AlignmentTuning.blurs,
     ) -> np.ndarray | None:  # fmt: skip
         """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed."""
         camera, T_camera_world = self.state.camera, inverse(T_world_camera)

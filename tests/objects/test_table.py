@@ -16,7 +16,7 @@ from ggslam.objects.boxes import middle_of, oriented_box
 from ggslam.objects.colors import UNLABELLED, id_palette
 from ggslam.objects.table import ObjectRecord, ObjectTable, Observation
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IdentityClassifier, IdentityVectorTuning
 from ggslam.scene.oriented_box import OrientedBox
 
 
@@ -72,7 +72,7 @@ def test_confidence_is_the_mean_probability_of_the_own_class(monkeypatch: pytest
     features = np.zeros((3, 16))
     features[0, 0], features[1, 0], features[2, 1] = np.log(4), np.log(9), 0
     table = ObjectTable.build(map_of([3, 3, 7], features=features), classifier, "masks")
-    nothing = np.exp(NOTHING_LOGIT)
+    nothing = np.exp(IdentityVectorTuning.nothing_logit)
     assert table.record(3).confidence == pytest.approx((4 / (5 + nothing) + 9 / (10 + nothing)) / 2)
     assert table.record(7).confidence == pytest.approx(1 / (2 + nothing))
 

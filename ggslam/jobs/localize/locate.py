@@ -35,7 +35,7 @@ from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
-from ggslam.scene.origin import GRID
+from ggslam.scene.origin import OriginTuning
 from ggslam.scene.poses import quaternion_to_matrix, separation
 from ggslam.sequences.rig import one_camera
 from ggslam.sequences.sequence import Sequence
@@ -53,7 +53,7 @@ _SHORT = 8
 """Letters of a run's fingerprint in the name of the store of its map."""
 _FARTHEST = 1e7
 """Metres from the origin of the map that a start pose may be."""
-_WHOLE = GRID / 4
+_WHOLE = OriginTuning.grid_m / 4
 """Metres that are a whole number of a scan's voxels: origins lie on the grid of coarse ones, four times as wide."""
 _FINEST = 1.5
 """A target's voxels are at least this many times as wide as those that the map was thinned with, and for scans as its
