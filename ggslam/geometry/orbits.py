@@ -10,8 +10,6 @@ import numpy as np
 from ggslam.scene.camera import Camera
 from ggslam.system.tuning import Tuning
 
-_ELEVATION = math.radians(20.0)
-
 
 class OrbitTuning(Tuning):
     """Views around a cloud."""
@@ -20,6 +18,8 @@ class OrbitTuning(Tuning):
     """Share of the points that are framed."""
     background = 2.5
     """Distance from the centre, in median distances, beyond which points count as background."""
+    elevation_rad = math.radians(20.0)
+    """Elevation of the cameras in radians."""
 
 
 def orbit(points: np.ndarray, camera: Camera, count: int) -> np.ndarray:
@@ -42,8 +42,8 @@ def orbit(points: np.ndarray, camera: Camera, count: int) -> np.ndarray:
     away = max(radius, 1e-3) / math.sin(half)
     poses = np.tile(np.eye(4), (count, 1, 1))
     for pose, angle in zip(poses, 2 * np.pi * np.arange(count) / count, strict=True):
-        forward = np.array([math.sin(angle) * math.cos(_ELEVATION), math.sin(_ELEVATION),
-                            math.cos(angle) * math.cos(_ELEVATION)])  # fmt: skip
+        forward = np.array([math.sin(angle) * math.cos(OrbitTuning.elevation_rad), math.sin(OrbitTuning.elevation_rad),
+                            math.cos(angle) * math.cos(OrbitTuning.elevation_rad)])  # fmt: skip
         right = np.array([math.cos(angle), 0.0, -math.sin(angle)])
         pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
         pose[:3, 3] = middle - away * forward

@@ -22,8 +22,8 @@ class FinishedMapTuning(Tuning):
     """Training of finished maps."""
 
     past_updates = 100
-    """Optimizer steps that each Gaussian counts as having seen. Without them, Adam's first steps would be the longest.
-    Optimizer steps that each Gaussian counts as having seen. Without them, Adam's first steps would be the longest."""
+    """Optimizer steps that each Gaussian counts as having seen. Without them, Adam's first steps would be the
+    longest."""
 
 
 def adopt_finished(mapper: Mapper, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:

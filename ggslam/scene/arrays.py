@@ -28,8 +28,8 @@ class ArrayLimits(Tuning):
     """Limits of compressed arrays in untrusted files."""
 
     max_bytes = 64 << 20
-    """Bytes that compressed arrays may expand to, whatever the size of their file. ggslam writes arrays uncompressed.
-    Bytes that compressed arrays may expand to, whatever the size of their file. ggslam writes arrays uncompressed."""
+    """Bytes that compressed arrays may expand to, whatever the size of their file. ggslam writes arrays
+    uncompressed."""
     max_ratio = 16
     """Largest expansion beyond that, in multiples of the file's size."""
 

@@ -12,7 +12,7 @@ from ggslam.sequences.verdicts import Severity, Verdict, judge_scale_by
 from ggslam.slam.map_parts import NOT_JOINED
 from ggslam.slam.result import SlamResult
 from ggslam.system.tuning import Tuning
-from ggslam.tracking.gicp_tracker import MIN_TEXTURED
+from ggslam.tracking.gicp_tracker import GicpTrackerTuning
 from ggslam.tracking.photometric import GreyDepth, textured_points
 from ggslam.tracking.settings import PhotometricSettings
 from ggslam.tracking.tracker import TrackingStatus
@@ -77,7 +77,7 @@ def _is_bare(keyframe: Keyframe) -> bool:
         return False
     shrink = PhotometricSettings().shrink * max(1, round(keyframe.camera.width / 320))
     view = GreyDepth.from_images(keyframe.color, keyframe.depth_m(), keyframe.camera, shrink)
-    return len(textured_points(view, PhotometricSettings())) < MIN_TEXTURED
+    return len(textured_points(view, PhotometricSettings())) < GicpTrackerTuning.min_textured
 
 
 def _judge_exposure(result: SlamResult) -> list[Verdict]:

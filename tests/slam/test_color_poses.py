@@ -23,7 +23,7 @@ from ggslam.slam.slam import Slam
 from ggslam.synthetic import write_synthetic_sequence
 from ggslam.system.tuning import overridden
 from ggslam.tracking.points import FramePoints
-from ggslam.tracking.residual_noise import FEWEST, ResidualNoise
+from ggslam.tracking.residual_noise import ResidualNoise, ResidualNoiseTuning
 from ggslam.tracking.settings import DepthNoise
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -78,11 +78,11 @@ def test_hidden_noise_is_what_residuals_say_of_it() -> None:
     frame = FramePoints(
         points, points, np.zeros((2000, 6), np.float32), np.zeros((2000, 2), np.int32), np.ones(2000, np.float32)
     )
-    for _ in range(FEWEST):
+    for _ in range(ResidualNoiseTuning.min_measurements):
         noise = residuals.observe(frame, (0.008 * rng.standard_normal(2000)) ** 2, noise)
     assert 28 < residuals.hidden < 36 and abs(noise.sigma(2) - 0.008) < 1e-3
     exact = ResidualNoise()
-    for _ in range(FEWEST):
+    for _ in range(ResidualNoiseTuning.min_measurements):
         exact.observe(frame, (0.0005 * rng.standard_normal(2000)) ** 2, DepthNoise(2.5e-4, 0.0))
     assert exact.hidden == 1
 

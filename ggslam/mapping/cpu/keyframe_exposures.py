@@ -12,7 +12,7 @@ from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.rendering.exposure import (
-    BRIGHT,
+    ExposureTuning,
     SeenAgain,
     change_of,
     frame_weights,
@@ -158,7 +158,7 @@ class KeyframeExposures:
         if self.blind[keyframe.index]:
             return np.zeros(keyframe.color.shape[:2], bool)
         if self.is_exposed(keyframe) and change_of(keyframe.exposure) > KeyframeExposureTuning.overexposed_gain:
-            return np.asarray((keyframe.color < BRIGHT * 255).all(2))
+            return np.asarray((keyframe.color < ExposureTuning.bright * 255).all(2))
         return None
 
     def typical(self, keyframes: Sequence[Keyframe]) -> np.ndarray | None:

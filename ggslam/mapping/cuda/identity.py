@@ -42,8 +42,8 @@ class CudaIdentityTuning(Tuning):
     logits_at_once = 2**24
     """Logits computed in one batch of the dense schedule; the 3-D loss computes a tenth of it."""
     kept_pools = 256
-    """Keyframes whose drawn pixels are kept, about 64 KB each with the default settings. The oldest are dropped first.
-    Keyframes whose drawn pixels are kept, about 64 KB each with the default settings. The oldest are dropped first."""
+    """Keyframes whose drawn pixels are kept, about 64 KB each with the default settings. The oldest are dropped
+    first."""
     split_pixels = 32768
     """Pixels that a split of an object reads in one batch."""
     split_terms = 48

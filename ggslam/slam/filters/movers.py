@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.geometry.moved_depth import largest_shift
 from ggslam.mapping.keyframe import ELSEWHERE
-from ggslam.movers.detector import GROWN, MoverDetector, coarse_factor, grow
+from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor, grow
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
@@ -182,7 +182,7 @@ class MoverFilter(FrameFilter):
                 continue
             old = CoarseView.of(depth, camera, factor, T_world_camera, self._margin, self.context)
             part = gone_since(old, view, trail, segments, depth.shape, factor, self._margin, settings, self.context)
-            found.append(None if part is None else grow(part, GROWN))
+            found.append(None if part is None else grow(part, DetectorTuning.mask_margin))
         return found
 
     def notes(self, frames: int) -> list[str]:
