@@ -135,7 +135,8 @@ class ScanTracker:
         return align_at, settle, settle_there
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
-        """See `FrontEnd`. After each scan that was not found, more are skipped, up to `ScanTrackerTuning.max_skipped`."""
+        """See `FrontEnd`. After each scan that was not found, more are skipped, at most
+        `ScanTrackerTuning.max_skipped`."""
         if self._places is None:
             return None
         if self._passes:

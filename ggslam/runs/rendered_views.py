@@ -27,7 +27,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.poses import inverse
 from ggslam.volumes.posed_view import PosedView
-from ggslam.volumes.surface_points import MOST_BLOCKS, surface_points
+from ggslam.volumes.surface_points import SurfacePointTuning, surface_points
 
 MIN_ALPHA = 0.5
 """Where the map covers less of a pixel than this, the pixel has no rendered depth."""
@@ -153,7 +153,7 @@ class RenderedViews:
                 found.append((float(np.median(depth[depth > 0])), self.cameras[number].fx))
         return found
 
-    def points(self, voxel_size: float, most_blocks: int = MOST_BLOCKS) -> Iterator[VoxelCloud]:
+    def points(self, voxel_size: float, most_blocks: int = SurfacePointTuning.max_blocks) -> Iterator[VoxelCloud]:
         """The surface that the keyframes see, one point for each voxel of a grid; see
         `volumes.surface_points.surface_points`.
 
