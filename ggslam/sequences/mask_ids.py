@@ -12,7 +12,7 @@ import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -21,8 +21,10 @@ from ggslam.sequences.mask_images import EQUAL_CHANNELS, MaskImage, read_mask_im
 from ggslam.sequences.recording import read_text
 from ggslam.system.images import MAX_PIXELS
 
-LARGEST_ID = 65535
-_CODES = 1 << 24
+LARGEST_ID: Final = 65535
+"""Largest instance id: masks are 16-bit."""
+_CODES: Final = 1 << 24
+"""Colours of 8-bit RGB images."""
 
 _log = logging.getLogger(__name__)
 
