@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -19,7 +20,8 @@ from ggslam.scene.poses import inverse, matrix_to_quaternion
 from ggslam.system.atomic import make_empty_folder, make_folder, write_bytes, write_text
 
 MODEL = "sparse/0"
-_PINHOLE = 1
+_PINHOLE: Final = 1
+"""Number of COLMAP's camera model PINHOLE."""
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track_length", "<u8")])
 
 

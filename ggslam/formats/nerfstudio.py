@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,8 +22,8 @@ from ggslam.scene.camera import Camera
 from ggslam.system.atomic import make_empty_folder, write_text
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-MOST_DEPTH = 65.535
-"""Metres; what is farther has no depth in a 16-bit image of millimetres."""
+MOST_DEPTH: Final = 65.535
+"""Largest depth in metres that a 16-bit image of millimetres holds; farther pixels have none."""
 
 
 @dataclass(frozen=True)

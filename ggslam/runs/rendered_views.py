@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import InputError
-from ggslam.formats.point_sampling import USUAL_VOXEL
+from ggslam.formats.point_sampling import PointSamplingTuning
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.geometry.scene_size import scale_of_depth, voxel_times
 from ggslam.mapping.keyframe import ELSEWHERE
@@ -131,7 +131,7 @@ class RenderedViews:
     def usual_voxel(self) -> float:
         """Edge of voxels that suits the map, a whole number of centimetres: 1 in rooms, more where most of what is seen
         is farther away, in halls or where depth has a wrong unit."""
-        return min(USUAL_VOXEL * self._times(), LARGEST_VOXEL)
+        return min(PointSamplingTuning.voxel_m * self._times(), LARGEST_VOXEL)
 
     def _times(self) -> int:
         """Size of the scene against a room's, see `geometry.scene_size.voxel_times`."""

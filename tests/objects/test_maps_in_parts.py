@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,8 @@ import torch
 from test_segmented_runs import done, refused, votes_for, write_run
 
 from ggslam.errors import FormatError
-from ggslam.formats import gaussian_rows
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_parts, write_gaussian_ply
-from ggslam.formats.gaussian_rows import GaussianRows
+from ggslam.formats.gaussian_rows import GaussianRows, GaussianRowsTuning
 from ggslam.formats.point_ply import read_points
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.objects import segmented_map
@@ -31,6 +31,7 @@ from ggslam.runs.verification import accept_files
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.tuning import overridden
 
 
 @pytest.fixture(scope="module")
@@ -54,15 +55,15 @@ def stored(shared_segmented_room: Any, tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.fixture
-def pair(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[RunFolder, RunFolder]:
+def pair(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[RunFolder, RunFolder]]:
     """A run in cells, and the same run without their index."""
     for name in ("cells", "whole"):
         shutil.copytree(stored, tmp_path / name)
     (tmp_path / "whole" / MAP_INDEX).unlink()
     accept_files(tmp_path / "whole")
-    monkeypatch.setattr(gaussian_rows, "BLOCK", 700)
     monkeypatch.setattr(segmented_map, "_ROWS_AT_ONCE", 500)
-    return RunFolder.open(tmp_path / "cells"), RunFolder.open(tmp_path / "whole")
+    with overridden(GaussianRowsTuning, rows_at_once=700):
+        yield RunFolder.open(tmp_path / "cells"), RunFolder.open(tmp_path / "whole")
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -127,14 +128,14 @@ def test_cells_are_kept_up_to_a_bound(pair: tuple[RunFolder, RunFolder]) -> None
 @pytest.mark.parametrize("options", [[], ["--plain"], ["--min-opacity", "0.7"], ["--objects", "all"]])
 @pytest.mark.parametrize("kind", ["ply", "segmented"])
 def test_exports_do_not_depend_on_blocks(
-    pair: tuple[RunFolder, RunFolder], kind: str, options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pair: tuple[RunFolder, RunFolder], kind: str, options: list[str], tmp_path: Path
 ) -> None:
     cells, whole = pair
     for folder, block, name in ((cells, 700, "a"), (whole, 1 << 30, "b")):
-        monkeypatch.setattr(gaussian_rows, "BLOCK", block)
-        (tmp_path / name).mkdir()
-        out = tmp_path / name / ("objects" if options[:1] == ["--objects"] and kind == "ply" else "map.ply")
-        done("export", folder.path, "--format", kind, *options, "--out", out)
+        with overridden(GaussianRowsTuning, rows_at_once=block):
+            (tmp_path / name).mkdir()
+            out = tmp_path / name / ("objects" if options[:1] == ["--objects"] and kind == "ply" else "map.ply")
+            done("export", folder.path, "--format", kind, *options, "--out", out)
     assert files(tmp_path / "a") == files(tmp_path / "b") and len(files(tmp_path / "a")) > (options != ["--plain"])
 
 
