@@ -3,7 +3,7 @@
 
 Without a voxel size the encoder divides a cloud's longest side into 2^bits voxels; a single point at 5 km would make
 those of a room 5 m wide. So the side of the cloud's bulk counts, which hardly any point lies outside of. Points beyond
-are coded on the same grid, as far as it can reach (`GRID_BITS`), and left out where it cannot.
+are coded on the same grid, as far as it can reach (`MAX_DEPTH`), and left out where it cannot.
 """
 
 from __future__ import annotations
@@ -13,17 +13,26 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ggslam.coding.quantization import GRID_BITS
+from ggslam.coding.geometry_syntax import MAX_DEPTH
 from ggslam.coding.settings import CodecSettings
+from ggslam.system.tuning import Tuning
 
-SAMPLED = 1 << 18
-"""Points that tell where most of them lie."""
-_SHARE, _FEWEST, _MOST_SHARE = 1e-3, 4, 0.04
-"""Points passed over at each end of an axis: a share of them, but so many at least, and no more than another share."""
-_FAR = 2.0
-"""A cloud has outliers if it is so many times as long as its bulk."""
-_FINE_BITS = 16
-"""Bits of the bulk's side that are fine enough: finer voxels are made larger before points are left out."""
+
+class OutlierTuning(Tuning):
+    """When points are far from all others."""
+
+    sample = 1 << 18
+    """Points that tell where most of them lie."""
+    share = 1e-3
+    """Share of the points that is passed over at each end of an axis."""
+    min_points = 4
+    """Fewest points that are passed over."""
+    max_share = 0.04
+    """Largest share of the points that is passed over."""
+    far = 2.0
+    """A cloud has outliers if it is so many times as long as its bulk."""
+    fine_bits = 16
+    """Bits of the bulk's side beyond which voxels are made larger before points are left out."""
 
 
 @dataclass
@@ -98,7 +107,7 @@ def reach_of(
     samples, corners = [], []
     for part in parts:
         if len(part):
-            samples.append(part[:: max(1, (len(part) if count is None else count) // SAMPLED)])
+            samples.append(part[:: max(1, (len(part) if count is None else count) // OutlierTuning.sample)])
             corners += [part.min(0), part.max(0)]
     if not samples:
         return Reach(settings)
@@ -112,13 +121,16 @@ def reach_of(
 def _choose(bulk: np.ndarray, whole: float, settings: CodecSettings, integers: bool, finest: float) -> Reach:
     """For a cloud whose longest side is `whole`."""
     side = float(np.ptp(bulk, axis=0).max())
-    if side <= 0 or whole <= _FAR * side:
+    if side <= 0 or whole <= OutlierTuning.far * side:
         named = integers or settings.voxel_size is not None
         fine = finest > whole / ((1 << settings.geometry_bits) - 1)
         return Reach(replace(settings, voxel_size=finest) if fine and not named else settings)
-    voxel, most = settings.voxel_size or (1.0 if integers else None), (1 << GRID_BITS) - 2
+    voxel, most = settings.voxel_size or (1.0 if integers else None), (1 << MAX_DEPTH) - 2
     if voxel is None:
-        voxel, finer = side / ((1 << settings.geometry_bits) - 1), max(0, settings.geometry_bits - _FINE_BITS)
+        voxel, finer = (
+            side / ((1 << settings.geometry_bits) - 1),
+            max(0, settings.geometry_bits - OutlierTuning.fine_bits),
+        )
         needed = whole * settings.geometry_scale / most
         voxel = max(needed if voxel < needed <= voxel * (1 << finer) else voxel, finest)
         settings = replace(settings, voxel_size=voxel)
@@ -134,6 +146,6 @@ def _choose(bulk: np.ndarray, whole: float, settings: CodecSettings, integers: b
 def bulk_of(sample: np.ndarray) -> np.ndarray:
     """Lowest and highest coordinates float64 [2, 3] of points [N, 3] but the outermost few along each axis."""
     count = len(sample)
-    passed = min(max(_FEWEST, int(_SHARE * count)), int(_MOST_SHARE * count))
+    passed = min(max(OutlierTuning.min_points, int(OutlierTuning.share * count)), int(OutlierTuning.max_share * count))
     ordered = np.partition(sample, (passed, count - 1 - passed), axis=0)
     return np.stack([ordered[passed], ordered[count - 1 - passed]]).astype(np.float64)

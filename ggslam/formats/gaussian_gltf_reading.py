@@ -24,7 +24,7 @@ from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
 from ggslam.formats.spz_reading import spz_columns
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, member, open_untrusted, read_untrusted
+from ggslam.system.untrusted_files import FileTuning, member, open_untrusted, read_untrusted
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz_2"
@@ -121,7 +121,7 @@ def _open(path: Path) -> _Document:
             binary = data[start + 8 : start + 8 + size] if kind == b"BIN\0" else b""
     else:
         text = data
-    if len(text) > MAX_TEXT_BYTES:
+    if len(text) > FileTuning.max_text_bytes:
         raise ValueError("its JSON part is too large")
     gltf = json.loads(text)
     buffers = [_buffer(path, buffer, binary) for buffer in gltf.get("buffers", [])]

@@ -26,7 +26,7 @@ from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
 from ggslam.system.images import claimed_size, decode_image
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, is_plain_name, member, read_untrusted
+from ggslam.system.untrusted_files import FileTuning, is_plain_name, member, read_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, open_zip, read_member
 
 LEVELS = "lod-meta.json"
@@ -69,7 +69,7 @@ def read_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
 def read_streamed_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
     """The finest level of a streamed SOG, of which `path` is the index; see `read_sog`."""
     try:
-        index = json.loads(read_untrusted(path, MAX_TEXT_BYTES))
+        index = json.loads(read_untrusted(path, FileTuning.max_text_bytes))
         pieces: set[tuple[int, int, int]] = set()
         waiting = [index["tree"]]
         while waiting:
@@ -96,17 +96,17 @@ def read_streamed_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
 
 
 def _decode(read: Files) -> tuple[SplatColumns, dict[int, str] | None]:
-    meta = json.loads(read(META, MAX_TEXT_BYTES))
+    meta = json.loads(read(META, FileTuning.max_text_bytes))
     if meta.get("version") != 2:
         raise ValueError(f"version {meta.get('version', 1)}, expected 2")
     count = int(meta["count"])
     if not 0 < count <= LARGEST_COUNT:
         raise ValueError(f"it says that it has {count} Gaussians")
     # Positions hardly pack; the other images may be of one colour.
-    check_count(count, 8 * sum(len(read(str(name), MAX_IMAGE_BYTES)) for name in meta["means"]["files"][:2]))
+    check_count(count, 8 * sum(len(read(str(name), FileTuning.max_image_bytes)) for name in meta["means"]["files"][:2]))
 
     def pixels(part: str, number: int = 0, size: int = count) -> np.ndarray:
-        return _pixels(read(str(meta[part]["files"][number]), MAX_IMAGE_BYTES), size)
+        return _pixels(read(str(meta[part]["files"][number]), FileTuning.max_image_bytes), size)
 
     quats = pixels("quats")
     if quats[:, 3].min(initial=255) < 252:

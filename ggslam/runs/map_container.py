@@ -24,6 +24,7 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -76,7 +77,8 @@ _NEEDED = (
 )  # fmt: skip
 _PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, *MOVER_FILES, TABLE, _CLASSIFIER)
 _MEMBERS = frozenset((_HEAD, MAP, _PLACES, PLACES_FILE, *_NEEDED, *_PERHAPS))
-_MOST_KEYFRAMES = (1 << 16) - 2
+_MOST_KEYFRAMES: Final = (1 << 16) - 2
+"""Largest number of a keyframe: 16 bits hold it plus 1."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.verdicts import Verdict
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, read_untrusted
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
 
 class HungTuning(Tuning):
@@ -193,6 +193,6 @@ def _size(file: ImageFile) -> int | None:
 
 def _read(file: ImageFile) -> bytes | None:
     try:
-        return read_untrusted(file, MAX_IMAGE_BYTES, SequenceError) if isinstance(file, Path) else None
+        return read_untrusted(file, FileTuning.max_image_bytes, SequenceError) if isinstance(file, Path) else None
     except SequenceError:
         return None

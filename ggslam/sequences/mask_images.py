@@ -14,7 +14,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.images import describe_channels
-from ggslam.system.images import MAX_PIXELS, PNG_SIGNATURE, decode_image, read_image_bytes
+from ggslam.system.images import PNG_SIGNATURE, PictureLimits, decode_image, read_image_bytes
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted
 
@@ -79,7 +79,7 @@ def most_pixels(*sizes: tuple[int, int]) -> int:
     )
 
 
-def read_mask_image(path: Path, most: int = MAX_PIXELS) -> MaskImage:
+def read_mask_image(path: Path, most: int = PictureLimits.max_pixels) -> MaskImage:
     """Reads a PNG of grey ids (1 to 16 bits), palette indices, or RGB-coded ids.
 
     Args:

@@ -14,7 +14,7 @@ from ggslam.sequences.images import read_color
 from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, read_untrusted
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
 
 class RepeatTuning(Tuning):
@@ -83,8 +83,8 @@ def _is_blank(file: ImageFile) -> bool:
 def _alike(a: ImageFile, b: ImageFile) -> bool:
     """Whether two images are the same: files by their bytes, others by their pixels."""
     if isinstance(a, Path) and isinstance(b, Path):
-        return a == b or read_untrusted(a, MAX_IMAGE_BYTES, SequenceError) == read_untrusted(
-            b, MAX_IMAGE_BYTES, SequenceError
+        return a == b or read_untrusted(a, FileTuning.max_image_bytes, SequenceError) == read_untrusted(
+            b, FileTuning.max_image_bytes, SequenceError
         )
     if isinstance(a, Path) or isinstance(b, Path):
         return False

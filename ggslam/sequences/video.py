@@ -13,7 +13,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.edit_list import count_hidden_frames
 from ggslam.sequences.recording import NumberedImage
-from ggslam.system.images import MAX_PIXELS
+from ggslam.system.images import PictureLimits
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted
 
@@ -53,8 +53,10 @@ class Video:
         if not capture.isOpened() or capture.get(cv2.CAP_PROP_FRAME_COUNT) < 1:
             raise SequenceError(f"{self.path}: cannot be opened as a video (truncated, or a codec that is not known)")
         width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if width * height > MAX_PIXELS:
-            raise SequenceError(f"{self.path}: claims {width}x{height} pixels; at most {MAX_PIXELS:,} are read")
+        if width * height > PictureLimits.max_pixels:
+            raise SequenceError(
+                f"{self.path}: claims {width}x{height} pixels; at most {PictureLimits.max_pixels:,} are read"
+            )
         return capture
 
     def frame(self, index: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from ggslam.submaps.store_objects import OBJECTS_FILE
 from ggslam.submaps.visit_files import visit_file
 from ggslam.system.atomic import make_folder
 from ggslam.system.process_memory import most_memory_bytes
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, copy_untrusted
+from ggslam.system.untrusted_files import FileTuning, copy_untrusted
 
 _TRIES = 20
 """Times that a writer may have replaced files between a look at the index and at them."""
@@ -93,6 +93,6 @@ def _copy_beside(source: Path, target: Path, visits: Sequence[str]) -> list[Path
     for file, copy in known:
         if file.is_file():
             copy.parent.mkdir(exist_ok=True)
-            copy_untrusted(file, copy, MAX_TEXT_BYTES)
+            copy_untrusted(file, copy, FileTuning.max_text_bytes)
             written.append(copy)
     return written

@@ -14,13 +14,13 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.changes import ChangeRecord, ChangesRecord
 from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.oriented_box import Vector
-from ggslam.system.images import MAX_PIXELS, read_picture
+from ggslam.system.images import PictureLimits, read_picture
 from ggslam.system.untrusted_files import refuse_links
 
 MOST_PICTURES = 12
 """Pictures that a page shows."""
 _MOST_PIXELS = 16_000_000
-"""Of one of them: two views of 8 megapixels. All of a page together have `MAX_PIXELS` at most."""
+"""Of one of them: two views of 8 megapixels. All of a page together have `PictureLimits.max_pixels` at most."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def read_changes(place: Path, most: int = MOST_PICTURES) -> ChangesShown:
     if record is None:
         raise ConfigError(f"{place}: holds no {ChangesRecord.FILE}; `ggslam changes OLD NEW --out FOLDER` writes one")
     named = [number for number, change in enumerate(record.changes) if change.picture]
-    found, unreadable, left = dict[int, np.ndarray](), list[str](), MAX_PIXELS
+    found, unreadable, left = dict[int, np.ndarray](), list[str](), PictureLimits.max_pixels
     for number in named[:most]:
         name = Path(record.changes[number].picture).name
         try:
