@@ -32,7 +32,7 @@ JOBS = (
     {"report"},
     {"update"},
     {"changes"},
-    {"score", "edit", "localize", "compare", "code", "render", "doctor", "batch", "merge", "refine"},
+    {"eval", "edit", "localize", "compare", "encode", "render", "doctor", "batch", "merge", "refine"},
     {"stores"},
     {"submaps", "tasks"},
     {"progress"},

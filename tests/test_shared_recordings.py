@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
+from ggslam.jobs.eval.run import score_run
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunRequest, execute
-from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, open_recording_of
 from ggslam.runs.records.metrics import MetricsRecord

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from ggslam.changes.fits import Fit
-from ggslam.changes.things import Thing
+from ggslam.changes.alignment_score import Fit
+from ggslam.changes.candidates import Candidate
 from ggslam.sight.margin import Margin
 
 Kind = Literal["moved", "removed", "added", "look", "unseen"]
@@ -32,8 +32,8 @@ class Change:
     """
 
     kind: Kind
-    old: Thing | None
-    new: Thing | None
+    old: Candidate | None
+    new: Candidate | None
     T_new_old: np.ndarray | None = None
     fit: Fit | None = None
     confidence: float = 1.0

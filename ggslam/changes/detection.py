@@ -9,30 +9,37 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from ggslam.changes.alignment_score import Fit, Judge
+from ggslam.changes.candidate_views import CandidateViews
+from ggslam.changes.candidates import UNNAMED, Candidate, JudgedSurface, candidates_by_id, candidates_by_surface
 from ggslam.changes.change import HARDLY_SEEN, UNCLEAR, Change, Detection
-from ggslam.changes.fits import Fit, Judge
-from ggslam.changes.motions import ALIKE
-from ggslam.changes.placing import Placing
+from ggslam.changes.motions import MotionTuning
+from ggslam.changes.pose_refinement import PoseRefinement
+from ggslam.changes.rotation_ambiguity import hidden_sector, with_rotation_ambiguity
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape
 from ggslam.changes.shape_alignment import fit_shapes
 from ggslam.changes.sightings import Sightings, Surface, Visit
-from ggslam.changes.thing_views import ThingViews
-from ggslam.changes.things import UNNAMED, JudgedSurface, Thing, things_by_id, things_by_surface
-from ggslam.changes.turns import hidden_sector, tell_turn
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points, turning_angle
 from ggslam.sight.margin import Margin
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.upright import estimate_up
 
-_SAME_PLACE = 0.03
-"""Metres: points of two visits so near to each other may be one thing's."""
-_TAKEN = 0.4
-"""Share of what seems to have stayed where other things of the same shape may stand now."""
-_TURNED = 1500
-"""Points of a thing that other turns are tried with."""
-_SAMPLE, _FAR_TOLERANCES = 20_000, 4
-"""Points that usual differences are measured at, up to so many times the least tolerance."""
+
+class DetectionTuning(Tuning):
+    """How two visits are compared."""
+
+    same_place_m = 0.03
+    """Largest distance between points of two visits that may be of one object, in metres."""
+    max_replaced = 0.4
+    """Share of the objects that seem to have stayed which may be others of the same shape."""
+    rotation_points = 1500
+    """Points of a candidate that other rotations are tried with."""
+    samples = 20_000
+    """Points that usual differences are measured at, about."""
+    max_tolerances = 4
+    """Differences above this many times the smallest tolerance are not usual."""
 
 
 class ChangeDetector:
@@ -54,7 +61,7 @@ class ChangeDetector:
         self.judged: list[JudgedSurface] = []
         self._trees: list[cKDTree | None] = [None, None]
         """Of each visit's points, if there are any."""
-        self.things: list[list[Thing]] = [[], []]
+        self.candidates: list[list[Candidate]] = [[], []]
 
     def detect(self) -> Detection:
         """Finds all changes."""
@@ -68,8 +75,8 @@ class ChangeDetector:
         if not both:
             words = ", whatever ids are said to mean" if self._ids else ""
             found.notes.append(f"a visit has no objects: changes are told by surfaces alone{words}")
-        split = things_by_id if found.ids_believed else things_by_surface
-        self.things = [split(judged, self.settings) for judged in self.judged]
+        split = candidates_by_id if found.ids_believed else candidates_by_surface
+        self.candidates = [split(judged, self.settings) for judged in self.judged]
         self._compare(found)
         found.changes.sort(key=lambda change: -change.confidence)
         return found
@@ -80,8 +87,10 @@ class ChangeDetector:
         """How near surfaces have to be to be one: by how much the visits differ where nothing changed."""
         s, offsets = self.settings, []
         for number, surface in enumerate(surfaces):
-            sample = surface.points[:: max(1, len(surface.points) // _SAMPLE)]
-            least = Margin(_FAR_TOLERANCES * s.tolerance_m, _FAR_TOLERANCES * s.tolerance_relative)
+            sample = surface.points[:: max(1, len(surface.points) // DetectionTuning.samples)]
+            least = Margin(
+                DetectionTuning.max_tolerances * s.tolerance_m, DetectionTuning.max_tolerances * s.tolerance_relative
+            )
             other = self.sights[1 - number].look_up(sample, least)
             offsets.append(np.abs(other.offset[np.isfinite(other.offset)]))
         usual = np.concatenate(offsets)
@@ -111,12 +120,14 @@ class ChangeDetector:
                 count += 1
                 same += int(there == i)
                 taken += int(there not in (0, i))
-        return same > 0 and same >= self.settings.ids_alike * (count - min(taken, int(_TAKEN * count)))
+        return same > 0 and same >= self.settings.ids_alike * (
+            count - min(taken, int(DetectionTuning.max_replaced * count))
+        )
 
     # --- verdicts ----------------------------------------------------------------------------------------------------
 
     def _compare(self, found: Detection) -> None:
-        gone, come = ([t for t in things if self._is_changed(t, found.ids_believed)] for things in self.things)
+        gone, come = ([t for t in things if self._is_changed(t, found.ids_believed)] for things in self.candidates)
         doubted = {id(thing) for thing in gone if thing.changed >= self.settings.whole}
         by_id, swapped = set[int](), set[int]()
         if found.ids_believed:
@@ -130,7 +141,7 @@ class ChangeDetector:
         found.changes += [Change("added", None, t, confidence=_confidence(t, id(t) in by_id)) for t in come]
         self._compare_looks(found)
         known = swapped | {id(change.old) for change in found.changes}
-        for thing in self.things[0]:
+        for thing in self.candidates[0]:
             if id(thing) in known:
                 continue
             if thing.seen < self.settings.min_seen:
@@ -140,17 +151,17 @@ class ChangeDetector:
             else:
                 found.stayed += 1
 
-    def _is_changed(self, thing: Thing, ids_believed: bool) -> bool:
+    def _is_changed(self, thing: Candidate, ids_believed: bool) -> bool:
         """Where ids say nothing, what is gone of an object is a thing of its own."""
         s = self.settings
         changed = thing.seen >= s.min_seen and thing.changed >= s.min_changed
         return changed and (ids_believed or thing.label >= UNNAMED)
 
-    def _shape(self, number: int, thing: Thing) -> Shape:
+    def _shape(self, number: int, thing: Candidate) -> Shape:
         judged = self.judged[number]
         return Shape.from_views(*(values[thing.rows] for values in (judged.points, judged.colors, judged.toward)))
 
-    def _fit(self, old: Thing, new: Thing) -> Fit | None:
+    def _fit(self, old: Candidate, new: Candidate) -> Fit | None:
         if min(len(old), len(new)) < self.settings.min_points:
             return None
         small, large = sorted((self.judged[0].extent(old), self.judged[1].extent(new)))
@@ -159,7 +170,7 @@ class ChangeDetector:
         before, after = self._shape(0, old), self._shape(1, new)
         return fit_shapes(before, after, self.sights[0], self.sights[1], self._up, self.settings)
 
-    def _with_turn(self, old: Thing, new: Thing, fit: Fit) -> Fit:
+    def _with_turn(self, old: Candidate, new: Candidate, fit: Fit) -> Fit:
         """A fit, with what makes its turn doubtful."""
         if fit.color_apart > self.settings.max_color:
             return replace(fit, repainted=True)
@@ -167,28 +178,30 @@ class ChangeDetector:
         judge = Judge(before, after, self.sights[0], self.sights[1], self.settings)
         toward = [judged.toward[thing.rows] for judged, thing in zip(self.judged, (old, new), strict=True)]
         hidden = hidden_sector(toward[0], self._up), hidden_sector(toward[1], self._up)
-        return tell_turn(fit, before.sample(_TURNED, np.random.default_rng(0)), after, judge, hidden, self._up)
+        sample = before.sample(DetectionTuning.rotation_points, np.random.default_rng(0))
+        return with_rotation_ambiguity(fit, sample, after, judge, hidden, self._up)
 
-    def _motion_change(self, old: Thing, new: Thing, fit: Fit) -> Change | None:
+    def _motion_change(self, old: Candidate, new: Candidate, fit: Fit) -> Change | None:
         """The change that a fit tells, once it is placed exactly; None: it did not move by more than the maps err."""
         T = fit.T_new_old
         if not self._has_moved(old, T) or not self._has_moved(old, T := self._place(old, new, T)):
             return None
         placed, fit = turning_angle(T, fit.T_new_old), self._with_turn(old, new, fit)
-        if placed > ALIKE and fit.turn_known:  # surfaces and pictures tell two turns
+        if placed > MotionTuning.same_rotation_rad and fit.turn_known:  # surfaces and pictures tell two turns
             fit = replace(fit, as_good_deg=round(float(np.degrees(placed))))
         fit = replace(fit, T_new_old=T)
         return Change("moved", old, new, T, fit, fit.share * min(1.0, max(0.0, 1 - fit.color_apart)))
 
-    def _place(self, old: Thing, new: Thing, T: np.ndarray) -> np.ndarray:
+    def _place(self, old: Candidate, new: Candidate, T: np.ndarray) -> np.ndarray:
         """Where exactly a thing lies of which it is known that it moved, and about where to."""
         trees = [tree for tree in self._trees if tree is not None]
         views = [
-            ThingViews(self.sights[k].pictures, trees[k], thing.rows, thing.ids) for k, thing in enumerate((old, new))
+            CandidateViews(self.sights[k].pictures, trees[k], thing.rows, thing.ids)
+            for k, thing in enumerate((old, new))
         ]
-        return Placing(self._shape(0, old), self._shape(1, new), (views[0], views[1])).place(T, self._up)
+        return PoseRefinement(self._shape(0, old), self._shape(1, new), (views[0], views[1])).place(T, self._up)
 
-    def _has_moved(self, old: Thing, T_new_old: np.ndarray) -> bool:
+    def _has_moved(self, old: Candidate, T_new_old: np.ndarray) -> bool:
         """Whether by more than the maps err."""
         s, judged = self.settings, self.judged[0]
         middle, error = judged.points[old.rows].mean(0), 0.5 * float(judged.within[old.rows].mean())
@@ -197,12 +210,12 @@ class ChangeDetector:
         least_turn = max(s.least_turn_deg, float(np.degrees(error / (0.5 * judged.extent(old)))))
         return shift >= max(s.least_motion_m, error) or turn >= least_turn
 
-    def _pair_by_id(self, found: Detection, gone: list[Thing], come: list[Thing]) -> list[Thing]:
+    def _pair_by_id(self, found: Detection, gone: list[Candidate], come: list[Candidate]) -> list[Candidate]:
         """What has one id in both visits, and is elsewhere: takes it from `gone` and `come`. Returns what of the older
         visit changed in a way that cannot be told."""
-        s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.things)
+        s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.candidates)
         changed = {t.label for t in (*gone, *come)}
-        unclear: list[Thing] = []
+        unclear: list[Candidate] = []
         for label in sorted(label for label in ours.keys() & theirs.keys() if label < UNNAMED):
             old, new = ours[label], theirs[label]
             shifted = label not in changed and self._has_shifted(old, new)
@@ -222,7 +235,7 @@ class ChangeDetector:
                 unclear.append(old)
         return unclear
 
-    def _change_of_pair(self, old: Thing, new: Thing, shifted: bool, sure: bool) -> Change | None:
+    def _change_of_pair(self, old: Candidate, new: Candidate, shifted: bool, sure: bool) -> Change | None:
         """How a thing moved; `shifted`: along what it lies on; `sure`: a visit saw it go or come as a whole."""
         s, fit = self.settings, self._fit(old, new)
         if fit is None:
@@ -234,22 +247,22 @@ class ChangeDetector:
         enough = min(old.changed, new.changed) >= (s.min_changed if fits else s.whole)
         return self._motion_change(old, new, fit) if (fits and sure) or enough else None
 
-    def _drop_hardly_seen(self, gone: list[Thing], come: list[Thing]) -> list[Thing]:
+    def _drop_hardly_seen(self, gone: list[Candidate], come: list[Candidate]) -> list[Candidate]:
         """What a visit has too little of to be a thing did not come or go; returns what seemed to be gone of these."""
         before = list(gone)
         for number, things in enumerate((gone, come)):
             known = set(np.unique(self.visits[1 - number].gaussians.object_id.numpy()).tolist())
-            known -= {t.label for t in self.things[1 - number]}
+            known -= {t.label for t in self.candidates[1 - number]}
             things[:] = [t for t in things if t.label not in known]
         kept = set(map(id, gone))
         return [thing for thing in before if id(thing) not in kept]
 
-    def _find_replaced(self, found: Detection, gone: list[Thing], come: list[Thing]) -> list[Thing]:
+    def _find_replaced(self, found: Detection, gone: list[Candidate], come: list[Candidate]) -> list[Candidate]:
         """What stands where something else of another id stood: that was removed, if it is nowhere, and this was added,
         if it was nowhere. Returns what ids alone tell, for what moved is there now, or was."""
-        s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.things)
+        s, ours, theirs = self.settings, *({t.label: t for t in things} for things in self.candidates)
         moved = {change.old.label for change in found.changes if change.kind == "moved" and change.old is not None}
-        by_id: list[Thing] = []
+        by_id: list[Candidate] = []
         for label, old in ours.items():
             if label >= UNNAMED or old.seen < s.min_seen or label in theirs or self._has_any(1, label):
                 continue
@@ -272,12 +285,12 @@ class ChangeDetector:
         """Whether a visit's map has anything of an object."""
         return bool((self.visits[number].gaussians.object_id == label).any())
 
-    def _differ(self, old: Thing, new: Thing) -> bool:
+    def _differ(self, old: Candidate, new: Candidate) -> bool:
         """Whether things at one place have different shapes or colours."""
         shapes = max(old.changed, new.changed) >= self.settings.min_changed
         return shapes or max(_or_zero(old.color_apart), _or_zero(new.color_apart)) > self.settings.look
 
-    def _counterpart(self, old: Thing) -> int:
+    def _counterpart(self, old: Candidate) -> int:
         """Id of what the newer visit has where a thing of the older one stood; 0: nothing with one."""
         return self._id_at(1, self.judged[0].points[old.rows]) or 0
 
@@ -291,10 +304,10 @@ class ChangeDetector:
         tree = self._trees[number]
         if tree is None:
             return np.zeros(0, np.int64)
-        apart, nearest = tree.query(points, distance_upper_bound=_SAME_PLACE)
+        apart, nearest = tree.query(points, distance_upper_bound=DetectionTuning.same_place_m)
         return self.judged[number].ids[nearest[np.isfinite(apart)]]
 
-    def _has_shifted(self, old: Thing, new: Thing) -> bool:
+    def _has_shifted(self, old: Candidate, new: Candidate) -> bool:
         """Whether much of where either visit has a thing is something else in the other one: what is thin and was
         pushed along its support leaves no gap. Of a thing that only one visit shows much of, labels end elsewhere."""
         if max(len(old), len(new)) > self.settings.max_size_ratio * min(len(old), len(new)):
@@ -305,7 +318,7 @@ class ChangeDetector:
                 return False
         return True
 
-    def _pair_by_shape(self, found: Detection, gone: list[Thing], come: list[Thing]) -> None:
+    def _pair_by_shape(self, found: Detection, gone: list[Candidate], come: list[Candidate]) -> None:
         """What went and what came that is one thing by shape and colour: takes it from `gone` and `come`."""
         s = self.settings
         fits = {(a, b): self._fit(old, new) for a, old in enumerate(gone) for b, new in enumerate(come)}
@@ -325,12 +338,12 @@ class ChangeDetector:
         for things, numbers in ((gone, {a for a, _ in taken}), (come, {b for _, b in taken})):
             things[:] = [thing for k, thing in enumerate(things) if k not in numbers]
 
-    def _find_swapped(self, gone: list[Thing], come: list[Thing]) -> list[Thing]:
+    def _find_swapped(self, gone: list[Candidate], come: list[Candidate]) -> list[Candidate]:
         """Objects that stand where others stood, of another shape and other colours: what went and what came there are
         parts of them. Returns these parts."""
-        s, theirs = self.settings, {t.label: t for t in self.things[1]}
-        absorbed: list[Thing] = []
-        for old in [t for t in self.things[0] if t.label < UNNAMED]:
+        s, theirs = self.settings, {t.label: t for t in self.candidates[1]}
+        absorbed: list[Candidate] = []
+        for old in [t for t in self.candidates[0] if t.label < UNNAMED]:
             new = theirs.get(self._counterpart(old))
             if new is None or new.label >= UNNAMED or min(old.seen, new.seen) < s.min_seen:
                 continue
@@ -341,7 +354,7 @@ class ChangeDetector:
                 absorbed += [t for own in parts for t in own]
         return absorbed
 
-    def _parts(self, number: int, things: list[Thing], whole: Thing) -> list[Thing]:
+    def _parts(self, number: int, things: list[Candidate], whole: Candidate) -> list[Candidate]:
         """Those that lie in an object for the most part."""
         ids = self.judged[number].ids
         return [t for t in things if (ids[t.rows] == whole.label).mean() > 0.5]
@@ -350,8 +363,8 @@ class ChangeDetector:
         """What stayed and looks otherwise."""
         s = self.settings
         known = {id(change.old) for change in found.changes}
-        theirs = {t.label: t for t in self.things[1]}
-        for old in self.things[0]:
+        theirs = {t.label: t for t in self.candidates[1]}
+        for old in self.candidates[0]:
             stays = id(old) not in known and old.seen >= s.min_seen and old.changed < s.min_changed
             if stays and old.label < UNNAMED and _or_zero(old.color_apart) > s.look:
                 new = theirs.get(self._counterpart(old))
@@ -365,6 +378,6 @@ def _or_zero(value: float) -> float:
     return value if np.isfinite(value) else 0.0
 
 
-def _confidence(thing: Thing, by_id: bool) -> float:
+def _confidence(thing: Candidate, by_id: bool) -> float:
     """Of something that went or came, as its id tells, or surfaces and colours."""
     return min(1.0, 2 * thing.seen) * (1.0 if by_id else max(thing.changed, _or_zero(thing.color_apart)))

@@ -9,16 +9,30 @@ from itertools import permutations, product
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ggslam.changes.shape import COLOR_SCALE_M, Shape
+from ggslam.changes.shape import Shape, ShapeTuning
 from ggslam.scene.poses import fit_similarity, rotation_about, turning_angle
+from ggslam.system.tuning import Tuning
 
-_COARSE, _COARSE_STEPS, _GOOD = 150, 10, 16
-_FINE, _FINE_STEPS, _BEST = 400, 15, 8
-"""Points, steps of each stage, and motions that are kept after it."""
-ALIKE = np.radians(12)
-"""Motions whose turns differ by less are one."""
-_TRIMMED = 0.8
-"""Share of the pairs of points, the nearest, that steer a motion: the visits saw different sides."""
+
+class MotionTuning(Tuning):
+    """How the likeliest motions are searched."""
+
+    coarse_points = 150
+    """Points in the first stage."""
+    coarse_steps = 10
+    """Steps of the first stage."""
+    coarse_kept = 16
+    """Motions kept after the first stage."""
+    fine_points = 400
+    """Points in the second stage."""
+    fine_steps = 15
+    """Steps of the second stage."""
+    fine_kept = 8
+    """Motions kept after the second stage."""
+    same_rotation_rad = np.radians(12)
+    """Motions whose rotations differ by less are one, in radians."""
+    kept_pairs = 0.8
+    """Share of the pairs of points, the nearest, that a step uses: the visits saw different sides."""
 
 
 def likeliest_motions(old: Shape, new: Shape, up: np.ndarray) -> list[np.ndarray]:
@@ -33,7 +47,10 @@ def likeliest_motions(old: Shape, new: Shape, up: np.ndarray) -> list[np.ndarray
     level = motions[: len(upright)].copy()
     level[:, :3, 3] -= float(up @ (new.points.mean(0) - old.points.mean(0))) * up
     motions = np.concatenate([motions, level])
-    for count, kept, steps in ((_COARSE, _GOOD, _COARSE_STEPS), (_FINE, _BEST, _FINE_STEPS)):
+    for count, kept, steps in (
+        (MotionTuning.coarse_points, MotionTuning.coarse_kept, MotionTuning.coarse_steps),
+        (MotionTuning.fine_points, MotionTuning.fine_kept, MotionTuning.fine_steps),
+    ):
         one, other = (shape.sample(count, rng) for shape in (old, new))
         tree = cKDTree(other.joint())
         for _ in range(steps):
@@ -46,7 +63,7 @@ def _unlike(motions: list[np.ndarray], most: int) -> list[np.ndarray]:
     """The first ones that turn otherwise than those before them."""
     chosen: list[np.ndarray] = []
     for T in motions:
-        if len(chosen) < most and all(turning_angle(T, other) > ALIKE for other in chosen):
+        if len(chosen) < most and all(turning_angle(T, other) > MotionTuning.same_rotation_rad for other in chosen):
             chosen.append(T)
     return chosen
 
@@ -55,9 +72,9 @@ def _step(a: Shape, b: Shape, tree: cKDTree, motions: np.ndarray) -> tuple[np.nd
     """One step of point-to-point ICP in places and colours from each motion [m, 4, 4]; the new motions, and the mean
     distances [m] before."""
     moved = a.points @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
-    shades = np.broadcast_to(COLOR_SCALE_M * a.colors, moved.shape)
+    shades = np.broadcast_to(ShapeTuning.color_scale_m * a.colors, moved.shape)
     apart, nearest = tree.query(np.concatenate([moved, shades], 2), workers=-1)
-    kept = np.argsort(apart, 1)[:, : max(3, round(_TRIMMED * len(a.points)))]
+    kept = np.argsort(apart, 1)[:, : max(3, round(MotionTuning.kept_pairs * len(a.points)))]
     partners = np.take_along_axis(nearest, kept, 1)
     found, _ = fit_similarity(a.points[kept], b.points[partners])
     return found, np.take_along_axis(apart, kept, 1).mean(1)

@@ -12,16 +12,24 @@ from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.geometry.normals import estimate_normals, turn_toward
 from ggslam.geometry.plane_steps import plane_step
 from ggslam.scene.poses import orthonormalize
+from ggslam.system.tuning import Tuning
 
-COLOR_SCALE_M = 0.08
-"""Metres that the distance from black to full in one channel counts as where partners are looked for."""
-NORMAL_SCALE_M = 0.06
-"""Metres that a radian between normals counts as there."""
-_SIDE_M = 0.02
-"""Metres that a radian between the directions that points were seen from counts as where neighbours are looked for."""
-_TANGENT = 0.1
-"""Weight of the distance along the surface, which colours tell, against that off the surface."""
-_FEWEST, _SMALL_STEP = 12, 2e-5
+
+class ShapeTuning(Tuning):
+    """How partners on two surfaces are found."""
+
+    color_scale_m = 0.08
+    """Metres that a full step in one colour channel counts as in the search for partners."""
+    normal_scale_m = 0.06
+    """Metres that a radian between normals counts as there."""
+    side_scale_m = 0.02
+    """Metres that a radian between viewing directions counts as in the search for neighbours."""
+    tangent_weight = 0.1
+    """Weight of the distance along the surface, which colours constrain, against the distance off it."""
+    min_pairs = 12
+    """Fewest pairs of points that a step is made from."""
+    min_step = 2e-5
+    """Largest entry of a step, metres or radians, below which the refinement ends."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +39,9 @@ class Shape(ColoredSurface):
     @staticmethod
     def from_views(points: np.ndarray, colors: np.ndarray, toward: np.ndarray) -> Shape:
         """A surface, with directions [n, 3] to the cameras that saw it: both faces of a thin thing are told apart."""
-        return Shape(points, colors, turn_toward(estimate_normals(points, beside=_SIDE_M * toward), toward))
+        return Shape(
+            points, colors, turn_toward(estimate_normals(points, beside=ShapeTuning.side_scale_m * toward), toward)
+        )
 
     def sample(self, count: int, rng: np.random.Generator) -> Shape:
         """Some of its points."""
@@ -39,11 +49,11 @@ class Shape(ColoredSurface):
 
     def joint(self) -> np.ndarray:
         """Places and colours, [n, 6] metres."""
-        return np.concatenate([self.points, COLOR_SCALE_M * self.colors], 1)
+        return np.concatenate([self.points, ShapeTuning.color_scale_m * self.colors], 1)
 
     def joint_with_sides(self) -> np.ndarray:
         """Places, colours and normals, [n, 9] metres."""
-        return np.concatenate([self.joint(), NORMAL_SCALE_M * self.normals], 1)
+        return np.concatenate([self.joint(), ShapeTuning.normal_scale_m * self.normals], 1)
 
 
 class Target:
@@ -70,12 +80,12 @@ class Target:
             moved = placed.points
             apart, nearest = self._tree.query(self._places(placed), distance_upper_bound=3 * reach, workers=-1)
             pairs = np.isfinite(apart)
-            if pairs.sum() < _FEWEST:
+            if pairs.sum() < ShapeTuning.min_pairs:
                 return T
             partners = nearest[pairs]
             partner, normal = self.shape.points[partners], self.shape.normals[partners]
-            step = plane_step(moved[pairs], partner, normal, reach, _TANGENT, free=free)
+            step = plane_step(moved[pairs], partner, normal, reach, ShapeTuning.tangent_weight, free=free)
             T = orthonormalize(step @ T)
-            if np.abs(step - np.eye(4)).max() < _SMALL_STEP:
+            if np.abs(step - np.eye(4)).max() < ShapeTuning.min_step:
                 break
         return T

@@ -19,14 +19,23 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sight.margin import Margin
 from ggslam.sight.view import Sight, View
+from ggslam.system.tuning import Tuning
 
-OUTLINE = 0.05
-"""Where depth changes by more than this share of it between neighbours, it belongs to what is behind as much."""
+
+class SightingTuning(Tuning):
+    """How a visit's pictures become a surface."""
+
+    max_depth_step = 0.05
+    """Depth step between neighbours, as a share of the depth, above which a pixel belongs to both surfaces."""
+    neighbours = 4
+    """Measured points that give the surface at a place."""
+    stride = 2
+    """Every n-th pixel along each axis is used."""
+    pictures_at_once = 8
+    """Pictures whose points are gathered before they are thinned, to save memory."""
+
+
 BYTE = np.float32(1 / 255)
-_NEIGHBOURS, _STRIDE = 4, 2
-"""Measured points that tell the surface at a place; pixels of which one is looked at, along each axis."""
-_THINNED_EVERY = 8
-"""Pictures whose points are gathered before they are thinned out: memory."""
 AROUND = np.ones((3, 3), np.uint8)
 """A pixel and those around it."""
 
@@ -195,14 +204,14 @@ class Sightings:
         """All surfaces that the keyframes see, as points so far apart."""
         gathered, waiting = Surface.empty(), list[Surface]()
         for number, (picture, view) in enumerate(zip(self.pictures, self._views, strict=True)):
-            shown = (view.near > 0) & (view.far - view.near < OUTLINE * view.far)
+            shown = (view.near > 0) & (view.far - view.near < SightingTuning.max_depth_step * view.far)
             points, counts = back_project(picture, shown), np.ones(int(shown.sum()), np.int32)
             toward = inverse(picture.T_camera_world)[:3, 3] - points
             toward /= np.linalg.norm(toward, axis=1, keepdims=True)
             waiting.append(
                 Surface(points, picture.color[shown] * BYTE, toward.astype(np.float32), picture.labels[shown], counts)
             )
-            if len(waiting) == _THINNED_EVERY or number + 1 == len(self.pictures):
+            if len(waiting) == SightingTuning.pictures_at_once or number + 1 == len(self.pictures):
                 gathered, waiting = Surface.join([gathered, *waiting]).thin(spacing), []
         return gathered
 
@@ -237,10 +246,12 @@ class _Measured:
     def mask(self, picture: Picture) -> None:
         """Blots out of a picture's depth what was not measured, looked at on every second pixel and row."""
         some = np.zeros(picture.depth.shape, bool)
-        some[::_STRIDE, ::_STRIDE] = picture.depth[::_STRIDE, ::_STRIDE] > 0
+        some[:: SightingTuning.stride, :: SightingTuning.stride] = (
+            picture.depth[:: SightingTuning.stride, :: SightingTuning.stride] > 0
+        )
         good = np.zeros(picture.depth.shape, np.uint8)
         good[some] = self._off(back_project(picture, some)) <= self._within(picture.depth[some])
-        small = good[::_STRIDE, ::_STRIDE]
+        small = good[::SightingTuning.stride, ::SightingTuning.stride]
         whole = cv2.resize(small, picture.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
         picture.depth[whole == 0] = 0
 
@@ -249,7 +260,7 @@ class _Measured:
         measured, normals = self._visit.measured, self._visit.normals
         if not len(measured):
             return np.full(len(points), np.inf)
-        apart, near = self._tree.query(points, _NEIGHBOURS, distance_upper_bound=self._around, workers=-1)
+        apart, near = self._tree.query(points, SightingTuning.neighbours, distance_upper_bound=self._around, workers=-1)
         near = np.minimum(near, len(measured) - 1)
         off = np.abs(((points[:, None] - measured[near]) * normals[near]).sum(2))
         return np.where(np.isfinite(apart), off, np.inf).min(1)

@@ -6,9 +6,14 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.scene.poses import rotation_about, transform_points
+from ggslam.system.tuning import Tuning
 
-LEVEL = np.radians(0.5)
-"""What tilts a thing less keeps it upright."""
+
+class UprightTuning(Tuning):
+    """When a motion keeps an object upright."""
+
+    max_tilt_rad = np.radians(0.5)
+    """Largest tilt, in radians."""
 
 
 def upright(up: np.ndarray) -> np.ndarray:

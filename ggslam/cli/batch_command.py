@@ -58,30 +58,36 @@ Source = Annotated[
 ]
 Replica = Annotated[
     Path | None,
-    typer.Option(help="Folder with Replica's scenes (room0 ... office4): all of them."),
+    typer.Option(help="Folder with Replica's scenes (room0 ... office4); all of them are run."),
 ]
 Out = Annotated[
     Path | None, typer.Option(help="Folder of runs and tables; default runs/NAME, or as the manifest says.")
 ]
 Options = Annotated[
-    str, typer.Option(help="Options of `ggslam run` for all recordings, as one text; before those of a manifest.")
+    str,
+    typer.Option(
+        help="Options of `ggslam run` for all recordings, in one string; those of a manifest come after them."
+    ),
 ]
-Seeds = Annotated[str, typer.Option(help="Of a folder: seeds, by commas.")]
+Seeds = Annotated[str, typer.Option(help="For a folder of recordings: seeds, separated by commas.")]
 Workers = Annotated[int | None, typer.Option(help="Runs at a time; default: one for every two processors.")]
 Engine = Annotated[
     EngineName,
-    typer.Option(help="local: processes on this machine; ray: tasks of a Ray cluster; slurm: a script of a job array."),
+    typer.Option(help="local: processes on this machine; ray: tasks of a Ray cluster; slurm: a job array."),
 ]
 Address = Annotated[
     str | None,
-    typer.Option(help="Of the Ray cluster, auto: the one this machine belongs to; default: one on this machine."),
+    typer.Option(
+        help="Address of the Ray cluster; auto: the cluster of this machine. Default: a new cluster on this machine."
+    ),
 ]
-WriteOnly = Annotated[bool, typer.Option("--write-only", help="Print the script of --engine slurm, submit nothing.")]
-TableOnly = Annotated[bool, typer.Option("--table-only", help="Make no run: write the table of those that are done.")]
+WriteOnly = Annotated[bool, typer.Option("--write-only", help="Print the script of --engine slurm and submit nothing.")]
+TableOnly = Annotated[bool, typer.Option("--table-only", help="Make no runs; write the table of the finished ones.")]
 Only = Annotated[
-    int | None, typer.Option(help="Make one run, by its number from 0 on, and no table: an element of a job array.")
+    int | None,
+    typer.Option(help="Make only the run with this number, counted from 0, and no table; used by job arrays."),
 ]
-Retry = Annotated[bool, typer.Option("--retry", help="Make runs again that failed.")]
+Retry = Annotated[bool, typer.Option("--retry", help="Repeat failed runs.")]
 
 
 def batch(

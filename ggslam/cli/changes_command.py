@@ -14,7 +14,7 @@ from ggslam.cli.observer import ProgressObserver
 
 if TYPE_CHECKING:
     from ggslam.changes.change import Change
-    from ggslam.changes.found import ChangeTable
+    from ggslam.changes.change_table import ChangeTable
 
 EPILOG = """
 Poses and boxes are in the world of the older run. Things of which the newer visit saw too little are listed as unseen:
@@ -38,13 +38,18 @@ class IdsName(str, Enum):
 
 def changes(
     old: Annotated[Path, typer.Argument(metavar="OLD", help="Folder of the earlier run, or a .ggz file of it.")],
-    new: Annotated[Path, typer.Argument(metavar="NEW", help="The later run of the same place, likewise.")],
+    new: Annotated[
+        Path, typer.Argument(metavar="NEW", help="Folder of the later run of the same place, or a .ggz file of it.")
+    ],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for changes.json and pictures of each change; without it only a table.")
+        Path | None,
+        typer.Option(help="Folder for changes.json and pictures of each change. Without it, only a table is printed."),
     ] = None,
     ids: Annotated[
         IdsName,
-        typer.Option(help="Whether one object id is one thing in both runs; auto: where what stayed has the same ids."),
+        typer.Option(
+            help="Whether an id means the same object in both runs; auto: yes if objects that stayed have the same ids."
+        ),
     ] = IdsName.auto,
 ) -> None:
     """List what was added, removed, moved or changed its look between two visits to one place."""

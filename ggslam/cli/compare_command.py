@@ -14,6 +14,7 @@ from ggslam.cli.changes_command import print_changes
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
+from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
     from ggslam.geometry.clouds import Overlap
@@ -51,7 +52,7 @@ SidePath = Annotated[
     typer.Argument(metavar="A", help="Folder of a run, PLY or PCD file with a cloud or mesh, or file of Gaussians "
                    "(.sog, .spz, ...)."),
 ]  # fmt: skip
-ReferencePath = Annotated[Path, typer.Argument(metavar="B", help="The reference: a run, cloud or mesh likewise.")]
+ReferencePath = Annotated[Path, typer.Argument(metavar="B", help="The reference: a run, cloud or mesh, too.")]
 
 
 def compare(
@@ -70,7 +71,7 @@ def compare(
     thresholds: Annotated[str, typer.Option(help="Distances for precision, recall and F1, metres.")] = "0.01,0.02,0.05",
     seed: Annotated[int, typer.Option(help="Seed of the random samples.", min=0)] = 0,
     changes: Annotated[
-        bool, typer.Option("--changes", help="Of runs: also list what changed from A, the earlier visit, to B.")
+        bool, typer.Option("--changes", help="For two runs: also list what changed from A, the earlier visit, to B.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="JSON file to write all numbers to.")] = None,
 ) -> None:  # fmt: skip
@@ -124,7 +125,7 @@ def _print(c: Comparison, max_distance: float) -> None:
             "the surface",
             highlight=False, markup=False, soft_wrap=True,
         )  # fmt: skip
-    if max(c.a_on_b.fitness, c.b_on_a.fitness) < _HARDLY:
+    if max(c.a_on_b.fitness, c.b_on_a.fitness) < CompareTuning.min_partners:
         console.print(
             "note: hardly anything of the two lies together: they show different places, or lie in different worlds "
             "(--align); the distances below mean nothing then", highlight=False, markup=False, soft_wrap=True
@@ -154,8 +155,13 @@ def _print(c: Comparison, max_distance: float) -> None:
 _ALIGNED = {
     "truth": "by the true poses", "icp": "by ICP", "trajectory": "by camera positions at common times",
 }  # fmt: skip
-_HARDLY = 0.05
-"""Share of points with a partner below which the two do not show the same thing as they lie."""
+
+
+class CompareTuning(Tuning):
+    """When two runs show different places."""
+
+    min_partners = 0.05
+    """Smallest share of points with a partner, in the better direction."""
 
 
 _COLUMNS = ["", "fitness", "inlier RMSE", "to the surface: median", "90 %"]

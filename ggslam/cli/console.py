@@ -26,10 +26,17 @@ from rich.text import Text
 
 from ggslam.cli.argument_names import with_options
 from ggslam.errors import plain
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import printable
 
-_NO_TERMINAL = 100_000
-"""Columns of what is no terminal: a log or a pipe has no width to wrap lines at."""
+
+class ConsoleTuning(Tuning):
+    """How output is printed where it is no terminal."""
+
+    columns = 100_000
+    """Columns of a log or a pipe: wide enough that no line wraps."""
+    line_interval_s = 10.0
+    """Seconds between two lines of progress."""
 
 
 class PlainConsole(Console):
@@ -42,7 +49,7 @@ class PlainConsole(Console):
         """Columns and rows."""
         found = super().size
         asked = self._width is not None or self.is_terminal or "COLUMNS" in os.environ
-        return found if asked else ConsoleDimensions(_NO_TERMINAL, found.height)
+        return found if asked else ConsoleDimensions(ConsoleTuning.columns, found.height)
 
     def print(self, *objects: Any, **how: Any) -> None:
         """As `rich.console.Console.print`."""
@@ -65,8 +72,6 @@ class CommandConsole(PlainConsole):
 
 console = CommandConsole()
 
-LINE_EVERY_S = 10.0
-"""Seconds between two lines of progress where output is no terminal."""
 
 
 class RateColumn(ProgressColumn):
@@ -83,7 +88,7 @@ class ProgressLines(Progress):
 
     def __init__(self, output: Console) -> None:
         super().__init__(console=output, disable=True)  # draws no bar
-        self._due = time.monotonic() + LINE_EVERY_S
+        self._due = time.monotonic() + ConsoleTuning.line_interval_s
 
     def update(self, task_id: TaskID, **changes: Any) -> None:  # type: ignore[override]
         """As `Progress.update`; prints a line when one is due."""
@@ -91,7 +96,7 @@ class ProgressLines(Progress):
         super().update(task_id, **changes)
         task, now = self._tasks[task_id], time.monotonic()
         if now >= self._due or (task.finished and not was_finished):
-            self._due = now + LINE_EVERY_S
+            self._due = now + ConsoleTuning.line_interval_s
             self.console.print(progress_line(task), highlight=False, markup=False, soft_wrap=True)
 
 

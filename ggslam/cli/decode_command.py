@@ -38,18 +38,18 @@ def decode(
         Path,
         typer.Argument(
             metavar="OUT",
-            help="PLY or PCD file; of Gaussians a 3DGS PLY; of a .ggz a run folder, of a .ggc a grid store.",
+            help="PLY or PCD file; for Gaussians a 3DGS PLY, for a .ggz a run folder, for a .ggc a grid store.",
         ),
     ],
-    slice_id: Annotated[int | None, typer.Option("--slice", help="Decode this slice alone.", min=0)] = None,
+    slice_id: Annotated[int | None, typer.Option("--slice", help="Decode only this slice.", min=0)] = None,
     box: Annotated[
-        str | None, typer.Option(help='Decode the points in a box alone: "x0 y0 z0 x1 y1 z1", metres.')
+        str | None, typer.Option(help='Decode only the points in this box: "x0 y0 z0 x1 y1 z1", metres.')
     ] = None,
     threads: options.Threads = None,
 ) -> None:
     """Decode an MPEG G-PCC stream, or one slice or box of it."""
-    from ggslam.jobs.code.coded_cells import is_cells_file
-    from ggslam.jobs.code.coding import decode_file
+    from ggslam.jobs.encode.coded_cells import is_cells_file
+    from ggslam.jobs.encode.coding import decode_file
     from ggslam.runs.map_container import is_container
 
     if is_cells_file(source):
@@ -74,7 +74,7 @@ def _unpack(source: Path, out: Path, in_part: bool, threads: int | None) -> None
 
 def _unpack_cells(source: Path, out: Path, in_part: bool, threads: int | None) -> None:
     """A grid store from a file of coded cells."""
-    from ggslam.jobs.code.coded_cells import decode_store
+    from ggslam.jobs.encode.coded_cells import decode_store
 
     if in_part:
         raise ConfigError("--slice and --box are for streams; a .ggc is decoded as a whole")

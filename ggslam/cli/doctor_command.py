@@ -27,8 +27,10 @@ _MARKS = {"ok": ("ok", "green"), "missing": ("--", "dim"), "warning": ("!!", "ye
 
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
-    modes: Annotated[bool, typer.Option("--modes", help="Print what runs of each kind leave out, and end.")] = False,
-    self_test: Annotated[bool, typer.Option("--self-test/--no-self-test", help="Also render and track.")] = True,
+    modes: Annotated[bool, typer.Option("--modes", help="Print what runs of each kind leave out, and exit.")] = False,
+    self_test: Annotated[
+        bool, typer.Option("--self-test/--no-self-test", help="Also render an image and track two frames.")
+    ] = True,
 ) -> None:
     """Check the installation: versions, compiled core, GPU, extras, weights. Exit code 1 if ggslam cannot work."""
     if modes:

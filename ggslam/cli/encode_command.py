@@ -67,7 +67,10 @@ class Sweep(str, Enum):
 
 
 Slicing = Annotated[
-    Split, typer.Option(help="Equal numbers of points or equal intervals of the longest axis, or octree cubes.")
+    Split,
+    typer.Option(
+        help="How slices are cut: equal numbers of points, equal intervals of the longest axis, or octree cubes."
+    ),
 ]
 Source = Annotated[
     Path,
@@ -88,7 +91,7 @@ def encode(
     source: Source,
     out: Out,
     qp: Annotated[
-        int, typer.Option(help="Quantiser of colours and reflectance; 6 more double the step.", min=4, max=51)
+        int, typer.Option(help="Quantiser of colours and reflectance; adding 6 doubles the step.", min=4, max=51)
     ] = 22,
     chroma_offset: Annotated[int, typer.Option(help="Added to --qp for chroma.", min=-51, max=51)] = 0,
     geometry_scale: Annotated[float, typer.Option(help="Resolution of the positions; 0.5: half.", min=1e-6)] = 1.0,
@@ -98,7 +101,7 @@ def encode(
     bits: Annotated[
         int, typer.Option(help="Bits of the longest side of a cloud without a grid.", min=1, max=21)
     ] = 10,
-    slices: Annotated[int, typer.Option(help="Slices, coded side by side.", min=1, max=65536)] = 1,
+    slices: Annotated[int, typer.Option(help="Number of slices, coded in parallel.", min=1, max=65536)] = 1,
     split: Slicing = Split.by_count,
     threads: options.Threads = None,
     preset: Annotated[
@@ -106,7 +109,7 @@ def encode(
     ] = Preset.pointcloud,
     rate: Annotated[Rate, typer.Option(help="Quality of splat, r01 smallest; instead of --qp and --bits.")] = Rate.r03,
     ids: Annotated[
-        bool, typer.Option("--ids/--no-ids", help="Code object ids and other whole numbers (exactly).")
+        bool, typer.Option("--ids/--no-ids", help="Also code object ids and other whole numbers, without loss.")
     ] = True,
     sweep: Annotated[
         Sweep | None, typer.Option(help="Write a study over QPs or geometry scales: tables, plots, pictures.")
@@ -118,8 +121,8 @@ def encode(
 ) -> None:
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
     from ggslam.coding import CodecSettings
-    from ggslam.jobs.code.coded_cells import is_cells_file
-    from ggslam.jobs.code.coding import encode_file
+    from ggslam.jobs.encode.coded_cells import is_cells_file
+    from ggslam.jobs.encode.coding import encode_file
     from ggslam.jobs.submaps.stores import is_store
     from ggslam.runs.map_container import is_container
 
@@ -151,7 +154,7 @@ def _encode_store(
 ) -> None:  # fmt: skip
     """The Gaussians of a store, cell by cell."""
     from ggslam.cli.observer import ProgressObserver
-    from ggslam.jobs.code.store_coding import encode_store
+    from ggslam.jobs.encode.store_coding import encode_store
     from ggslam.jobs.tasks.engines import Engine
 
     with progress_bar() as bar:
@@ -241,8 +244,8 @@ def _rate(size: int, points: int) -> str:
 
 def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], plots: bool) -> None:
     from ggslam.coding.study import sweep_steps
-    from ggslam.jobs.code.coding import study_cloud
-    from ggslam.jobs.code.study import write_study
+    from ggslam.jobs.encode.coding import study_cloud
+    from ggslam.jobs.encode.study import write_study
 
     steps = sweep_steps(kinds)
     cloud = study_cloud(source, settings)

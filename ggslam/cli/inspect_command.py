@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from ggslam.cli import options
 from ggslam.cli.console import console, table
+from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
     from ggslam.scene.camera import Camera
@@ -33,8 +34,12 @@ EPILOG = """
   ggslam inspect kitchen.ggz
 """
 
-SAME_TIME_S = 0.005
-"""Seconds between depth and colour that are none: generated recordings without any measure up to 0.0032."""
+
+class ClockTuning(Tuning):
+    """When depth and colour are of the same time."""
+
+    max_offset_s = 0.005
+    """Largest measured offset, in seconds: recordings without any measure up to 0.0032."""
 
 
 def inspect(
@@ -150,8 +155,8 @@ def _print_formats() -> None:
 
 def _print_contents(path: Path) -> None:
     """What is in a .ggz or .ggc."""
-    from ggslam.jobs.code.coded_cells import is_cells_file
-    from ggslam.jobs.code.contents import contents_of_cells, contents_of_run
+    from ggslam.jobs.encode.coded_cells import is_cells_file
+    from ggslam.jobs.encode.contents import contents_of_cells, contents_of_run
 
     found = contents_of_cells(path) if is_cells_file(path) else contents_of_run(path)
     for name, value in found.facts:
@@ -166,7 +171,7 @@ def _print_contents(path: Path) -> None:
 
 
 def _print_stream(path: Path) -> None:
-    from ggslam.jobs.code.coding import list_stream
+    from ggslam.jobs.encode.coding import list_stream
 
     listing = list_stream(path)
     for unit in listing.units:
@@ -216,13 +221,13 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     ]  # fmt: skip
     if r.native_camera != r.camera:
         lines.insert(3, ("stored as", _camera(r.native_camera)))
-    if r.clocks is not None and abs(r.clocks.seconds) > max(SAME_TIME_S, 2 * r.clocks.error):
+    if r.clocks is not None and abs(r.clocks.seconds) > max(ClockTuning.max_offset_s, 2 * r.clocks.error):
         side = "after" if r.clocks.seconds > 0 else "before"
         apart, error = 1e3 * abs(r.clocks.seconds), 1e3 * r.clocks.error
         words = f"depth {apart:.1f} ms {side} colour (to {error:.1f} ms, by the motion in {r.clocks.frames} frames)"
         lines.append(("clocks", words))
     elif r.clocks is not None and not r.verdicts:
-        lines.append(("clocks", f"depth and colour are of the same time, to {1e3 * SAME_TIME_S:.0f} ms"))
+        lines.append(("clocks", f"depth and colour are of the same time, to {1e3 * ClockTuning.max_offset_s:.0f} ms"))
     if r.motion is not None:
         step, turn = r.motion.step_m, r.motion.turn_deg
         lines.append(("motion", f"path {r.motion.path_m:.2f} m; a frame: {step[0] * 100:.1f} cm and {turn[0]:.1f} deg "

@@ -11,6 +11,7 @@ import typer
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
+from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
     from ggslam.jobs.localize.report import LocalizationReport
@@ -29,8 +30,13 @@ EPILOG = """
   ggslam localize campus.pcd scans/tuesday --start-pose given --set scans.search.reach=4 --set scans.scan.farthest=100
 """
 
-_OTHER_WORLD = 4.0
-"""Times the RMSE after alignment from which on the RMSE tells of another world."""
+
+class OtherWorldTuning(Tuning):
+    """When true poses seem to be in another world."""
+
+    max_ratio = 4.0
+    """Largest RMSE over the RMSE after alignment."""
+
 
 MapPath = Annotated[
     Path,
@@ -49,12 +55,12 @@ StartPose = Annotated[
 ]  # fmt: skip
 NoStartPose = Annotated[
     bool,
-    typer.Option("--no-start-pose", help="Look the first frame or scan up in the map (the default)."),
+    typer.Option("--no-start-pose", help="Search for the first frame or scan in the map (default)."),
 ]
 Near = Annotated[
     str | None,
     typer.Option(metavar="PLACE", help='Roughly where the recording was made: "x y sigma" or "x y z sigma", metres in '
-                 "the map. Only places within 3 sigma are looked at."),
+                 "the map. Only places within 3 sigma are searched."),
 ]  # fmt: skip
 FullMap = Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")]
@@ -138,7 +144,7 @@ def _print(report: LocalizationReport) -> None:
     ]
     console.print(table("full map" if report.full else "partial map", ["", ""], rows))
     rmse, aligned = s["rmse_m"], s["rmse_aligned_m"]
-    if rmse is not None and aligned is not None and rmse > _OTHER_WORLD * aligned:
+    if rmse is not None and aligned is not None and rmse > OtherWorldTuning.max_ratio * aligned:
         console.print(
             "the given poses are not in the world of this map (of a run: its first camera), so the RMSE after rigid "
             "alignment is the one to read", highlight=False,

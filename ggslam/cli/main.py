@@ -43,9 +43,16 @@ from ggslam.cli.console import PlainConsole
 from ggslam.cli.old_names import Command
 from ggslam.errors import GgslamError
 from ggslam.system.interrupts import Interrupted, exit_code, stop_like_ctrl_c
+from ggslam.system.tuning import Tuning
 
-_SHOWN = 60
-"""Characters of a name that is far too long."""
+
+class MessageTuning(Tuning):
+    """How errors are printed."""
+
+    name_length = 60
+    """Characters that are printed of a file name that is too long."""
+
+
 _TORCH_HAS_NO_MEMORY = "DefaultCPUAllocator: "
 """How torch says so; it has no class of errors for it."""
 
@@ -129,7 +136,7 @@ def main() -> None:
         raise
     except OSError as error:
         too_long = error.errno == errno.ENAMETOOLONG
-        said = f"{str(error.filename)[:_SHOWN]!r}...: {error.strerror}" if too_long else error
+        said = f"{str(error.filename)[:MessageTuning.name_length]!r}...: {error.strerror}" if too_long else error
         errors.print(f"error: {said}", highlight=False, soft_wrap=True, markup=False)
         sys.exit(2 if too_long else 1)
     except Exception as error:

@@ -8,12 +8,17 @@ from typing import TYPE_CHECKING
 
 from rich.progress import Progress, TaskID
 
+from ggslam.system.tuning import Tuning
+
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.slam.result import StepReport
 
 
-_WIDE = 96
-"""Columns of a window that has room for more."""
+class ProgressTuning(Tuning):
+    """What a progress bar shows."""
+
+    wide_columns = 96
+    """Columns of a window from which more is shown."""
 
 
 class ProgressObserver:
@@ -35,7 +40,7 @@ class ProgressObserver:
         loss = f"{report.loss:.3f}" if math.isfinite(report.loss) else "-"
         psnr = f"{report.psnr:.1f} dB" if math.isfinite(report.psnr) else "-"
         info = f"overlap {report.frame.overlap:4.0%}  {_count(report.gaussians)} Gaussians  loss {loss}"
-        if self._bar.console.width >= _WIDE:
+        if self._bar.console.width >= ProgressTuning.wide_columns:
             info += f"  PSNR {psnr}"
         if report.frame.status != "ok":
             info += f"  [yellow]{report.frame.status}[/]"

@@ -22,7 +22,7 @@ Settings = Annotated[
 ]
 Columns = Annotated[
     int | None,
-    typer.Option(help="Numbers that a .bin scan stores for each point; default: as its numbers tell.", min=3),
+    typer.Option(help="Numbers that a .bin scan stores for each point; default: guessed from the file.", min=3),
 ]
 LivePath = Annotated[
     Path | None,
@@ -43,8 +43,8 @@ Stop = Annotated[int | None, typer.Option(help="Stop before this frame.", min=1)
 Stride = Annotated[int, typer.Option(help="Use only every n-th frame.", min=1)]
 Scale = Annotated[
     float | None,
-    typer.Option(help="Resize the images by this factor, e.g. 0.5. 1 is the stored size, but of colour much finer than "
-                 "depth (phones) 640x480 pixels."),
+    typer.Option(help="Resize the images by this factor, e.g. 0.5. Default 1: the stored size, or 640x480 pixels where "
+                 "colour is much finer than depth (phones)."),
 ]  # fmt: skip
 Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.", min=1, max=1024)]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
@@ -60,8 +60,8 @@ DepthCamera = Annotated[
 ]
 OwnCamera = Annotated[
     Path | None,
-    typer.Option("--camera", metavar="FILE", help="File with the calibration of the colour camera, instead of the "
-                 "recording's own: a camera.yaml, or of OpenCV, ORB-SLAM, ROS, Kalibr, Open3D, COLMAP, or K.txt."),
+    typer.Option("--camera", metavar="FILE", help="Calibration file of the colour camera, instead of the recording's "
+                 "own: camera.yaml, K.txt, or a file of OpenCV, ORB-SLAM, ROS, Kalibr, Open3D or COLMAP."),
 ]  # fmt: skip
 Intrinsics = Annotated[
     str | None,
@@ -79,15 +79,15 @@ DepthKind = Annotated[
 ]  # fmt: skip
 DepthDelay = Annotated[
     str | None,
-    typer.Option(metavar="DELAY", help="How much later depth was taken than the colour that it is stored beside: 1f "
-                 "(frame), -1f, or 33ms; colour is paired with the depth of its own time."),
+    typer.Option(metavar="DELAY", help="How much later depth was taken than the colour stored beside it: 1f (one "
+                 "frame), -1f, or 33ms. Colour is then paired with the depth of its own time."),
 ]  # fmt: skip
 Upright = Annotated[
-    bool, typer.Option("--upright", help="Turn colour images as their orientation tag (EXIF) says.")
+    bool, typer.Option("--upright", help="Rotate colour images by their EXIF orientation.")
 ]
 VoidId = Annotated[
     int | None,
-    typer.Option(help="Id of masks that means unlabelled besides 0: 255 of VOC, DAVIS.", min=1, max=2**24 - 1),
+    typer.Option(help="Mask id that means unlabelled, besides 0; VOC and DAVIS use 255.", min=1, max=2**24 - 1),
 ]
 Topics = Annotated[
     list[str] | None,
@@ -120,6 +120,7 @@ CellWorkers = Annotated[
 CellAddress = Annotated[
     str | None,
     typer.Option(
-        "--address", help="Of the Ray cluster, auto: the one this machine belongs to; default: one on this machine."
+        "--address",
+        help="Address of the Ray cluster; auto: the cluster of this machine. Default: a new cluster on this machine.",
     ),
 ]

@@ -35,8 +35,8 @@ Source = Annotated[
     Path, typer.Argument(metavar="RUN_OR_STORE", help="Folder that `ggslam run` or `ggslam submaps` wrote.")
 ]
 Out = Annotated[Path | None, typer.Option(help="Folder for the refined run or store; default: in place.")]
-Steps = Annotated[int, typer.Option(help="Optimisation steps, of a store for each cell.", min=0)]
-Seed = Annotated[int, typer.Option(help="Of the order of the keyframes.", min=0)]
+Steps = Annotated[int, typer.Option(help="Optimisation steps; for a store, steps per cell.", min=0)]
+Seed = Annotated[int, typer.Option(help="Seed of the order of the keyframes.", min=0)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a run that is already at --out.")]
 
 

@@ -31,7 +31,9 @@ def render(
     ] = None,
     frames: Annotated[str | None, typer.Option(help="Frames, e.g. 0,50,100; default: 8, spread evenly.")] = None,
     every: Annotated[int | None, typer.Option(help="Render every n-th frame instead.", min=1)] = None,
-    what: Annotated[str, typer.Option(help="Some of color, depth, alpha, ids, pca; by commas.")] = "color,depth",
+    what: Annotated[
+        str, typer.Option(help="What to render: some of color, depth, alpha, ids, pca, separated by commas.")
+    ] = "color,depth",
     width: Annotated[
         int | None, typer.Option(help="Width of the pictures; default: that of the run's images.", min=16, max=8192)
     ] = None,

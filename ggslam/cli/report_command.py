@@ -13,7 +13,7 @@ from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ggslam.jobs.changes.shown import ChangesShown
+    from ggslam.jobs.changes.saved_changes import ChangesShown
 
 EPILOG = """
 [bold]Examples[/]
@@ -35,7 +35,8 @@ def report(
     ] = None,
     plots: Annotated[Path | None, typer.Option(help="Folder to write the plots to, as SVG and PNG.")] = None,
     changes: Annotated[
-        bool, typer.Option("--changes", help="Of two visits, the older one first: show what changed between them, too.")
+        bool,
+        typer.Option("--changes", help="For two visits, the older one first: also show what changed between them."),
     ] = False,
 ) -> None:
     """Write RUN/report.html again, or one page that compares several runs. Pages open from disk, without a network."""

@@ -10,7 +10,7 @@ from enum import Enum
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from rich.markup import escape
@@ -55,8 +55,8 @@ _WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host",
 """Options that change nothing of what a run computes."""
 
 
-STRICT_EXIT_CODE = 3
-"""Of runs that came to an end, but are bad or of a recording that seems wrong, under --strict."""
+STRICT_EXIT_CODE: Final = 3
+"""Exit code under --strict of a run that ended but is bad, or whose recording seems wrong."""
 
 
 class DeviceName(str, Enum):
@@ -74,7 +74,9 @@ Record = Annotated[
 Iterations = Annotated[int | None, typer.Option(help="Mapping iterations per frame (default 4).")]
 Refine = Annotated[
     int | None,
-    typer.Option(help="Mapping iterations after the last frame (default: 1.2 for each before, more of few frames)."),
+    typer.Option(
+        help="Mapping iterations after the last frame (default: 1.2 x the iterations so far, more for few frames)."
+    ),
 ]
 Realtime = Annotated[
     float | None, typer.Option(metavar="FPS", help="Deliver frames at this rate; tracker and mapper run side by side.")
@@ -95,30 +97,30 @@ EarlierRun = Annotated[
     Path | None, typer.Option("--map", metavar="RUN", help="Start in the map of this run instead of an empty one.")
 ]
 LocalizeOnly = Annotated[
-    bool, typer.Option("--localize-only", help="With --map: locate the frames and leave the map as it is.")
+    bool, typer.Option("--localize-only", help="With --map: locate the frames and do not change the map.")
 ]
 Loops = Annotated[
-    bool | None, typer.Option("--loops/--no-loops", help="Close loops and look lost frames up (default: yes).")
+    bool | None, typer.Option("--loops/--no-loops", help="Close loops and relocalize lost frames (default: yes).")
 ]
 Threads = Annotated[int | None, typer.Option(help="Number of threads; default: one per processor.")]
 Seed = Annotated[int | None, typer.Option(help="Seed of all random draws.", min=0)]
 Log = Annotated[
     str | None, typer.Option(metavar="rerun|FILE.rrd", help="Stream poses, images and map to rerun, or to a file.")
 ]
-ShowPage = Annotated[bool, typer.Option("--view", help="Show the map in a browser while it grows, and afterwards.")]
+ShowPage = Annotated[bool, typer.Option("--view", help="Show the map in a browser during and after the run.")]
 Evaluate = Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")]
 Check = Annotated[
-    bool, typer.Option("--check/--no-check", help="Look at depth first, and refuse it where it is certainly wrong.")
+    bool, typer.Option("--check/--no-check", help="Check depth first, and refuse it if it is certainly wrong.")
 ]
 Resume = Annotated[
     Path | None,
-    typer.Option(metavar="RUN", help="Go on with a run that was cut off. Settings and recording are those it had."),
+    typer.Option(metavar="RUN", help="Continue an interrupted run with its own settings and recording."),
 ]
 CheckpointEvery = Annotated[
     int | None,
     typer.Option(
         metavar="FRAMES", min=0,
-        help="Save what it takes to go on after so many frames; 0: never. Default: as often as takes 1 % of the time.",
+        help="Save a checkpoint every FRAMES frames; 0: never. Default: as often as costs 1 % of the time.",
     ),
 ]
 Strict = Annotated[

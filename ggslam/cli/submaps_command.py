@@ -14,6 +14,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.system.json_files import json_ready
+from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
     from ggslam.jobs.submaps.fill import StoreListing, SubmapsRequest
@@ -31,13 +32,18 @@ EPILOG = """
   ggslam submaps scans/monday --out campus.grid --set submaps.partial_radius=40
 """
 
-_PROBLEMS = 5
-"""Damaged files that are named."""
 
-_OBJECTS = 40
-"""Objects that are listed."""
-_CELLS = 4
-"""Cells of an object that are named."""
+class ListingTuning(Tuning):
+    """How much of a store is listed."""
+
+    problems = 5
+    """Damaged files."""
+    objects = 40
+    """Objects."""
+    cells = 4
+    """Cells of an object."""
+
+
 _WORDS = {"look": "changed look"}
 
 SourcePath = Annotated[
@@ -58,7 +64,10 @@ Voxel = Annotated[
 ]
 Radius = Annotated[
     float | None,
-    typer.Option(help="R: record a cell from so near its centre, metres (default 1, or 0.9 S of a LiDAR).", min=0),
+    typer.Option(
+        help="R: record a cell from within this distance of its centre, metres (default 1, or 0.9 S for a LiDAR).",
+        min=0,
+    ),
 ]
 Refresh = Annotated[
     float | None, typer.Option(help="T: seconds before a cell is recorded again (default 300).", min=0)
@@ -78,7 +87,7 @@ def submaps(
         Path | None, typer.Option(help="Trajectory file in the map's world, instead of the recording's own poses.")
     ] = None,
     at: Annotated[
-        float | None, typer.Option(help="When this visit began, seconds on a clock that all visits share.")
+        float | None, typer.Option(help="Start of this visit, in seconds on a clock that all visits share.")
     ] = None,
     spacing: Spacing = None,
     axes: Axes = None,
@@ -152,10 +161,10 @@ def _print(listing: StoreListing) -> None:
         ]
         console.print(table(f"{len(rows)} cells since {listing.since}", ["cell", "new", "changed"], rows))
     _print_objects(listing)
-    for problem in listing.problems[:_PROBLEMS]:
+    for problem in listing.problems[:ListingTuning.problems]:
         console.print(problem, highlight=False, markup=False, soft_wrap=True)
-    if len(listing.problems) > _PROBLEMS:
-        console.print(f"and {len(listing.problems) - _PROBLEMS} more files like these", highlight=False)
+    if len(listing.problems) > ListingTuning.problems:
+        console.print(f"and {len(listing.problems) - ListingTuning.problems} more files like these", highlight=False)
 
 
 def _print_objects(listing: StoreListing) -> None:
@@ -167,11 +176,12 @@ def _print_objects(listing: StoreListing) -> None:
         present = listing.objects.present()
         title = f"{len(present)} objects, {len(listing.objects.objects) - len(present)} gone"
         rows = [
-            [o.label(), str(o.gaussians), str(len(o.cells)), o.first_seen, o.last_seen] for o in present[:_OBJECTS]
+            [o.label(), str(o.gaussians), str(len(o.cells)), o.first_seen, o.last_seen]
+            for o in present[: ListingTuning.objects]
         ]
         console.print(table(title, ["object", "Gaussians", "cells", "first seen", "last seen"], rows))
-        if len(present) > _OBJECTS:
-            console.print(f"and {len(present) - _OBJECTS} more objects", highlight=False)
+        if len(present) > ListingTuning.objects:
+            console.print(f"and {len(present) - ListingTuning.objects} more objects", highlight=False)
     if listing.unknown:
         names = ", ".join(listing.unknown)
         text = f"no record of objects: {names}" if listing.objects is not None else "no record of objects"
@@ -179,9 +189,9 @@ def _print_objects(listing: StoreListing) -> None:
 
 
 def _event_row(event: ObjectEvent) -> list[str]:
-    motion, cells = event.motion(), " ".join(str(key) for key in event.cells[:_CELLS])
-    if len(event.cells) > _CELLS:
-        cells += f" and {len(event.cells) - _CELLS} more"
+    motion, cells = event.motion(), " ".join(str(key) for key in event.cells[:ListingTuning.cells])
+    if len(event.cells) > ListingTuning.cells:
+        cells += f" and {len(event.cells) - ListingTuning.cells} more"
     moved = "" if motion is None else f"{100 * motion[0]:.1f} cm"
     turned = "" if motion is None else f"{motion[1]:.1f} deg" if event.turn_known else "not known"
     return [_WORDS.get(event.kind, event.kind), event.label(), moved, turned, cells]

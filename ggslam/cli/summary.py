@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 
 from ggslam.cli.console import console, table
+from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
     from ggslam.runs.records.metrics import (
@@ -31,7 +32,13 @@ _SEGMENTATION_COLUMNS = [
     ("accuracy", "accuracy", 100.0, ".1f"), ("precision", "precision", 100.0, ".0f"),
     ("recall", "recall", 100.0, ".0f"), ("votes", "votes_miou", 100.0, ".1f"),
 ]  # fmt: skip
-_LOWEST = 5
+
+
+class SummaryTuning(Tuning):
+    """How much of the scores is printed."""
+
+    lowest = 5
+    """Objects with the lowest scores."""
 
 
 def _text(value: float | None, factor: float, form: str) -> str:
@@ -99,7 +106,7 @@ def _print_segmentation(s: SegmentationRecord) -> None:
     columns = ["scores", *(title for title, *_ in _SEGMENTATION_COLUMNS)]
     console.print(table(f"objects against masks, %; {matched}", columns, rows))
     scored = [(i, o, o.iou) for i, o in s.per_object.items() if o.iou is not None]
-    lowest = sorted(scored, key=lambda item: item[2])[:_LOWEST]
+    lowest = sorted(scored, key=lambda item: item[2])[:SummaryTuning.lowest]
     labels = [f"{o.name} ({i})" if o.name else f"object {i}" for i, o, _ in lowest]
     texts = [f"{label} {_text(iou, 100, '.1f')} %" for label, (_, _, iou) in zip(labels, lowest, strict=True)]
     console.print(f"lowest IoU: {', '.join(texts)}", highlight=False, markup=False)

@@ -103,23 +103,23 @@ def synth(
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
     seed: Annotated[int, typer.Option(help="Seed of textures, camera path and noise.", min=0)] = 0,
     path: PathOption = None,
-    speed: Annotated[
-        int, typer.Option(help="How many times as far as usual the camera moves between two frames.", min=1)
-    ] = 1,
+    speed: Annotated[int, typer.Option(help="Factor on the camera's motion between two frames.", min=1)] = 1,
     blur: Annotated[
         float,
         typer.Option(help="Share of the time between two frames for which the shutter is open.", min=0, max=1),
     ] = 0.0,
     rolling: Annotated[
         float,
-        typer.Option(help="The same between the first row of an image that is read and the last.", min=0, max=1),
+        typer.Option(
+            help="Share of the frame time between reading the first and the last row of an image.", min=0, max=1
+        ),
     ] = 0.0,
     depth_delay: Annotated[
-        float, typer.Option(help="The same by which depth is later than colour.", min=-0.4, max=0.4)
+        float, typer.Option(help="Share of the frame time by which depth is later than colour.", min=-0.4, max=0.4)
     ] = 0.0,
     depth_distortion: Annotated[
         float | None,
-        typer.Option(help="Fixed error of the depth camera, steps of disparity; default 0, for the loop 0.3."),
+        typer.Option(help="Fixed error of the depth camera, in steps of disparity; default 0, and 0.3 for the loop."),
     ] = None,
     noise: Annotated[bool, typer.Option("--noise/--no-noise", help="Add depth noise like a Kinect's.")] = True,
     rig: RigOption = None,
@@ -128,7 +128,9 @@ def synth(
     ] = 0.0,
     changes: Annotated[
         int | None,
-        typer.Option(help="Things of the room that differ between two visits; the second one's are in changes.json."),
+        typer.Option(
+            help="Number of things that differ between two visits; the second visit writes them to changes.json."
+        ),
     ] = None,
     visit: Annotated[int, typer.Option(help="Which of the two visits to record.", min=1, max=2)] = 1,
     movers: MoversOption = None,

@@ -30,11 +30,15 @@ history, changes/ what changed. It is an ordinary run, and can be brought up to 
 
 def update(
     old: Annotated[Path, typer.Argument(metavar="OLD", help="Folder of the earlier run, or a .ggz file of it.")],
-    new: Annotated[Path, typer.Argument(metavar="NEW", help="The later run of the same place, likewise.")],
+    new: Annotated[
+        Path, typer.Argument(metavar="NEW", help="Folder of the later run of the same place, or a .ggz file of it.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the updated run.")],
     ids: Annotated[
         IdsName,
-        typer.Option(help="Whether one object id is one thing in both runs; auto: where what stayed has the same ids."),
+        typer.Option(
+            help="Whether an id means the same object in both runs; auto: yes if objects that stayed have the same ids."
+        ),
     ] = IdsName.auto,
     steps: Annotated[
         int,

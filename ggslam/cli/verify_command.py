@@ -21,7 +21,7 @@ EPILOG = """
 
 def verify(
     run: options.RunPath,
-    accept: Annotated[bool, typer.Option("--accept", help="Take the files as they are now: write the manifest anew.")]
+    accept: Annotated[bool, typer.Option("--accept", help="Accept the files as they are now and rewrite the manifest.")]
     = False,
 ) -> None:  # fmt: skip
     """Compare a run's files with its manifest: sizes and SHA-256. Exit code 2 if they are not what the run wrote."""

@@ -35,10 +35,13 @@ def view(
     host: options.Host = "127.0.0.1",
     port: options.Port = 8080,
     page: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="Write one file that opens from disk; serve nothing.")
+        Path | None,
+        typer.Option(
+            "--html", metavar="FILE", help="Write one HTML file that opens from disk instead of serving a page."
+        ),
     ] = None,
     max_splats: Annotated[
-        int, typer.Option(help="Show the most visible Gaussians, at most so many.", min=1000)
+        int, typer.Option(help="Most Gaussians to show; the most visible ones are chosen.", min=1000)
     ] = 400_000,
     sequence: options.MovedSequence = None,
     changes: Annotated[

@@ -49,7 +49,8 @@ Voxel = Annotated[
 ]
 Esdf = Annotated[bool, typer.Option("--esdf", help="Also make a distance field, with a slice and a ROS map.")]
 Occupancy = Annotated[
-    float | None, typer.Option(metavar="VOXEL", help="Also make an occupancy map (.bt, .ot), voxels of so many metres.")
+    float | None,
+    typer.Option(metavar="VOXEL", help="Also make an occupancy map (.bt, .ot) with voxels of this edge, metres."),
 ]
 MinWeight = Annotated[
     float | None,
@@ -66,7 +67,7 @@ Live = Annotated[
 ]
 Realtime = Annotated[float | None, typer.Option(metavar="FPS", help="With --live: deliver frames at this rate.")]
 Onto = Annotated[
-    Path | None, typer.Option(metavar="TSDF", help="Add to this tsdf.npz; decay leaves what is in it alone.")
+    Path | None, typer.Option(metavar="TSDF", help="Add to this tsdf.npz; decay does not change what is in it.")
 ]
 SliceHeight = Annotated[
     float | None,

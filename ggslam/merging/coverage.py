@@ -15,9 +15,14 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.sight.margin import Margin
 from ggslam.sight.view import Sight, View
+from ggslam.system.tuning import Tuning
 
-_SEAM_WIDTH = 160
-"""Pixels of the small pictures that seams are looked for in."""
+
+class CoverageTuning(Tuning):
+    """How seams are looked for."""
+
+    width = 160
+    """Width of the small pictures, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,9 @@ class Coverage:
         """Share of each keyframe's view in which the run's map and another one show the same surface, [K]."""
         shares = []
         for T, whole in zip(run.T_world_camera, run.cameras, strict=True):
-            camera = whole.resize(_SEAM_WIDTH, max(1, round(whole.height * _SEAM_WIDTH / whole.width)))
+            camera = whole.resize(
+                CoverageTuning.width, max(1, round(whole.height * CoverageTuning.width / whole.width))
+            )
             view = View.of(self._show(base, camera, T), camera, T, self._margin, self._context)
             shares.append(float((view.classify_depth(self._show(run.gaussians, camera, T)) == Sight.SAME).mean()))
         return np.array(shares)

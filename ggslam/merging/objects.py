@@ -13,14 +13,20 @@ from ggslam.errors import ConfigError
 from ggslam.mapping.votes import merge_votes
 from ggslam.objects.encoding import code_of, with_class
 from ggslam.objects.same_object import LabelledVoxels, find_counterparts, sizes_of
-from ggslam.objects.settings import SameObjectSettings
+from ggslam.objects.settings import IDS, SameObjectSettings
 from ggslam.objects.table import ObjectTable, Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
+from ggslam.system.tuning import Tuning
 
-_IDS = 1 << 16
-_SMALL = 4
-"""Things that fill fewer than this many times the voxels that two have to share are compared in finer ones, too."""
+
+class SmallObjectTuning(Tuning):
+    """Which objects are compared in finer voxels, too."""
+
+    small = 4
+    """Those that fill fewer voxels than this many times the number that two objects have to share."""
+
+
 _SUREST: tuple[Supervision, ...] = ("geometry", "model", "associated masks", "masks")
 """What taught objects, the least sure first: a merged map's are as sure as the least sure of them."""
 
@@ -140,13 +146,13 @@ class UnitedObjects:
         objects_before = {i for of_run in self.ids for i in of_run.values()}
         self.united += [(new, len(self.ids), old) for old, new in ids.items() if new in objects_before]
         taken = known | set(ids.values()) | (set() if told is None else told.taken)
-        free = iter([i for i in range(1, _IDS) if i not in taken and i not in own])
+        free = iter([i for i in range(1, IDS) if i not in taken and i not in own])
         for i in own:
             if i not in ids:
                 ids[i] = i if i not in taken else next(free, 0)
                 taken.add(ids[i])
         if 0 in ids.values():
-            raise ConfigError(f"the runs have more than {_IDS - 1} objects together")
+            raise ConfigError(f"the runs have more than {IDS - 1} objects together")
         return ids
 
     def _by_source(self, objects: RunObjects) -> dict[int, int] | None:
@@ -162,7 +168,10 @@ class UnitedObjects:
         voxel = self.settings.voxel
         first, second = LabelledVoxels.of_map(base, voxel), LabelledVoxels.of_map(gaussians, voxel)
         found = {pair.second: pair.first for pair in find_counterparts(first, second, self.settings)}
-        small = [np.flatnonzero(sizes_of(voxels) < _SMALL * self.settings.min_shared) for voxels in (first, second)]
+        small = [
+            np.flatnonzero(sizes_of(voxels) < SmallObjectTuning.small * self.settings.min_shared)
+            for voxels in (first, second)
+        ]
         for finer in (voxel / 2, voxel / 4):  # small things fill too few voxels
             maps = [LabelledVoxels.of_map(g, finer, only) for g, only in zip((base, gaussians), small, strict=True)]
             more = {pair.second: pair.first for pair in find_counterparts(maps[0], maps[1], self.settings)}
@@ -191,7 +200,7 @@ class UnitedObjects:
 
     def _relabel(self, base: GaussianMap, gaussians: GaussianMap, objects: RunObjects, ids: Mapping[int, int]) -> None:
         """A run's Gaussians get ids, votes and vectors of the whole."""
-        table = np.zeros(_IDS, np.int32)
+        table = np.zeros(IDS, np.int32)
         table[list(ids)] = list(ids.values())
         alias = torch.from_numpy(table)
         gaussians.object_id[:] = alias[gaussians.object_id.long()]

@@ -17,9 +17,14 @@ from scipy.spatial import cKDTree
 from ggslam.geometry.voxels import neighbour_step, voxel_centres, voxel_keys
 from ggslam.merging.known_run import KnownRun
 from ggslam.scene.poses import transform_points
+from ggslam.system.tuning import Tuning
 
-_NEAREST = 0.1
-"""Metres; points nearer to the camera count as if they were so near."""
+
+class OwnershipTuning(Tuning):
+    """How measured points are weighed."""
+
+    near_m = 0.1
+    """Smallest depth that is counted with, in metres."""
 
 
 class Ownership:
@@ -42,7 +47,7 @@ class Ownership:
             world = [transform_points(points.astype(float), T) for points, T in zip(run.points, own, strict=True)]
             depths = np.concatenate([np.zeros(0), *(points[:, 2].astype(float) for points in run.points)])
             places = np.concatenate([np.zeros((0, 3)), *world])
-            weight = 1 / np.maximum(depths, _NEAREST) ** 2  # pixels a square metre
+            weight = 1 / np.maximum(depths, OwnershipTuning.near_m) ** 2  # pixels a square metre
             keys.append(voxel_keys(places, voxel))
             weights.append(weight if factor is None else weight * factor(number, places))
             owners.append(np.full(len(places), number))

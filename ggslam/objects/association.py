@@ -19,19 +19,28 @@ from ggslam.objects.consistency import ConsistencyJudge
 from ggslam.objects.evidence import PairEvidence, find_touching_pairs
 from ggslam.objects.fragments import Fragment, FragmentMemory
 from ggslam.objects.overlap import MapView, SegmentOverlap, number_ids, overlap_of
-from ggslam.objects.settings import AssociationSettings
+from ggslam.objects.settings import IDS, AssociationSettings
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, ObjectId
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
 __all__ = ["Association", "Associator", "MapView"]
 
 _log = logging.getLogger(__name__)
-_IDS = 1 << 16
-_MIN_SHARED = 5
-_DOMINANT = 0.8
-_CANDIDATE = 0.3
-_SHARE_OF_BIG = 0.2
+
+
+class MatchTuning(Tuning):
+    """When a segment is an object of the map."""
+
+    min_pixels = 5
+    """Fewest pixels that a segment shares with an object."""
+    dominant = 0.8
+    """Share of a segment in one object from which it is mostly that object."""
+    min_within = 0.3
+    """Smallest share of a segment that lies in an object it may belong to."""
+    min_covered = 0.2
+    """Smallest share of that object which the segment covers."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +88,10 @@ class Associator:
         self._evidence = PairEvidence(self._settings)
         self._fragments = FragmentMemory(self._settings)
         self._planes = BoundingPlanes()
-        self._current = np.arange(_IDS).astype(np.uint16)
+        self._current = np.arange(IDS).astype(np.uint16)
         """Id -> id of the object that it is part of by now."""
-        self._used = np.zeros(_IDS, bool)
-        self._blocked = np.zeros(_IDS, bool)
+        self._used = np.zeros(IDS, bool)
+        self._blocked = np.zeros(IDS, bool)
         self._blocked[[0, *reserved]] = True
         self._highest = 0
         self._ran_out = False
@@ -182,7 +191,7 @@ class Associator:
         self._used[new] = True
         self._highest = max([self._highest, *new])
         # Own ids prove that what was merged before the verdict was not one.
-        self._current = np.arange(_IDS).astype(np.uint16)
+        self._current = np.arange(IDS).astype(np.uint16)
         return Association(segments.copy(), [], new)
 
     def _match(
@@ -223,7 +232,9 @@ class Associator:
         """bool [S, O]: objects that a segment has as a whole, or with a large share of both."""
         within, covers, visible = overlap.within, overlap.covers, overlap.shared.sum(0)
         seen = visible >= self._settings.min_visible * overlap.row.size
-        return ((covers >= self._settings.whole) & seen) | ((within >= _CANDIDATE) & (covers >= _SHARE_OF_BIG))
+        return ((covers >= self._settings.whole) & seen) | (
+            (within >= MatchTuning.min_within) & (covers >= MatchTuning.min_covered)
+        )
 
     def _best(self, overlap: SegmentOverlap) -> np.ndarray:
         """int [S]: number of the object a segment belongs to, -1 = none that the map shows."""
@@ -232,12 +243,12 @@ class Associator:
             return best
         s, shared, within, covers = self._settings, overlap.shared, overlap.within, overlap.covers
         # Both shares count: a mug is not its table's although its rim may show the table, nor is the table the mug's.
-        score = np.where(within >= _CANDIDATE, within + covers, within - 2)
+        score = np.where(within >= MatchTuning.min_within, within + covers, within - 2)
         chosen = score.argmax(1)
         rows = np.arange(len(chosen))
         share = shared[rows, chosen] / overlap.area
         continues = (share >= s.min_continuation) & (covers[rows, chosen] >= 0.5) & (within[rows, chosen] >= 0.5)
-        accepted = (shared[rows, chosen] >= _MIN_SHARED) & ((share >= s.min_overlap) | continues)
+        accepted = (shared[rows, chosen] >= MatchTuning.min_pixels) & ((share >= s.min_overlap) | continues)
         best[accepted] = chosen[accepted]
         return best
 
@@ -254,7 +265,7 @@ class Associator:
             column = overlap.column[inside]
             keep = (column >= 0) & covered[k, column]
             label = np.where(keep, overlap.objects[column], image[inside])
-            if overlap.within[k].max() < _DOMINANT and k not in planes:
+            if overlap.within[k].max() < MatchTuning.dominant and k not in planes:
                 label[column < 0] = 0
             image[inside] = label
 

@@ -9,29 +9,46 @@ import numpy as np
 from ggslam.objects.depth_surface import DepthSurface
 from ggslam.objects.regions import Borders
 from ggslam.objects.settings import GeometricSettings
+from ggslam.system.tuning import Tuning
 
-_CONVEX_CLOSED = 0.6
-_CONVEX_BENT = 0.25
-_HOLLOW = 0.3
-_EVEN, _PAINTED, _ENCLOSED = 0.25, 1.5, 0.7
-_GROUND, _ON_GROUND = 0.04, 0.05
-"""A plane that things lie on: share of the image at least; they: share of the plane at most."""
-_RAISED = 1.5
-"""How far off the plane they are, in tolerances of planes, at least."""
+
+class BorderTuning(Tuning):
+    """What the border of two regions means."""
+
+    convex_closed = 0.6
+    """Smallest share of a convex border that has no gap."""
+    convex_bent = 0.25
+    """Largest share of it that is concave."""
+    hollow_share = 0.3
+    """Share of the shorter outline from which a border is long."""
+    even_bent = 0.25
+    """Largest share of an even border that is bent."""
+    painted_contrast = 1.5
+    """Contrast across a painted border, as a multiple of the contrast that tells objects apart."""
+    enclosed_share = 0.7
+    """Share of the shorter outline from which a region is enclosed."""
+    min_ground = 0.04
+    """Smallest share of the image of a plane that things lie on."""
+    max_on_ground = 0.05
+    """Largest share of that plane which a thing covers."""
+    min_height = 1.5
+    """Smallest median height of a thing above the plane, in tolerances of the plane."""
 
 
 def is_convex(borders: Borders) -> np.ndarray:
     """bool [n]: borders mostly without a gap and hardly anywhere concave."""
-    closed = borders.closed >= _CONVEX_CLOSED * borders.length
+    closed = borders.closed >= BorderTuning.convex_closed * borders.length
     judged = (borders.judged >= 3) & (borders.judged >= 0.3 * borders.length)
-    return closed & judged & (borders.concave <= _CONVEX_BENT * borders.judged)
+    return closed & judged & (borders.concave <= BorderTuning.convex_bent * borders.judged)
 
 
 def is_painted(borders: Borders, color_contrast: float) -> np.ndarray:
     """bool [n]: borders that are no edge, at which the colour changes: smooth, but not for being one body. A curtain
     hangs before a window, by less than the noise of its depth. A picture in its frame is one thing."""
-    even = (borders.bent <= _EVEN * borders.judged) & (borders.length < _ENCLOSED * _shorter_outline(borders))
-    return even & (borders.contrast >= _PAINTED * color_contrast) & (color_contrast > 0)
+    even = (borders.bent <= BorderTuning.even_bent * borders.judged) & (
+        borders.length < BorderTuning.enclosed_share * _shorter_outline(borders)
+    )
+    return even & (borders.contrast >= BorderTuning.painted_contrast * color_contrast) & (color_contrast > 0)
 
 
 def lies_on(
@@ -43,8 +60,14 @@ def lies_on(
         return np.zeros(len(borders.length), bool)
     area = np.bincount(regions.ravel(), minlength=int(borders.pairs.max(initial=0)) + 1)
     first, second = borders.pairs.T
-    asked = (first <= len(planes)) & (second > len(planes)) & (borders.contrast >= _PAINTED * settings.color_contrast)
-    asked &= (area[first] >= _GROUND * regions.size) & (area[second] < _ON_GROUND * area[first])
+    asked = (
+        (first <= len(planes))
+        & (second > len(planes))
+        & (borders.contrast >= BorderTuning.painted_contrast * settings.color_contrast)
+    )
+    asked &= (area[first] >= BorderTuning.min_ground * regions.size) & (
+        area[second] < BorderTuning.max_on_ground * area[first]
+    )
     asked &= borders.length >= 0.5 * _shorter_outline(borders)
     wanted = np.zeros(len(area), bool)
     wanted[second[asked]] = True
@@ -54,14 +77,14 @@ def lies_on(
     for k in np.flatnonzero(asked):
         own = number == second[k]
         off = np.abs(points[own] @ planes[first[k] - 1] - 1) / points[own, 2]
-        asked[k] = np.median(off / tolerance[own]) > _RAISED
+        asked[k] = np.median(off / tolerance[own]) > BorderTuning.min_height
     return asked
 
 
 def is_hollow(borders: Borders, planes: int) -> np.ndarray:
     """bool [n]: borders between two things, none of them a plane, that make up much of the outline of one: perhaps the
     inside and the outside of a bowl."""
-    return (borders.pairs[:, 0] > planes) & (borders.length >= _HOLLOW * _shorter_outline(borders))
+    return (borders.pairs[:, 0] > planes) & (borders.length >= BorderTuning.hollow_share * _shorter_outline(borders))
 
 
 def _shorter_outline(borders: Borders) -> np.ndarray:

@@ -16,16 +16,28 @@ from ggslam.objects.overlap import SegmentOverlap
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ObjectId, Vector3
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-_STRIDE = 4
-_LEAST = 0.02
-"""Share of the image that a segment has at least."""
-_ON, _FLAT = 0.9, 0.03
-"""Share of a segment's points that lie within so many metres, plus as much of their depth / 3, of its plane."""
-_BEHIND, _BEYOND = 0.01, 0.08
-"""Share of all points that may lie farther behind the plane than so many metres."""
-_SAME_DIRECTION, _SAME_PLACE = 0.995, 0.04
-"""Cosine of the angle, and metres, between planes that are one."""
+
+class BoundingPlaneTuning(Tuning):
+    """When a segment is a floor or wall."""
+
+    stride = 4
+    """Every n-th pixel along each axis is used."""
+    min_area = 0.02
+    """Smallest share of the image."""
+    min_on_plane = 0.9
+    """Smallest share of its points on its plane."""
+    flat_m = 0.03
+    """Largest distance of these from it, in metres up to 3 m of depth; it grows in proportion beyond."""
+    max_behind = 0.01
+    """Largest share of all points behind the plane."""
+    behind_m = 0.08
+    """Distance from which they are behind it, in metres up to 2 m of depth; it grows in proportion beyond."""
+    same_direction = 0.995
+    """Smallest cosine between the normals of one plane in two views."""
+    same_place_m = 0.04
+    """Largest distance between them, in metres."""
 
 
 @savable()
@@ -52,20 +64,23 @@ class BoundingPlanes:
     ) -> dict[int, BoundingPlane]:
         """The planes of those segments of a keyframe that bound the room, by number of the segment. Of several on one
         plane only the largest: the others are pictures on the wall or rugs on the floor."""
-        z = depth[::_STRIDE, ::_STRIDE].ravel()
+        z = depth[::BoundingPlaneTuning.stride, ::BoundingPlaneTuning.stride].ravel()
         seen = np.flatnonzero(z > 0)
-        rays = camera.rays()[::_STRIDE, ::_STRIDE].reshape(-1, 3)
+        rays = camera.rays()[::BoundingPlaneTuning.stride, ::BoundingPlaneTuning.stride].reshape(-1, 3)
         points = rays[seen].astype(np.float64) * z[seen][:, None]
-        row = overlap.row[::_STRIDE, ::_STRIDE].ravel()[seen]
+        row = overlap.row[::BoundingPlaneTuning.stride, ::BoundingPlaneTuning.stride].ravel()[seen]
         found: dict[int, BoundingPlane] = {}
         order = np.argsort(-overlap.area, kind="stable")
-        for k in order[overlap.area[order] >= _LEAST * overlap.row.size].tolist():
+        for k in order[overlap.area[order] >= BoundingPlaneTuning.min_area * overlap.row.size].tolist():
             own = points[row == k]
             plane = _fit(own) if len(own) >= 10 else None
             if plane is None:
                 continue
             normal, offset = plane
-            if np.mean(points @ normal - offset < -_BEYOND * np.maximum(1, points[:, 2] / 2)) < _BEHIND:
+            if (
+                np.mean(points @ normal - offset < -BoundingPlaneTuning.behind_m * np.maximum(1, points[:, 2] / 2))
+                < BoundingPlaneTuning.max_behind
+            ):
                 world = T_world_camera[:3, :3] @ normal
                 middle = T_world_camera[:3, :3] @ own.mean(0) + T_world_camera[:3, 3]
                 bounding = BoundingPlane(world, float(offset + world @ T_world_camera[:3, 3]), middle)
@@ -100,7 +115,10 @@ def _are_one(plane: BoundingPlane, other: BoundingPlane) -> bool:
     # Compared where either was seen: far from there, directions that are a little wrong say nothing.
     there = abs(plane.normal @ other.middle - plane.offset)
     here = abs(other.normal @ plane.middle - other.offset)
-    return bool(plane.normal @ other.normal > _SAME_DIRECTION and max(here, there) < _SAME_PLACE)
+    return bool(
+        plane.normal @ other.normal > BoundingPlaneTuning.same_direction
+        and max(here, there) < BoundingPlaneTuning.same_place_m
+    )
 
 
 def _fit(points: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -113,7 +131,7 @@ def _fit(points: np.ndarray) -> tuple[np.ndarray, float] | None:
         normal = np.linalg.eigh(np.cov((points[near] - centre).T))[1][:, 0]
         away = np.abs((points - centre) @ normal)
         near = away <= max(float(np.median(away)) * 3, 1e-3)
-    if np.mean(away < _FLAT * np.maximum(1, points[:, 2] / 3)) < _ON:
+    if np.mean(away < BoundingPlaneTuning.flat_m * np.maximum(1, points[:, 2] / 3)) < BoundingPlaneTuning.min_on_plane:
         return None
     if normal @ centre > 0:
         normal = -normal

@@ -7,19 +7,25 @@ import numpy as np
 from scipy.linalg import svd
 
 from ggslam.scene.oriented_box import OrientedBox, Vector
+from ggslam.system.tuning import Tuning
 
-TRIMMED = 0.01
-"""Share of the points, the farthest from the middle, that a box need not hold: floaters would inflate it."""
+
+class BoxTuning(Tuning):
+    """Which points a box holds."""
+
+    trimmed = 0.01
+    """Share of the points, the farthest from the middle, that a box need not hold: floaters would inflate it."""
 
 
 def middle_of(points: np.ndarray, weights: np.ndarray) -> Vector:
-    """Weighted mean of points [M, 3] without the farthest (`TRIMMED`)."""
+    """Weighted mean of points [M, 3] without the farthest (`BoxTuning.trimmed`)."""
     kept = _inlier_mask(points)
     return _vector(np.average(points[kept].astype(np.float64), axis=0, weights=weights[kept].astype(np.float64)))
 
 
 def oriented_box(points: np.ndarray) -> OrientedBox:
-    """Box along the principal axes of points [M, 3], M >= 1, without the farthest (`TRIMMED`). Fewer than three points
+    """Box along the principal axes of points [M, 3], M >= 1, without the farthest (`BoxTuning.trimmed`). Fewer than
+    three points
     leave axes undetermined: these are chosen along the coordinates."""
     inner = points[_inlier_mask(points)].astype(np.float64)
     axes = np.eye(3)
@@ -37,9 +43,9 @@ def oriented_box(points: np.ndarray) -> OrientedBox:
 
 
 def _inlier_mask(points: np.ndarray) -> np.ndarray:
-    """bool [M]: all but the share `TRIMMED` of points that are farthest from the median."""
+    """bool [M]: all but the share `BoxTuning.trimmed` of points that are farthest from the median."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    return distance <= np.quantile(distance, 1 - TRIMMED, method="higher")
+    return distance <= np.quantile(distance, 1 - BoxTuning.trimmed, method="higher")
 
 
 def _vector(values: np.ndarray) -> Vector:

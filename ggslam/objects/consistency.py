@@ -9,10 +9,20 @@ from scipy.optimize import linear_sum_assignment
 from ggslam.objects.overlap import SegmentOverlap
 from ggslam.system.array_forms import IdImage
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-_MIN_PIXELS = 20
-_MIN_CHANGE = 0.02
-_AGREE, _DISAGREE = 0.9, 0.6
+
+class ConsistencyTuning(Tuning):
+    """When the ids of masks mean the same in all frames."""
+
+    min_pixels = 20
+    """Fewest pixels of a segment that counts."""
+    min_change = 0.02
+    """Smallest share of pixels whose label changes; less proves nothing."""
+    agree = 0.9
+    """Agreement from which ids are consistent."""
+    disagree = 0.6
+    """Agreement below which they are not."""
 
 
 @savable()
@@ -57,22 +67,22 @@ class ConsistencyJudge:
         previous, self._previous = self._previous, segments
         if previous is None or previous.shape != segments.shape:
             return True
-        return float((previous != segments).mean()) >= _MIN_CHANGE
+        return float((previous != segments).mean()) >= ConsistencyTuning.min_change
 
     def _settle(self) -> None:
         recent = self._agreement
-        if len(recent) >= 2 and min(recent[-2:]) >= _AGREE:
+        if len(recent) >= 2 and min(recent[-2:]) >= ConsistencyTuning.agree:
             self.consistent = True
-        elif len(recent) >= 2 and max(recent[-2:]) < _DISAGREE:
+        elif len(recent) >= 2 and max(recent[-2:]) < ConsistencyTuning.disagree:
             self.consistent = False
         elif len(recent) >= 3 and self.consistent is None:
-            self.consistent = sum(recent) / len(recent) >= (_AGREE + _DISAGREE) / 2
+            self.consistent = sum(recent) / len(recent) >= (ConsistencyTuning.agree + ConsistencyTuning.disagree) / 2
 
 
 def agreement_of(overlap: SegmentOverlap) -> float | None:
     """How well ids agree with the map's, 0 to 1 = as well as their best renaming; None: nothing to compare."""
     shared = overlap.shared
-    seen = shared.sum(1) >= _MIN_PIXELS
+    seen = shared.sum(1) >= ConsistencyTuning.min_pixels
     if not seen.any():
         return None
     equal = overlap.segments[:, None] == overlap.objects[None, :]

@@ -16,13 +16,18 @@ import numpy as np
 from ggslam.abi import core
 from ggslam.abi.arrays import address
 from ggslam.native.loader import load_library
+from ggslam.objects.settings import REFERENCE_WIDTH
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-_REFERENCE_WIDTH = 320
-_LEAST_NOISE = 2e-4
-"""1/m: an inverse depth known better than this gains nothing."""
-_MOST_NOISE = 5e-3
-"""1/m: what looks noisier (2 cm at 2 m) is clutter."""
+
+class DepthNoiseTuning(Tuning):
+    """Bounds of the measured noise of inverse depth."""
+
+    min_noise = 2e-4
+    """Smallest noise, in 1/m: better depth gains nothing."""
+    max_noise = 5e-3
+    """Largest noise, in 1/m: what looks noisier (2 cm at 2 m) is clutter."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +57,12 @@ def surface_of(depth: np.ndarray, camera: Camera, max_depth: float) -> DepthSurf
     """Prepares a depth image [H, W] (metres, 0 = unknown)."""
     depth = np.asarray(depth, np.float32)
     measured = (depth > 0) & (depth <= max_depth)
-    bridged = _bridge(np.where(measured, depth, np.float32(0)), max(1, round(camera.width / _REFERENCE_WIDTH)))
+    bridged = _bridge(np.where(measured, depth, np.float32(0)), max(1, round(camera.width / REFERENCE_WIDTH)))
     valid = bridged > 0
     inverse: np.ndarray = 1 / np.where(valid, bridged, np.float32(1e3))
     sigma = _noise(inverse, valid)
-    scale = camera.width / _REFERENCE_WIDTH
-    noisy = sigma > 3 * _LEAST_NOISE
+    scale = camera.width / REFERENCE_WIDTH
+    noisy = sigma > 3 * DepthNoiseTuning.min_noise
     if noisy:
         diameter = 2 * max(1, round(2 * scale)) + 1
         inverse = np.asarray(cv2.bilateralFilter(inverse, diameter, 4 * sigma, diameter / 2))
@@ -99,6 +104,6 @@ def _noise(inverse: np.ndarray, valid: np.ndarray) -> float:
     inner = cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8))[::2, ::2] > 0
     away = np.abs(inverse - cv2.blur(inverse, (3, 3)))[::2, ::2][inner]
     if len(away) < 100:
-        return _LEAST_NOISE
+        return DepthNoiseTuning.min_noise
     # 70 % of a normal distribution lie within 1.04 standard deviations; a median would miss quantised depth.
-    return min(max(float(np.quantile(away, 0.7)) / 1.04 * 1.06, _LEAST_NOISE), _MOST_NOISE)
+    return min(max(float(np.quantile(away, 0.7)) / 1.04 * 1.06, DepthNoiseTuning.min_noise), DepthNoiseTuning.max_noise)

@@ -13,9 +13,14 @@ from ggslam.objects.editing import Change
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 
-_AT_HOME_M = 1e-3
-"""An object no point of which is farther from its recorded place than this is back there."""
+
+class DisplacementTuning(Tuning):
+    """When an object is back in its place."""
+
+    max_distance_m = 1e-3
+    """Largest distance of its points from where they were recorded, in metres."""
 
 
 class Displacement:
@@ -81,7 +86,7 @@ class Displacement:
         points = scene.gaussians.means.numpy()[scene.gaussians.object_id.numpy() == object_id]
         home = inverse(total)
         apart = np.linalg.norm(points @ home[:3, :3].T + home[:3, 3] - points, axis=1)
-        if (apart < _AT_HOME_M).all():
+        if (apart < DisplacementTuning.max_distance_m).all():
             self.motions.pop(object_id, None)
             self._left = [(i, gaussians) for i, gaussians in self._left if i != object_id]
         else:

@@ -30,13 +30,19 @@ from ggslam.objects.segmented_rows import (
 from ggslam.objects.table import ObjectTable, Observation
 from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.system.tuning import Tuning
 
 Vector = Sequence[float]
-FARTHEST_M = 1000.0
-"""Objects are not moved farther from the origin than this: clouds sampled from a map count cells in 21 bits."""
 
-MAX_NAME = 200
-"""Characters of the name of an object."""
+
+class EditingTuning(Tuning):
+    """Limits of edits."""
+
+    max_distance_m = 1000.0
+    """Largest distance of a moved object from the origin, in metres: clouds sampled from a map count cells in 21 bits.
+    """
+    max_name_length = 200
+    """Most characters of an object's name."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,7 @@ def move_objects(
             shift. Floaters far from the objects stay where they are and lose their label.
 
     Raises:
-        ConfigError: unknown ids, or farther than `FARTHEST_M`.
+        ConfigError: unknown ids, or farther than `EditingTuning.max_distance_m`.
     """
     what = _labels(scene, ids)
     _check_near(scene, "move", ids, shift)
@@ -127,7 +133,7 @@ def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector | N
         shift: metres along the world's axes; None: to the right by a little more than the widest of them measures.
 
     Raises:
-        ConfigError: unknown ids, or farther than `FARTHEST_M`, or no id is left.
+        ConfigError: unknown ids, or farther than `EditingTuning.max_distance_m`, or no id is left.
     """
     what = _labels(scene, ids)
     if shift is None:
@@ -202,8 +208,8 @@ def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:
         ConfigError: unknown id; or a name that would be taken for an id or a list, or is "all", empty or another's.
     """
     what, name = _labels(scene, [object_id]), name.strip()
-    if len(name) > MAX_NAME:
-        raise ConfigError(f"name {name[:20]!r}...: {len(name)} characters, at most {MAX_NAME}")
+    if len(name) > EditingTuning.max_name_length:
+        raise ConfigError(f"name {name[:20]!r}...: {len(name)} characters, at most {EditingTuning.max_name_length}")
     if not name or name.isdecimal() or "," in name or name.casefold() == "all" or not name.isprintable():
         raise ConfigError(f"name {name!r}: expected a printable word that is no number, without commas, and not 'all'")
     taken = [i for i, other in _names(scene.table).items() if other.casefold() == name.casefold() and i != object_id]
@@ -236,9 +242,10 @@ def _labels(scene: SegmentedMap, ids: Sequence[int]) -> str:
 def _check_near(scene: SegmentedMap, kind: str, ids: Sequence[int], shift: Vector) -> None:
     for record in map(scene.table.record, ids):
         place = np.add(record.centroid, shift)
-        if not np.abs(place).max() <= FARTHEST_M:
+        if not np.abs(place).max() <= EditingTuning.max_distance_m:
             raise ConfigError(
-                f"--{kind} {record.label()} by {_numbers(shift)} m: it would be farther than {FARTHEST_M:g} m away, "
+                f"--{kind} {record.label()} by {_numbers(shift)} m: it would be farther than "
+                f"{EditingTuning.max_distance_m:g} m away, "
                 "and Gaussians are in single precision; large offsets belong to the program that shows the map"
             )
 

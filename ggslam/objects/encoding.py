@@ -12,15 +12,21 @@ import torch
 from scipy.optimize import minimize
 
 from ggslam.errors import ConfigError
+from ggslam.objects.settings import ClassifierTuning
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.system.tuning import Tuning
 
-CERTAIN = 0.9
-"""Probability from which an identity vector is an example of its object."""
-_CANDIDATES = 512
-_MARGIN = 4.0
-"""A new class stays this much (in logits) behind the best class of the Gaussians that are there already."""
-_VALUES_AT_ONCE = 1 << 22
+
+class EncodingTuning(Tuning):
+    """How an identity vector for an object is found."""
+
+    certain = 0.9
+    """Probability from which a vector is an example of its object."""
+    directions = 512
+    """Directions that are tried for a new class."""
+    margin = 4.0
+    """Logits by which a new class stays behind the best class of the Gaussians that are there."""
 
 
 def with_class(classifier: IdentityClassifier, object_id: int, features: np.ndarray) -> IdentityClassifier:
@@ -40,17 +46,19 @@ def with_class(classifier: IdentityClassifier, object_id: int, features: np.ndar
     if not 1 <= object_id <= 65535 or object_id in classifier.class_ids:
         raise ConfigError(f"object id {object_id}: expected a free one from 1 to 65535")
     channels = classifier.weight.shape[1]
-    directions = np.random.default_rng(object_id).normal(size=(_CANDIDATES, channels)).astype(np.float32)
+    directions = np.random.default_rng(object_id).normal(size=(EncodingTuning.directions, channels)).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     lengths = np.linalg.norm(classifier.weight, axis=1)
     weight, bias = directions[0], np.float32(0)
     if len(classifier):
         others = classifier.weight / np.maximum(lengths[:, None], 1e-9)
         weight = directions[(directions @ others.T).max(1).argmin()] * max(float(np.median(lengths)), 1e-3)
-        step = max(1, _VALUES_AT_ONCE // len(classifier))
+        step = max(1, ClassifierTuning.values_at_once // len(classifier))
         parts = [features[start : start + step] for start in range(0, len(features), step)]
         leads = [classifier.logits(part).max(1) - part @ weight for part in parts]
-        bias = np.float32((np.quantile(np.concatenate(leads), 1e-3) if parts else classifier.bias.max()) - _MARGIN)
+        bias = np.float32(
+            (np.quantile(np.concatenate(leads), 1e-3) if parts else classifier.bias.max()) - EncodingTuning.margin
+        )
     return IdentityClassifier(
         np.append(classifier.class_ids, np.uint16(object_id)),
         np.concatenate([classifier.weight, weight[None]]), np.append(classifier.bias, bias),
@@ -65,10 +73,10 @@ def code_of(gaussians: GaussianMap, classifier: IdentityClassifier, object_id: i
     """
     number = classifier.class_of(object_id)
     own = gaussians.features.numpy()[gaussians.object_id.numpy() == object_id]
-    certain = classifier.probabilities(own)[:, number] >= CERTAIN
+    certain = classifier.probabilities(own)[:, number] >= EncodingTuning.certain
     if certain.any():
         mean = own[certain].mean(0)
-        if classifier.probabilities(mean)[number] >= CERTAIN:
+        if classifier.probabilities(mean)[number] >= EncodingTuning.certain:
             return mean
     return _computed_code(classifier, number)
 

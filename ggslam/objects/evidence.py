@@ -12,9 +12,16 @@ from ggslam.objects.overlap import SegmentOverlap
 from ggslam.objects.settings import AssociationSettings
 from ggslam.system.array_forms import ObjectId
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-_MIN_WEIGHT = 0.05
-_FULLY_VISIBLE = 0.5
+
+class EvidenceTuning(Tuning):
+    """What a keyframe says of two objects."""
+
+    min_weight = 0.05
+    """Smallest weight of an object that is seen."""
+    full_share = 0.5
+    """Share of an object's largest view from which a view counts fully."""
 
 
 @savable()
@@ -65,7 +72,7 @@ class PairEvidence:
         weight = self._weights(overlap.objects, visible, overlap.row.size)
         covers = overlap.covers
         home = covers.argmax(0)
-        whole = (covers.max(0) >= self._settings.whole) & (weight >= _MIN_WEIGHT)
+        whole = (covers.max(0) >= self._settings.whole) & (weight >= EvidenceTuning.min_weight)
         found = {int(overlap.objects[k]): (int(home[k]), float(weight[k])) for k in np.flatnonzero(whole)}
         for segment in np.unique(home[whole]):
             inside = overlap.objects[whole & (home == segment)].tolist()
@@ -84,7 +91,7 @@ class PairEvidence:
         for i, n in zip(ids.tolist(), visible.tolist(), strict=True):
             self._largest[i] = max(self._largest.get(i, 0), n)
         largest = np.array([self._largest[i] for i in ids.tolist()], float)
-        weight = np.minimum(1.0, visible / np.maximum(_FULLY_VISIBLE * largest, 1))
+        weight = np.minimum(1.0, visible / np.maximum(EvidenceTuning.full_share * largest, 1))
         return np.where(visible >= self._settings.min_visible * pixels, weight, 0.0)
 
     def take_over(self, whole: int, part: int, together: int, apart: int) -> None:

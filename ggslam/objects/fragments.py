@@ -19,11 +19,20 @@ from ggslam.objects.settings import AssociationSettings
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ObjectId, Vector3
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-_INSIDE = 0.6
-_MINOR = 0.5
-_NEAR = 0.5
-_SIZE_RATIO = 1.6
+
+class FragmentTuning(Tuning):
+    """When a part may be an object of its own."""
+
+    min_inside = 0.6
+    """Smallest share of its segment inside the parent."""
+    max_of_parent = 0.5
+    """Largest share of the parent that it covers."""
+    max_distance = 0.5
+    """Largest distance between two sightings of one part, in radii of the smaller."""
+    max_size_ratio = 1.6
+    """Largest ratio of their radii."""
 
 
 @savable()
@@ -49,8 +58,8 @@ class Fragment:
     def is_like(self, other: Fragment) -> bool:
         """Whether both are the same part of the same object."""
         larger, smaller = max(self.radius, other.radius), min(self.radius, other.radius)
-        near = math.dist(self.centre, other.centre) < _NEAR * smaller
-        return self.parent == other.parent and near and larger < _SIZE_RATIO * smaller
+        near = math.dist(self.centre, other.centre) < FragmentTuning.max_distance * smaller
+        return self.parent == other.parent and near and larger < FragmentTuning.max_size_ratio * smaller
 
 
 @savable()
@@ -131,7 +140,9 @@ class FragmentMemory:
         large = overlap.shared[rows, best[rows]] >= self._settings.min_visible * overlap.row.size
         largest = overlap.shared.max(0, initial=0)[best[rows]]
         minor = overlap.shared[rows, best[rows]] < largest
-        return rows[minor & large & (within >= _INSIDE) & (covers < _MINOR)].tolist()
+        return rows[
+            minor & large & (within >= FragmentTuning.min_inside) & (covers < FragmentTuning.max_of_parent)
+        ].tolist()
 
     def _note_absent(
         self, seen: list[Fragment], minor: list[int], overlap: SegmentOverlap, best: np.ndarray, depth: np.ndarray,

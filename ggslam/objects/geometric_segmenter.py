@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from ggslam.objects.border_kinds import is_convex, is_hollow, is_painted, lies_on
+from ggslam.objects.concave_parts import join_insides, join_panes
 from ggslam.objects.depth_surface import DepthSurface, surface_of
-from ggslam.objects.hollows import join_insides, join_panes
 from ggslam.objects.overhangs import join_overhangs
 from ggslam.objects.pixel_passes import connected_pieces, grow_regions, link_surfaces, share_near_planes
 from ggslam.objects.plane_colors import colors_to_compare, find_flat_things
@@ -23,13 +23,26 @@ from ggslam.objects.planes import find_planes
 from ggslam.objects.regions import Borders, Groups, find_borders
 from ggslam.objects.settings import GeometricSettings
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-_FLAKE = 6
-_FLAKE_CLOSED = 0.6
-_GROWTH = 4
-_FLAT_BORDER = 12
-_FLAT_SHARE = 0.9
-_ALIKE = 0.75
+
+class SegmentTuning(Tuning):
+    """How regions become segments."""
+
+    flake_area = 6
+    """Regions below this multiple of the smallest area are flakes."""
+    flake_closed = 0.6
+    """Share of a flake's outline without a gap from which it joins its neighbour."""
+    growth = 4
+    """Pixels that regions grow by, for images 320 wide."""
+    min_flat_border = 12
+    """Fewest pixels of border between a plane and a flat region on it."""
+    min_flat = 0.9
+    """Smallest share of a flat region near its plane."""
+    alike_contrast = 0.75
+    """Contrast below which regions look alike, as a share of the contrast that tells objects apart."""
+
+
 _SQUARE = np.ones((3, 3), np.uint8)
 
 
@@ -75,7 +88,7 @@ class GeometricSegmenter:
         number = np.zeros(len(area), np.int32)
         number[kept] = int(plane_of.max()) + 1 + np.arange(len(kept))
         regions = np.where(rest, number[pieces], plane_of)
-        return grow_regions(regions, surface.valid, closed, _GROWTH * surface.step)
+        return grow_regions(regions, surface.valid, closed, SegmentTuning.growth * surface.step)
 
     def _join_regions(
         self, regions: np.ndarray, plane_of: np.ndarray, planes: np.ndarray, surface: DepthSurface, color: np.ndarray
@@ -86,7 +99,7 @@ class GeometricSegmenter:
         borders = find_borders(regions, surface, plane_of, planes, colors_to_compare(color), surface.step + 1, settings)
         groups = Groups(int(regions.max()) + 1)
         convex, lies = is_convex(borders), lies_on(borders, regions, planes, surface, settings)
-        alike = ~convex & (borders.contrast < _ALIKE * settings.color_contrast)
+        alike = ~convex & (borders.contrast < SegmentTuning.alike_contrast * settings.color_contrast)
         parts = is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
         bodies = convex & ~is_painted(borders, settings.color_contrast) & ~lies
         for k in np.flatnonzero(bodies | (alike & parts)):
@@ -103,10 +116,14 @@ class GeometricSegmenter:
     ) -> np.ndarray:
         """bool [n]: those of the borders `asked` that part a plane and something that lies flat on it."""
         first, second = borders.pairs.T
-        asked = asked & (first <= len(planes)) & (second > len(planes)) & (borders.length >= _FLAT_BORDER)
+        asked = (
+            asked & (first <= len(planes)) & (second > len(planes)) & (borders.length >= SegmentTuning.min_flat_border)
+        )
         flat, places = np.zeros(len(asked), bool), np.flatnonzero(asked & (borders.closed >= 0.5 * borders.length))
         questions = [(int(second[k]), planes[first[k] - 1]) for k in places]
-        flat[places] = share_near_planes(surface.points, regions, questions, self._settings.flat_m) >= _FLAT_SHARE
+        flat[places] = (
+            share_near_planes(surface.points, regions, questions, self._settings.flat_m) >= SegmentTuning.min_flat
+        )
         return flat
 
 
@@ -131,8 +148,8 @@ def _without_flakes(
                 best[flake] = (closed - concave, other)
     for flake in sorted(best, key=lambda k: area[k]):
         joined, other = best[flake]
-        small = flake > planes and area[flake] < _FLAKE * min_area * regions.size
-        if small and joined >= _FLAKE_CLOSED * rim[flake]:
+        small = flake > planes and area[flake] < SegmentTuning.flake_area * min_area * regions.size
+        if small and joined >= SegmentTuning.flake_closed * rim[flake]:
             groups.join(flake, other)
     return groups.roots().astype(np.int32)[regions]
 

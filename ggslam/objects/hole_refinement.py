@@ -14,13 +14,19 @@ from ggslam.objects.hole_views import HoleView
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gradients
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-_RATES = {"sh": 1e-2, "opacity_logits": 5e-2, "log_scales": 1e-2}
-"""Adam's step sizes. Places stay: beside the object nothing is seen of most new Gaussians that would hold them."""
-_DEPTH_WEIGHT = 0.5
-_FEW_PIXELS = 0.5
-"""Adam's epsilon: steps of Gaussians whose gradient is less than that of so many pixels' errors become small. Otherwise
-those that show by a hair beside the object would move as far as the others."""
+
+class HoleTrainingTuning(Tuning):
+    """How new Gaussians in a hole are trained."""
+
+    rates = {"sh": 1e-2, "opacity_logits": 5e-2, "log_scales": 1e-2}
+    """Adam's step sizes. Positions stay fixed: little is seen of most new Gaussians that would hold them."""
+    depth_weight = 0.5
+    """Weight of the depth error."""
+    adam_epsilon = 0.5
+    """Adam's epsilon: Gaussians with gradients of less than half a pixel's error move less. Without it, those that
+    hardly show move as far as the others."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +51,16 @@ def refine(
     """
     known = [view for view in views if view.view.frame is not None]
     targets = [_Target.of(view, recorded(view.view.frame)) for view in known if view.view.frame is not None]
-    new = {name: _trained_values(gaussians, name)[first:] for name in _RATES}
+    new = {name: _trained_values(gaussians, name)[first:] for name in HoleTrainingTuning.rates}
     parameters = {name: values.clone().requires_grad_() for name, values in new.items()}
-    groups = [{"params": [parameters[name]], "lr": rate} for name, rate in _RATES.items()]
-    optimizer = torch.optim.Adam(groups, eps=_FEW_PIXELS)
+    groups = [{"params": [parameters[name]], "lr": rate} for name, rate in HoleTrainingTuning.rates.items()]
+    optimizer = torch.optim.Adam(groups, eps=HoleTrainingTuning.adam_epsilon)
     rasterizer = CpuRasterizer()
     for i in range(iterations if targets else 0):
         target = targets[i % len(targets)]
         view = rasterizer.forward(gaussians, target.view.view.camera, target.view.view.T_camera_world, features=False)
         d_color = torch.sign(view.image - target.color) * target.free
-        d_depth = _DEPTH_WEIGHT * torch.sign(view.depth - target.depth) * target.measured
+        d_depth = HoleTrainingTuning.depth_weight * torch.sign(view.depth - target.depth) * target.measured
         gradients = rasterizer.backward(d_color, d_depth)
         for name, values in parameters.items():
             values.grad = _trained_values(gradients, name)[first:]

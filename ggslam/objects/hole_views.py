@@ -16,11 +16,18 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.sight.margin import Margin
 from ggslam.sight.view import Sight, View
+from ggslam.system.tuning import Tuning
 
-COVERED = 0.3
-"""Share of a pixel's colour from which the object is said to cover it."""
-SOLID = 0.8
-"""Alpha from which a pixel is said to show a surface; the rest of it would be black."""
+
+class HoleViewTuning(Tuning):
+    """What a pixel shows beside a hole."""
+
+    covered = 0.3
+    """Share of a pixel's colour from which the object covers it."""
+    solid = 0.8
+    """Alpha from which a pixel shows a surface."""
+
+
 RENDERED = Margin()
 """How far depths of one surface may differ between a map's renders."""
 
@@ -123,7 +130,11 @@ def find_facing_views(gaussians: Gaussians, views: Sequence[CameraView], most: i
 
 def _hole_view(kept: Gaussians, both: GaussianTensors, view: CameraView, rasterizer: CpuRasterizer) -> HoleView:
     out = rasterizer.forward(both, view.camera, view.T_camera_world)
-    covered = out.features[0].numpy() > COVERED if out.features is not None else np.zeros(out.depth.shape, bool)
+    covered = (
+        out.features[0].numpy() > HoleViewTuning.covered
+        if out.features is not None
+        else np.zeros(out.depth.shape, bool)
+    )
     before = solid_depth(out.alpha, out.expected_depth)
     out = rasterizer.forward(kept, view.camera, view.T_camera_world, features=False)
     return HoleView(view, covered, before, solid_depth(out.alpha, out.expected_depth), _picture(out.image))
@@ -136,7 +147,7 @@ def _picture(image: torch.Tensor) -> np.ndarray:
 
 def solid_depth(alpha: torch.Tensor, depth: torch.Tensor) -> np.ndarray:
     """Depth [H, W] where a surface is shown, else 0; the caller's own."""
-    return np.where(alpha.numpy() > SOLID, depth.numpy(), 0).astype(np.float32)
+    return np.where(alpha.numpy() > HoleViewTuning.solid, depth.numpy(), 0).astype(np.float32)
 
 
 def pick_views(views: Sequence[CameraView], most: int) -> list[CameraView]:

@@ -21,11 +21,11 @@ from scipy.spatial import cKDTree
 from ggslam.objects.hole_refinement import Recorded, refine
 from ggslam.objects.hole_views import CameraView, HoleView, look, look_again
 from ggslam.objects.plane_filling import as_seen, cover, find_hole, make_chart, paint, widen_hole
+from ggslam.objects.removal_artifacts import drop_artifacts, places
 from ggslam.objects.rim_planes import RimPlane, find_rim_planes, rim_points
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.segmented_rows import copies_of
-from ggslam.objects.traces import drop_traces, places
-from ggslam.objects.view_filling import LEAST_PIXELS, close, open_pixels
+from ggslam.objects.view_filling import ViewFillingTuning, close, open_pixels
 from ggslam.rendering.types import GaussianTensors
 from ggslam.system.settings import setting, settings_class
 
@@ -112,7 +112,7 @@ class _Hole:
         views = look(kept, self.removed, self.views, self.settings.views)
         if not views:
             return Filling()
-        dropped = drop_traces(self.scene, self.removed, self.views, self.ignored)
+        dropped = drop_artifacts(self.scene, self.removed, self.views, self.ignored)
         self.old -= dropped
         views = look_again(copies_of(self.scene.gaussians, self.surroundings()), views)
         planes = self._continue_planes(views)
@@ -148,7 +148,7 @@ class _Hole:
         for _ in range(self.settings.closings):
             kept = copies_of(self.scene.gaussians, self.surroundings())
             counts = np.array([open_pixels(kept, view).sum() for view in views])
-            order = np.argsort(-counts, kind="stable")[: int((counts >= LEAST_PIXELS).sum())]
+            order = np.argsort(-counts, kind="stable")[: int((counts >= ViewFillingTuning.min_pixels).sum())]
             patch = next((p for p in (close(kept, views[i], views) for i in order) if p is not None), None)
             if patch is None:
                 return

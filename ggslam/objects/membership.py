@@ -23,11 +23,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from ggslam.objects.settings import ClassifierTuning
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.system.settings import setting, settings_class
-
-_VALUES_AT_ONCE = 1 << 22
 
 
 @settings_class(frozen=True)
@@ -121,7 +120,7 @@ class _Evidence:
             stored, np.empty_like(stored), np.empty(len(stored), np.float32),
             np.zeros((len(stored), len(ids)), np.float32),
         )  # fmt: skip
-        step = max(1, _VALUES_AT_ONCE // len(classifier))
+        step = max(1, ClassifierTuning.values_at_once // len(classifier))
         for rows in (slice(start, start + step) for start in range(0, len(stored), step)):
             probabilities = classifier.probabilities(features[rows])
             out.best[rows] = classifier.class_ids[probabilities.argmax(1)]

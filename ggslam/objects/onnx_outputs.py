@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
 
 from ggslam.errors import ConfigError
 
-PROTOTYPE_GREY = 114
+PROTOTYPE_GREY: Final = 114
 """Grey of the border that the YOLO family is trained with."""
 
 

@@ -8,24 +8,32 @@ import numpy as np
 
 from ggslam.objects.depth_surface import DepthSurface
 from ggslam.objects.regions import Groups
+from ggslam.system.tuning import Tuning
 
-_STEP = 0.15
-"""Metres that a face may stand out over another one."""
-_CLEAR = 0.003
-"""Metres behind the other's plane from which a point counts as behind it: no low thing on a table is its edge."""
-_BEHIND = 0.6
-"""Share of a face's points that lie behind the other's plane at least: the others stand out."""
-_FLAT = (0.15, 0.003)
-"""Thickness of a flat face at most (root mean square): a share of its width, plus metres."""
-_CORNER = 0.64
-"""Cosine of the angle between the normals of two faces at most: 50 degrees."""
-_PARALLEL = 0.9
-_RIM = 0.12
-"""Share of the outline of one of the two that lies between them."""
-_LEAST, _LEAST_FACE = 12, 30
-"""Pixels of border, and of a face on a grid of every second, at least."""
-_POINTS = 400
-"""Points of a face that are looked at, about."""
+
+class OverhangTuning(Tuning):
+    """When a step parts two faces of one body."""
+
+    max_step_m = 0.15
+    """Largest overhang of a face over another, in metres."""
+    clear_m = 0.003
+    """Distance behind the other's plane from which a point is behind it, in metres."""
+    min_behind = 0.6
+    """Smallest share of a face's points behind the other's plane."""
+    flatness = (0.15, 0.003)
+    """Largest thickness of a flat face (root mean square): a share of its width, plus metres."""
+    max_corner_cosine = 0.64
+    """Largest cosine between the normals of two faces: 50 degrees."""
+    min_parallel = 0.9
+    """Smallest cosine between the normals of parallel faces."""
+    min_rim = 0.12
+    """Smallest share of one outline along the border."""
+    min_border = 12
+    """Fewest pixels of border."""
+    min_face = 30
+    """Fewest pixels of a face on a grid of every second."""
+    points = 400
+    """Points of a face that are used, about."""
 
 
 def join_overhangs(groups: Groups, regions: np.ndarray, surface: DepthSurface, pairs: np.ndarray) -> None:
@@ -39,7 +47,7 @@ def join_overhangs(groups: Groups, regions: np.ndarray, surface: DepthSurface, p
     n = len(groups.roots())
     rim = np.bincount(pairs[:, :2].ravel(), np.repeat(pairs[:, 2], 2), n)
     fewer = rim[pairs[:, :2]].min(1)
-    asked = pairs[(pairs[:, 2] >= _LEAST) & (pairs[:, 2] >= _RIM * fewer)]
+    asked = pairs[(pairs[:, 2] >= OverhangTuning.min_border) & (pairs[:, 2] >= OverhangTuning.min_rim * fewer)]
     if not len(asked):
         return
     faces = _Faces(regions, surface, n)
@@ -58,10 +66,10 @@ class _Faces:
         order = np.argsort(number, kind="stable")
         count = np.bincount(number, minlength=n)
         rank = np.arange(len(order)) - (np.cumsum(count) - count)[number[order]]
-        some = order[rank % np.maximum(1, count // _POINTS)[number[order]] == 0]
+        some = order[rank % np.maximum(1, count // OverhangTuning.points)[number[order]] == 0]
         self._points = surface.points[::2, ::2].reshape(-1, 3)[some]
         self._start = np.searchsorted(number[some], np.arange(n + 1))
-        self._is_face = count >= _LEAST_FACE
+        self._is_face = count >= OverhangTuning.min_face
         self._is_face[0] = False
         self._fit(number[some], n)
         self._heights: dict[int, float] = {}
@@ -74,7 +82,7 @@ class _Faces:
         spread = _sums((away[:, :, None] * away[:, None, :]).reshape(-1, 9), number, n).reshape(-1, 3, 3)
         values, axes = np.linalg.eigh(spread / np.maximum(size - 1, 1)[:, None, None])
         thickness, width = np.sqrt(np.maximum(values[:, :2], 0)).T
-        self._is_face &= thickness <= _FLAT[0] * width + _FLAT[1]
+        self._is_face &= thickness <= OverhangTuning.flatness[0] * width + OverhangTuning.flatness[1]
         normals = axes[:, :, 0]
         self._normals = np.where(((normals * centre).sum(1) > 0)[:, None], -normals, normals)
 
@@ -94,14 +102,14 @@ class _Faces:
     def are_corner(self, a: int, b: int) -> bool:
         """Whether both are flat, stand at an angle and lie behind one another."""
         n, m = self._normal(a), self._normal(b)
-        if n is None or m is None or n @ m > _CORNER:
+        if n is None or m is None or n @ m > OverhangTuning.max_corner_cosine:
             return False
         return self._is_behind(a, b) and self._is_behind(b, a)
 
     def is_below(self, groups: Groups, a: int, edge: int) -> bool:
         """Whether `a` is set back behind the parallel `edge` of a board that lies on it: a front below a table top."""
         n, m = self._normal(a), self._normal(edge)
-        if n is None or m is None or n @ m < _PARALLEL or not self._is_behind(a, edge):
+        if n is None or m is None or n @ m < OverhangTuning.min_parallel or not self._is_behind(a, edge):
             return False
         root = groups.find(edge)
         boards = [k for k in range(1, len(self._is_face)) if k not in (a, edge) and groups.find(k) == root]
@@ -111,7 +119,10 @@ class _Faces:
         """Whether the points of `a` lie behind the face `b`, but for what may stand out, and reach up to it."""
         out = np.sort(self._some(a) @ self._normals[b]) - self._height(b)
         high = out[round(0.98 * (len(out) - 1))]
-        return bool(out[int(_BEHIND * (len(out) - 1))] < -_CLEAR and -_STEP < high < _STEP)
+        return bool(
+            out[int(OverhangTuning.min_behind * (len(out) - 1))] < -OverhangTuning.clear_m
+            and -OverhangTuning.max_step_m < high < OverhangTuning.max_step_m
+        )
 
 
 def _sums(rows: np.ndarray, number: np.ndarray, n: int) -> np.ndarray:

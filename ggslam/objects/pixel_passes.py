@@ -206,22 +206,22 @@ def count_alike(
     return alike
 
 
-def strange_colors(
+def outlier_colors(
     lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray, *, light: np.ndarray, bins: tuple[float, float, float],
     cell: int, least_cell: float, occurs: float, usual: float, base: float, same_hue: float,
     shade: tuple[float, float],
 ) -> np.ndarray:  # fmt: skip
-    """Pixels of a plane whose colour occurs in few places of it, uint8 [H, W], see `find_strange_colors`; what the
-    numbers are, tells `StrangeColorsJob` in abi/core/objects.hpp."""
+    """Pixels of a plane whose colour occurs in few places of it, uint8 [H, W], see `find_outlier_colors`; what the
+    numbers are, tells `OutlierColorsJob` in abi/core/objects.hpp."""
     lab, inside = np.ascontiguousarray(lab, np.float32), np.ascontiguousarray(inside, bool)
     pieces, kind = np.ascontiguousarray(pieces, np.int32), np.empty(inside.shape, np.uint8)
-    job = core.StrangeColorsJob(
+    job = core.OutlierColorsJob(
         address(lab), address(inside), address(pieces), *inside.shape, int(pieces.max(initial=0)) + 1, cell=cell,
         least_cell=least_cell, occurs=occurs, usual=usual, base=base, same_hue=same_hue, darkest=shade[0],
         brightest=shade[1], kind=address(kind),
     )  # fmt: skip
     job.light[:], job.bins[:] = light.tolist(), bins
-    load_library().ggslam_strange_colors(ctypes.byref(job))
+    load_library().ggslam_outlier_colors(ctypes.byref(job))
     return kind
 
 

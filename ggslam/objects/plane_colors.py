@@ -11,25 +11,36 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from ggslam.objects.outlier_colors import HUE, OutlierColorTuning, find_outlier_colors
 from ggslam.objects.pixel_passes import connected_pieces, count_alike
 from ggslam.objects.settings import GeometricSettings
-from ggslam.objects.strange_colors import HUE, SHADE, find_strange_colors
+from ggslam.system.tuning import Tuning
 
-_WIDTH = 160
-"""Pixels across of the image in which colours are compared."""
-_LEAST_PLANE = 0.04
-"""Share of the image that a plane covers at least."""
-_LEAST_PIECE, _MOST_PIECE = 2.5e-3, 0.4
-"""Size of a thing: share of the image at least, share of its plane at most."""
-_LINK = 0.6
-"""Neighbouring pixels belong together up to this share of the contrast that tells a thing."""
-_REPEATED, _REPEATED_ON_PLANE = 0.5, 0.01
-"""A piece's colour may be on so much of its plane besides: shares of the piece and of the plane."""
+
+class FlatThingTuning(Tuning):
+    """When a patch of colour on a plane is an object."""
+
+    width = 160
+    """Image width at which colours are compared, in pixels."""
+    min_plane = 0.04
+    """Smallest share of the image that a plane covers."""
+    min_area = 2.5e-3
+    """Smallest area, as a share of the image."""
+    max_area = 0.4
+    """Largest area, as a share of its plane."""
+    link = 0.6
+    """Neighbouring pixels are joined up to this share of the contrast that tells objects apart."""
+    repeated = 0.5
+    """Most of its colour elsewhere on the plane: a share of its area..."""
+    repeated_on_plane = 0.01
+    """...plus this share of the plane."""
+    min_solid = 0.6
+    """Smallest share of its convex hull that it fills."""
+    min_sure = 0.1
+    """Smallest share of it that differs by more than a shadow does."""
+
+
 _SQUARE = np.ones((3, 3), np.uint8)
-_SOLID = 0.6
-"""Share of its convex hull that a thing fills."""
-_SURE = 0.1
-"""Share of it that differs in more than what a shadow changes."""
 
 
 def colors_to_compare(color: np.ndarray) -> np.ndarray:
@@ -51,21 +62,21 @@ def find_flat_things(color: np.ndarray, plane_of: np.ndarray, settings: Geometri
     found = np.zeros(plane_of.shape, np.int32)
     if not settings.color_contrast:
         return found
-    size = _WIDTH, max(1, round(plane_of.shape[0] * _WIDTH / plane_of.shape[1]))
+    size = FlatThingTuning.width, max(1, round(plane_of.shape[0] * FlatThingTuning.width / plane_of.shape[1]))
     small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
     plane = cv2.resize(plane_of.astype(np.float32), size, interpolation=cv2.INTER_NEAREST).astype(np.int32)
     areas = np.bincount(plane.ravel())
-    large = areas >= _LEAST_PLANE * plane.size
+    large = areas >= FlatThingTuning.min_plane * plane.size
     large[0] = False
     if not large.any():
         return found
     plane[~large[plane]] = 0
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB).astype(np.float32)
     things = np.zeros(plane.shape, np.int32)
-    pieces = connected_pieces(plane, _links(plane, lab, _LINK * settings.color_contrast))
+    pieces = connected_pieces(plane, _links(plane, lab, FlatThingTuning.link * settings.color_contrast))
     for number in np.flatnonzero(large):
-        strange = _strange_pieces(pieces, plane == number, lab, settings.color_contrast)
-        kind = find_strange_colors(lab, plane == number, pieces, settings.color_contrast)
+        strange = _outlier_pieces(pieces, plane == number, lab, settings.color_contrast)
+        kind = find_outlier_colors(lab, plane == number, pieces, settings.color_contrast)
         _add_compact(things, strange | (kind > 0), strange | (kind == HUE), plane == number)
     enlarged = cv2.resize(things.astype(np.float32), plane_of.shape[::-1], interpolation=cv2.INTER_NEAREST)
     found = enlarged.astype(np.int32)
@@ -83,21 +94,23 @@ def _links(plane: np.ndarray, lab: np.ndarray, limit: float) -> tuple[np.ndarray
     return links[0], links[1]
 
 
-def _strange_pieces(pieces: np.ndarray, inside: np.ndarray, lab: np.ndarray, contrast: float) -> np.ndarray:
+def _outlier_pieces(pieces: np.ndarray, inside: np.ndarray, lab: np.ndarray, contrast: float) -> np.ndarray:
     """Pixels of the pieces of a plane (bool [h, w]) whose colour is their own, bool [h, w]."""
     out = np.zeros(inside.shape, bool)
     numbers, colors = pieces[inside], lab[inside]
     area = np.bincount(numbers)
-    candidates = np.flatnonzero((area >= _LEAST_PIECE * inside.size) & (area <= _MOST_PIECE * len(numbers)))
+    candidates = np.flatnonzero(
+        (area >= FlatThingTuning.min_area * inside.size) & (area <= FlatThingTuning.max_area * len(numbers))
+    )
     means = np.array([colors[numbers == piece].mean(0) for piece in candidates], np.float32).reshape(-1, 3)
     alike = count_alike(colors, numbers, candidates, means, contrast)
-    single = alike <= _REPEATED * area[candidates] + _REPEATED_ON_PLANE * len(numbers)
+    single = alike <= FlatThingTuning.repeated * area[candidates] + FlatThingTuning.repeated_on_plane * len(numbers)
     for piece, mean in zip(candidates[single], means[single], strict=True):
         rest = colors[numbers != piece]
         usual = np.median(rest, 0)
         hue = float(np.linalg.norm(mean[1:] - usual[1:]))
         shade = mean[0] / max(usual[0], 1.0)
-        if hue >= 0.5 * contrast or not SHADE[0] < shade < SHADE[1]:
+        if hue >= 0.5 * contrast or not OutlierColorTuning.shade[0] < shade < OutlierColorTuning.shade[1]:
             out |= pieces == piece
     return out
 
@@ -113,9 +126,14 @@ def _add_compact(things: np.ndarray, strange: np.ndarray, sure: np.ndarray, insi
     # Growing bridged gaps; a thing ends where its own pixels do.
     number[~inside | ((cv2.erode(together, _SQUARE) == 0) & ~strange)] = 0
     area, own = np.bincount(number.ravel()), np.bincount(number[grown > 0], minlength=int(number.max()) + 1)
-    least, most = _LEAST_PIECE * inside.size, _MOST_PIECE * np.count_nonzero(inside)
+    least, most = FlatThingTuning.min_area * inside.size, FlatThingTuning.max_area * np.count_nonzero(inside)
     certain = np.bincount(number[sure], minlength=len(area))
-    compact = (area >= least) & (area <= most) & (own >= _SOLID * area) & (certain >= _SURE * area)
+    compact = (
+        (area >= least)
+        & (area <= most)
+        & (own >= FlatThingTuning.min_solid * area)
+        & (certain >= FlatThingTuning.min_sure * area)
+    )
     for k in np.flatnonzero(compact):
         if k:
             things[number == k] = things.max() + 1

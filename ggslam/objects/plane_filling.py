@@ -19,20 +19,30 @@ from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import rgb_to_sh
 from ggslam.scene.poses import inverse, matrix_to_quaternion
+from ggslam.system.tuning import Tuning
 
-_LARGEST_CHART = 360
-_ENCLOSED, _KNOWN = 6, 5
-"""Of eight directions along the plane, how many must meet known surface or another plane, and how many the former."""
-_OCCUPIED = 0.7
-"""Alpha from which a cell is known."""
-_BELOW = 0.4
-"""Cells by which the new surface lies under the old one, which thus covers it where they overlap."""
-_MARGIN = 4
-"""Cells along the hole's rim that are not copied from."""
-_OUTLINE = 9
-"""Width in pixels of the square by which the object's pixels grow before a view is asked for colours."""
-_RARE, _LEAST_RARE = 4.0, 0.08
-"""Distance of a colour from the median, in median distances but at least so much of [0, 1], from which it is rare."""
+
+class PlaneFillingTuning(Tuning):
+    """How a plane is continued into a hole."""
+
+    max_chart = 360
+    """Most cells along a side of a plane's picture."""
+    enclosed = 6
+    """Fewest of eight directions along the plane that meet known surface or another plane."""
+    known = 5
+    """Fewest of them that meet known surface."""
+    occupied = 0.7
+    """Alpha from which a cell is known."""
+    below = 0.4
+    """Cells by which the new surface lies under the old one, which covers it where they overlap."""
+    margin = 4
+    """Cells along the rim of the hole that are not copied from."""
+    outline = 9
+    """Width of the square that the object's pixels grow by, in pixels."""
+    rare = 4.0
+    """Distance of a rare colour from the median colour, in median distances..."""
+    min_rare = 0.08
+    """...and at least this, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +80,7 @@ def make_chart(plane: RimPlane, kept: Gaussians, cell: float) -> Chart | None:
     second = np.cross(first, plane.normal)  # first x second = -normal, the direction a camera in front looks in
     flat = plane.points @ np.stack([first, second], 1)
     low, high = np.percentile(flat, [0.5, 99.5], axis=0)
-    cell = max(cell, float((high - low).max()) / _LARGEST_CHART)
+    cell = max(cell, float((high - low).max()) / PlaneFillingTuning.max_chart)
     columns, rows = (np.ceil((high - low) / cell).astype(int) + 1).tolist()
     means = kept.means.numpy()
     flat = means @ np.stack([first, second], 1)
@@ -83,7 +93,7 @@ def make_chart(plane: RimPlane, kept: Gaussians, cell: float) -> Chart | None:
     origin = low[0] * first + low[1] * second + plane.offset * plane.normal
     color, alpha = _front_view(kept, on, origin, axes, cell, rows, columns)
     _, covered = _front_view(kept, around, origin, axes, cell, rows, columns)
-    return Chart(origin, axes, cell, color, alpha > _OCCUPIED, covered > _OCCUPIED)
+    return Chart(origin, axes, cell, color, alpha > PlaneFillingTuning.occupied, covered > PlaneFillingTuning.occupied)
 
 
 def _front_view(
@@ -119,7 +129,9 @@ def find_hole(chart: Chart, views: Sequence[HoleView], others: Sequence[RimPlane
         ends |= other.is_met(centres, 4 * chart.cell)
     stops = chart.known | ends.reshape(chart.known.shape)
     gaps = could_be_hidden(centres, views).reshape(chart.known.shape) & ~chart.known
-    gaps &= (_directions(stops, gaps) >= _ENCLOSED) & (_directions(chart.known, gaps) >= _KNOWN)
+    gaps &= (_directions(stops, gaps) >= PlaneFillingTuning.enclosed) & (
+        _directions(chart.known, gaps) >= PlaneFillingTuning.known
+    )
     part = cv2.connectedComponents(gaps.astype(np.uint8))[1]
     return gaps & np.isin(part, part[gaps & is_open(centres, views).reshape(gaps.shape)])
 
@@ -144,7 +156,7 @@ def _meets(stops: np.ndarray, gap: np.ndarray, diagonal: bool) -> np.ndarray:
     return met
 
 
-def paint(chart: Chart, hole: np.ndarray, margin: int = _MARGIN) -> np.ndarray:
+def paint(chart: Chart, hole: np.ndarray, margin: int = PlaneFillingTuning.margin) -> np.ndarray:
     """Colours of the hole's cells [M, 3], from the known cells around it.
 
     Args:
@@ -166,7 +178,7 @@ def usual_colors(color: np.ndarray, among: np.ndarray) -> np.ndarray:
         return among
     middle = np.median(color[among], axis=0)
     spread = np.median(np.abs(color[among] - middle), axis=0)
-    return (np.abs(color - middle) <= np.maximum(_RARE * spread, _LEAST_RARE)).all(2)
+    return (np.abs(color - middle) <= np.maximum(PlaneFillingTuning.rare * spread, PlaneFillingTuning.min_rare)).all(2)
 
 
 def as_seen(chart: Chart, views: Sequence[HoleView]) -> Chart:
@@ -180,7 +192,12 @@ def as_seen(chart: Chart, views: Sequence[HoleView]) -> Chart:
     largest = np.zeros(len(centres))
     for v in views:
         now = v.sight_now.classify_points(centres)
-        covered = cv2.dilate(v.covered.astype(np.uint8), np.ones((_OUTLINE, _OUTLINE), np.uint8)) > 0
+        covered = (
+            cv2.dilate(
+                v.covered.astype(np.uint8), np.ones((PlaneFillingTuning.outline, PlaneFillingTuning.outline), np.uint8)
+            )
+            > 0
+        )
         shown = now.same & ~now.at(covered)
         slant = np.abs((centres - v.view.position) @ chart.axes[2]) / np.maximum(now.z, 1e-3) ** 3
         better = shown & (slant > largest)
@@ -200,7 +217,7 @@ def cover(chart: Chart, hole: np.ndarray, colors: np.ndarray, plane: RimPlane) -
     distance, index = cKDTree(plane.points).query(centres, k=min(16, len(plane.points)))
     weights = 1 / np.maximum(distance.reshape(len(centres), -1), chart.cell)
     heights = plane.distance(plane.points)[index].reshape(weights.shape)
-    height = (weights * heights).sum(1) / weights.sum(1) - _BELOW * chart.cell
+    height = (weights * heights).sum(1) / weights.sum(1) - PlaneFillingTuning.below * chart.cell
     return discs(centres + height[:, None] * chart.axes[2], chart.axes, np.full(len(centres), chart.cell), colors)
 
 

@@ -12,13 +12,20 @@ import numpy as np
 
 from ggslam.objects.depth_surface import DepthSurface
 from ggslam.objects.pixel_passes import claim_planes, connected_pieces
-from ggslam.objects.settings import GeometricSettings
+from ggslam.objects.settings import REFERENCE_WIDTH, GeometricSettings
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-_REFERENCE_WIDTH = 320
-_FLAT_SIGMAS = 2.0
-_PLANE_SIGMAS = 3.0
-_NORMAL_DEGREES = 40.0
+
+class PlaneTuning(Tuning):
+    """When depth is flat."""
+
+    block_sigmas = 2.0
+    """Largest error of a flat block, in standard deviations of the noise."""
+    plane_sigmas = 3.0
+    """The same of a plane."""
+    max_angle_deg = 40.0
+    """Largest angle between a plane and the surface at its pixels, in degrees."""
 
 
 def find_planes(surface: DepthSurface, camera: Camera, settings: GeometricSettings) -> tuple[np.ndarray, np.ndarray]:
@@ -28,7 +35,7 @@ def find_planes(surface: DepthSurface, camera: Camera, settings: GeometricSettin
         int32 [H, W], number of the plane of each pixel from 1 on, larger planes first, 0 = none; and
         float32 [P, 3], per plane the vector w with 1/z = w . ray, in other words its normal over its distance.
     """
-    size = max(4, round(settings.block_pixels * camera.width / _REFERENCE_WIDTH))
+    size = max(4, round(settings.block_pixels * camera.width / REFERENCE_WIDTH))
     size = min(size, camera.width, camera.height)
     blocks = _Blocks(surface, camera, size)
     group = _grow(blocks, surface.sigma, settings)
@@ -112,7 +119,7 @@ def fit(
 def _grow(blocks: _Blocks, sigma: float, settings: GeometricSettings) -> np.ndarray:
     """Number of the group of each flat block, int [rows, columns], -1 = not flat: neighbours with like planes."""
     # Rounding of float32 sums adds a little to the noise.
-    flat = blocks.full & (blocks.error < _FLAT_SIGMAS * sigma)
+    flat = blocks.full & (blocks.error < PlaneTuning.block_sigmas * sigma)
     unit = blocks.plane / np.maximum(np.linalg.norm(blocks.plane, axis=-1, keepdims=True), 1e-9)
     centre = blocks.right[..., 2] / np.maximum(blocks.count, 1)
     limit = np.cos(np.radians(settings.plane_degrees))
@@ -143,7 +150,7 @@ def _fit(
     group = number[group]
     sums = blocks.sums_of(group, len(order))
     fitted, error = sums.fit()
-    limit = _PLANE_SIGMAS * sigma + settings.tolerance_m * (sums.inverse() / sizes[order]) ** 2
+    limit = PlaneTuning.plane_sigmas * sigma + settings.tolerance_m * (sums.inverse() / sizes[order]) ** 2
     planes = np.zeros((0, 3))
     members: list[list[int]] = []
     for k in np.flatnonzero(error < limit).tolist():
@@ -173,7 +180,7 @@ def _claim(
     settings: GeometricSettings,
 ) -> np.ndarray:  # fmt: skip
     """Plane of each pixel: the nearest of those that it lies on and has the normal of, in pieces with blocks."""
-    label = claim_planes(surface, camera.rays(), planes, np.cos(np.radians(_NORMAL_DEGREES)), settings)
+    label = claim_planes(surface, camera.rays(), planes, np.cos(np.radians(PlaneTuning.max_angle_deg)), settings)
     support = np.zeros(label.shape, np.int32)
     grown = plane_of_block.repeat(size, 0).repeat(size, 1)
     support[: grown.shape[0], : grown.shape[1]] = grown

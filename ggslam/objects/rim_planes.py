@@ -10,14 +10,24 @@ import cv2
 import numpy as np
 
 from ggslam.objects.hole_views import HoleView
+from ggslam.system.tuning import Tuning
 
-_POINTS = 4000
-_TRIALS = 300
-_LARGEST = 6
-_LEAST_SHARE = 0.03
-_PARALLEL = 0.85
-"""Cosine of the largest angle between a plane and the surface at its points."""
-_RING_SHARE = 0.4
+
+class RimPlaneTuning(Tuning):
+    """How planes around a hole are found."""
+
+    points = 4000
+    """Most points of the rim."""
+    trials = 300
+    """Trials of RANSAC."""
+    max_planes = 6
+    """Most planes."""
+    min_share = 0.03
+    """Smallest share of the points on a plane."""
+    min_parallel = 0.85
+    """Smallest cosine between a plane's normal and those at its points."""
+    ring_width = 0.4
+    """Width of the rim, as a share of the root of the covered area."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +65,7 @@ def rim_points(views: Sequence[HoleView]) -> tuple[np.ndarray, np.ndarray]:
     points, normals = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.float32)]
     for v in views:
         covered = v.covered.astype(np.uint8)
-        width = int(np.clip(_RING_SHARE * np.sqrt(covered.sum()), 4, 40))
+        width = int(np.clip(RimPlaneTuning.ring_width * np.sqrt(covered.sum()), 4, 40))
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * width + 1, 2 * width + 1))
         ring = (cv2.dilate(covered, disc) > 0) & (cv2.dilate(covered, np.ones((3, 3), np.uint8)) == 0) & (v.now > 0)
         surface = v.view.points(v.now)
@@ -63,7 +73,7 @@ def rim_points(views: Sequence[HoleView]) -> tuple[np.ndarray, np.ndarray]:
         normal = np.cross(np.gradient(smooth, axis=1), np.gradient(smooth, axis=0))[ring]
         points.append(surface[ring])
         normals.append(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
-    pick = np.random.default_rng(0).permutation(sum(len(part) for part in points))[:_POINTS]
+    pick = np.random.default_rng(0).permutation(sum(len(part) for part in points))[:RimPlaneTuning.points]
     return np.concatenate(points)[pick], np.concatenate(normals)[pick]
 
 
@@ -78,8 +88,8 @@ def find_rim_planes(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray
     rng = np.random.default_rng(0)
     planes: list[RimPlane] = []
     left, facing = points.astype(np.float64), normals.astype(np.float64)
-    least = max(30, _LEAST_SHARE * len(points))
-    while len(left) >= least and len(planes) < _LARGEST:
+    least = max(30, RimPlaneTuning.min_share * len(points))
+    while len(left) >= least and len(planes) < RimPlaneTuning.max_planes:
         plane = _best_plane(left, facing, tolerance, rng)
         near = _on(plane, left, facing, tolerance)
         if near.sum() < least:
@@ -94,15 +104,17 @@ def find_rim_planes(points: np.ndarray, normals: np.ndarray, cameras: np.ndarray
 
 def _on(plane: np.ndarray, points: np.ndarray, normals: np.ndarray, tolerance: float) -> np.ndarray:
     """Whether points lie on a plane (nx, ny, nz, offset) and their surface runs along it, bool [M]."""
-    return (np.abs(points @ plane[:3] - plane[3]) <= tolerance) & (np.abs(normals @ plane[:3]) >= _PARALLEL)
+    return (np.abs(points @ plane[:3] - plane[3]) <= tolerance) & (
+        np.abs(normals @ plane[:3]) >= RimPlaneTuning.min_parallel
+    )
 
 
 def _best_plane(points: np.ndarray, normals: np.ndarray, tolerance: float, rng: np.random.Generator) -> np.ndarray:
     """(nx, ny, nz, offset) of the best of many planes through a point along its surface, fitted to all its inliers."""
-    seeds = rng.integers(0, len(points), _TRIALS)
+    seeds = rng.integers(0, len(points), RimPlaneTuning.trials)
     offsets = np.einsum("ti,ti->t", normals[seeds], points[seeds])
     close = np.abs(points @ normals[seeds].T - offsets) <= tolerance
-    best = (close & (np.abs(normals @ normals[seeds].T) >= _PARALLEL)).sum(0).argmax()
+    best = (close & (np.abs(normals @ normals[seeds].T) >= RimPlaneTuning.min_parallel)).sum(0).argmax()
     plane = np.append(normals[seeds[best]], offsets[best])
     for _ in range(4):
         inliers = points[_on(plane, points, normals, tolerance)]

@@ -10,9 +10,14 @@ import numpy as np
 from ggslam.geometry.voxels import voxel_keys
 from ggslam.objects.settings import SameObjectSettings
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-FAINT = 0.1
-"""Gaussians fainter than this say nothing."""
+
+class SameObjectTuning(Tuning):
+    """Which Gaussians tell that two objects are one."""
+
+    min_opacity = 0.1
+    """Smallest opacity."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class LabelledVoxels:
     def of_map(gaussians: GaussianMap, voxel: float, only: np.ndarray | None = None) -> LabelledVoxels:
         """Of a map whose Gaussians have objects; of these objects alone, if `only` names some."""
         opacities = gaussians.opacities.numpy()
-        seen = opacities >= FAINT
+        seen = opacities >= SameObjectTuning.min_opacity
         if only is not None:
             seen &= np.isin(gaussians.object_id.numpy(), only)
         labels = gaussians.object_id.numpy()[seen].astype(np.int64)

@@ -13,8 +13,14 @@ from ggslam.objects.table import ObjectTable
 from ggslam.scene.arrays import array_blocks, arrays_to_bytes, read_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.system.tuning import Tuning
 
-_ROWS_AT_ONCE = 1 << 16
+
+class SegmentedMapTuning(Tuning):
+    """How votes are read."""
+
+    rows_at_once = 1 << 16
+    """Rows that are read at a time."""
 
 
 @dataclass
@@ -58,7 +64,7 @@ class ObjectVotes:
     @staticmethod
     def labels_in_file(path: str | Path) -> np.ndarray:
         """`labels` of the votes in a file, which are never all in memory; errors as of `from_file`."""
-        blocks = array_blocks(path, "votes", "ids", "weights", rows=_ROWS_AT_ONCE)
+        blocks = array_blocks(path, "votes", "ids", "weights", rows=SegmentedMapTuning.rows_at_once)
         labels = [ObjectVotes._check_votes(path, *block).labels() for block in blocks]
         return np.concatenate(labels) if labels else np.empty(0, np.uint16)
 

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 
 from ggslam.objects.pixel_passes import connected_pieces
-from ggslam.objects.settings import CleaningSettings
+from ggslam.objects.settings import REFERENCE_WIDTH, CleaningSettings
 
-_REFERENCE_WIDTH = 320
 _SMALL_SQUARE = np.ones((3, 3), np.uint8)
 _DIRECTIONS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
 
@@ -74,7 +73,7 @@ def boundary_trust(segments: np.ndarray, depth: np.ndarray, settings: CleaningSe
     settings = settings or CleaningSettings()
     height, width = segments.shape
     trusted = np.ones(segments.shape, bool)
-    reach = max(1, round(settings.band_pixels * width / _REFERENCE_WIDTH)) if settings.band_pixels else 0
+    reach = max(1, round(settings.band_pixels * width / REFERENCE_WIDTH)) if settings.band_pixels else 0
     if not reach:
         return trusted
     size = 2 * reach + 1

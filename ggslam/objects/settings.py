@@ -3,11 +3,23 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 from ggslam.system.settings import setting, settings_class, tuning_class
+from ggslam.system.tuning import Tuning
 
 Mode = Literal["auto", "always", "never"]
+REFERENCE_WIDTH: Final = 320
+"""Image width that lengths in pixels of these settings are given for."""
+IDS: Final = 1 << 16
+"""Object ids are 16 bits."""
+
+
+class ClassifierTuning(Tuning):
+    """How the classifier of identity vectors is applied."""
+
+    values_at_once = 1 << 22
+    """Probabilities that are computed at a time."""
 
 
 @tuning_class(frozen=True)

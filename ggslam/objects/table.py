@@ -19,6 +19,7 @@ from ggslam.errors import ConfigError, FormatError, InputError
 from ggslam.objects.boxes import middle_of, oriented_box
 from ggslam.objects.colors import id_palette
 from ggslam.objects.history import History
+from ggslam.objects.settings import ClassifierTuning
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.object_names import object_label
@@ -34,7 +35,6 @@ segmenter; a segmentation model."""
 Byte = Annotated[int, pydantic.Field(ge=0, le=255)]
 Count = Annotated[int, pydantic.Field(ge=0)]
 ObjectId = Annotated[int, pydantic.Field(ge=1, le=65535)]
-_VALUES_AT_ONCE = 1 << 22
 
 
 @savable()
@@ -296,7 +296,7 @@ def _probability(features: np.ndarray, object_id: int, classifier: IdentityClass
         number = classifier.class_of(object_id)
     except KeyError:
         return None
-    step, total = max(1, _VALUES_AT_ONCE // len(classifier)), 0.0
+    step, total = max(1, ClassifierTuning.values_at_once // len(classifier)), 0.0
     for start in range(0, len(features), step):
         total += float(classifier.probabilities(features[start : start + step])[:, number].sum(dtype=np.float64))
     return total

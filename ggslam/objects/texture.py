@@ -11,14 +11,20 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-_HALF = 4
-"""Patches are 2 * 4 + 1 pixels wide."""
-_TREND = 0.05
-"""How much a patch's new part must agree with the smooth interpolation, against its known part with what is there."""
-_LIGHT = 0.1
-"""Largest correction of brightness, in [0, 1]."""
-_MOST = 400
-"""Patches a gap may need, as a rule of thumb; a larger gap is filled in a smaller picture."""
+from ggslam.system.tuning import Tuning
+
+
+class TextureTuning(Tuning):
+    """How a gap is filled with texture."""
+
+    half_patch = 4
+    """Pixels of a patch on each side of its centre."""
+    trend_weight = 0.05
+    """Weight of agreement with the smooth interpolation, against agreement with the surroundings."""
+    max_light = 0.1
+    """Largest correction of brightness, in [0, 1]."""
+    max_patches = 400
+    """Patches that a gap may need, about; a larger gap is filled in a smaller picture."""
 
 
 def fill_gap(picture: np.ndarray, known: np.ndarray, gap: np.ndarray) -> np.ndarray:
@@ -29,15 +35,17 @@ def fill_gap(picture: np.ndarray, known: np.ndarray, gap: np.ndarray) -> np.ndar
         known: bool [H, W], where the picture may be copied from; at least one pixel.
         gap: bool [H, W], where colours are wanted.
     """
-    size = 2 * _HALF + 1
-    if gap.sum() > _MOST * size * size / 3:
-        return _filled_coarsely(picture, known, gap, float(np.sqrt(gap.sum() / (_MOST * size * size / 3))))
+    size = 2 * TextureTuning.half_patch + 1
+    most = TextureTuning.max_patches * size * size / 3
+    if gap.sum() > most:
+        return _filled_coarsely(picture, known, gap, float(np.sqrt(gap.sum() / most)))
     pixels = (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
     smooth = cv2.inpaint(pixels, (~known).astype(np.uint8), 5, cv2.INPAINT_TELEA).astype(np.float32) / 255
     textured = _copy_patches(picture.astype(np.float32), known & ~gap, gap, smooth)
     if textured is None:
         return smooth[gap]
-    light = cv2.GaussianBlur(smooth.mean(2) - textured.mean(2), (0, 0), size).clip(-_LIGHT, _LIGHT)
+    limit = TextureTuning.max_light
+    light = cv2.GaussianBlur(smooth.mean(2) - textured.mean(2), (0, 0), size).clip(-limit, limit)
     return (textured + light[..., None])[gap].clip(0, 1)
 
 
@@ -57,31 +65,32 @@ def _filled_coarsely(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, fa
 def _copy_patches(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smooth: np.ndarray) -> np.ndarray | None:
     """The picture with the gap filled by known patches; what is neither known nor gap is `smooth`. None if no whole
     patch is known."""
-    size = 2 * _HALF + 1
+    half = TextureTuning.half_patch
+    size = 2 * half + 1
     whole = cv2.erode(known.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0) > 0
     if not whole.any():
         return None
-    border = ((_HALF, _HALF), (_HALF, _HALF), (0, 0))
+    border = ((half, half), (half, half), (0, 0))
     canvas = np.pad(np.where(known[..., None], picture, smooth), border, mode="symmetric")
     trend = np.pad(smooth, border, mode="symmetric")
-    done = np.pad(known, _HALF)
-    todo = np.pad(gap, _HALF)
+    done = np.pad(known, half)
+    todo = np.pad(gap, half)
     confidence = done.astype(np.float32)
-    candidates = whole[_HALF:-_HALF, _HALF:-_HALF]  # by the upper left corner of the patch in the picture
+    candidates = whole[half:-half, half:-half]  # by the upper left corner of the patch in the picture
     while todo.any():
         row, column = _next_place(canvas, done, todo, confidence)
-        window = (slice(row - _HALF, row + _HALF + 1), slice(column - _HALF, column + _HALF + 1))
+        window = slice(row - half, row + half + 1), slice(column - half, column + half + 1)
         mask = np.repeat(done[window].astype(np.float32)[..., None], 3, 2)
         fit = cv2.matchTemplate(picture, canvas[window], cv2.TM_SQDIFF, mask=mask)
         drift = cv2.matchTemplate(picture, trend[window], cv2.TM_SQDIFF, mask=1 - mask)
-        cost = np.asarray(fit) + _TREND * np.asarray(drift)
+        cost = np.asarray(fit) + TextureTuning.trend_weight * np.asarray(drift)
         y, x = np.unravel_index(np.where(candidates, cost, np.inf).argmin(), cost.shape)
         fresh = todo[window]
         canvas[window][fresh] = picture[y : y + size, x : x + size][fresh]
         confidence[window][fresh] = confidence[window].mean()
         done[window] |= fresh
         todo[window] = False
-    return canvas[_HALF:-_HALF, _HALF:-_HALF]
+    return canvas[half:-half, half:-half]
 
 
 def _next_place(canvas: np.ndarray, done: np.ndarray, todo: np.ndarray, confidence: np.ndarray) -> tuple[int, int]:
@@ -89,7 +98,7 @@ def _next_place(canvas: np.ndarray, done: np.ndarray, todo: np.ndarray, confiden
     rim = todo & (cv2.dilate(done.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     if not rim.any():  # nothing known touches what is left
         rim = todo
-    size = 2 * _HALF + 1
+    size = 2 * TextureTuning.half_patch + 1
     sure = cv2.blur(confidence, (size, size))
     grey = np.where(done, canvas.mean(2), 0).astype(np.float32)
     solid = cv2.erode(done.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

@@ -8,22 +8,28 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ggslam.objects.hole_views import SOLID, HoleView, could_be_hidden
+from ggslam.objects.hole_views import HoleView, HoleViewTuning, could_be_hidden
 from ggslam.objects.plane_filling import discs
 from ggslam.objects.texture import fill_gap
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians, GaussianTensors
+from ggslam.system.tuning import Tuning
 
-LEAST_PIXELS = 6
-"""Smaller gaps in a view are left alone."""
-_STEPS = (1.0, 1.03, 1.07, 1.12, 1.2, 1.33)
+
+class ViewFillingTuning(Tuning):
+    """How gaps in a view are filled."""
+
+    min_pixels = 6
+    """Smaller gaps are left alone, in pixels."""
+    depth_factors = (1.0, 1.03, 1.07, 1.12, 1.2, 1.33)
+    """Factors of depth that are tried for a new surface."""
 
 
 def open_pixels(kept: Gaussians, view: HoleView) -> np.ndarray:
     """Pixels of the object that show nothing solid now, bool [H, W]: the black blots."""
     out = CpuRasterizer().forward(kept, view.view.camera, view.view.T_camera_world, features=False)
     covered = cv2.dilate(view.covered.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return covered & (out.alpha.numpy() < SOLID)
+    return covered & (out.alpha.numpy() < HoleViewTuning.solid)
 
 
 def close(kept: Gaussians, view: HoleView, views: Sequence[HoleView]) -> GaussianTensors | None:
@@ -38,8 +44,8 @@ def close(kept: Gaussians, view: HoleView, views: Sequence[HoleView]) -> Gaussia
     camera, T = view.view.camera, view.view.T_camera_world
     out = CpuRasterizer().forward(kept, camera, T, features=False)
     alpha, depth = out.alpha.numpy(), out.expected_depth.numpy()
-    known = (alpha >= SOLID) & ~view.covered & ~gap
-    if gap.sum() < LEAST_PIXELS or not known.any():
+    known = (alpha >= HoleViewTuning.solid) & ~view.covered & ~gap
+    if gap.sum() < ViewFillingTuning.min_pixels or not known.any():
         return None
     inverse_depth = np.where(known, 1 / np.maximum(depth, 1e-3), 0).astype(np.float32)
     continued = np.asarray(cv2.inpaint(inverse_depth, (~known).astype(np.uint8), 5, cv2.INPAINT_NS))
@@ -60,7 +66,7 @@ def _possible_depths(depth: np.ndarray, gap: np.ndarray, view: HoleView, views: 
     """Depths [M] of the gap's pixels, moved away from the camera where another view saw that there is nothing, in steps
     up to a third; 0 where that does not help."""
     out = np.zeros(int(gap.sum()), np.float32)
-    for factor in _STEPS:
+    for factor in ViewFillingTuning.depth_factors:
         todo = out == 0
         if todo.any():
             possible = could_be_hidden(view.view.points(factor * depth)[gap], views) & todo

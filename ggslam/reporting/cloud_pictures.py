@@ -11,15 +11,22 @@ import cv2
 import numpy as np
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-_BACKGROUND = 255
-_LARGEST = 24
-"""Pixels that a point is drawn wide at most."""
-_NEAREST = 0.05
-"""Points nearer to the camera than this share of the cloud's size are not drawn."""
-_FIELD_OF_VIEW = math.radians(50)
-_FILLED = 1.04
-"""The box of a cloud seen from outside is given a margin by this factor."""
+
+class CloudPictureTuning(Tuning):
+    """How clouds are drawn."""
+
+    background = 255
+    """Grey of the background."""
+    max_point = 24
+    """Largest width of a point, in pixels."""
+    near_share = 0.05
+    """Points nearer to the camera than this share of the cloud's size are not drawn."""
+    field_of_view = math.radians(50)
+    """Field of view, in radians."""
+    margin = 1.04
+    """Factor on the cloud's box that leaves a margin around it."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,7 @@ def outside_view(points: np.ndarray, upwards: np.ndarray, width: int = 960, heig
     x, y, z = (corners @ pose[:3, :3]).T
     # As near as all corners of the cloud's box stay within the picture.
     wide, tall = np.abs(x) / width, np.abs(y) / height
-    distance = (2 * _FILLED * camera.fx * np.maximum(wide, tall) - z).max()
+    distance = (2 * CloudPictureTuning.margin * camera.fx * np.maximum(wide, tall) - z).max()
     pose[:3, 3] = (low + high) / 2 + direction * distance
     return CloudView(camera, pose)
 
@@ -79,7 +86,7 @@ def view_along(
 
 
 def _camera(width: int, height: int) -> Camera:
-    focal = 0.5 * width / math.tan(_FIELD_OF_VIEW / 2)
+    focal = 0.5 * width / math.tan(CloudPictureTuning.field_of_view / 2)
     return Camera(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
 
 
@@ -94,15 +101,15 @@ def draw_cloud(points: np.ndarray, colors: np.ndarray, view: CloudView, point_si
     camera = view.camera
     T_camera_world = np.linalg.inv(view.T_world_camera)
     position = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    nearest = _NEAREST * float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9
+    nearest = CloudPictureTuning.near_share * float(np.linalg.norm(np.ptp(points, axis=0))) + 1e-9
     rows = np.flatnonzero(position[:, 2] > nearest)
     rows = rows[np.argsort(-position[rows, 2], kind="stable")]  # the nearest are drawn last
     x, y, z = position[rows].T
     # A square that is seen from its side or corner shows up to sqrt(3) times its edge.
-    width = np.clip(np.ceil(1.3 * point_size * camera.fx / z), 1, _LARGEST).astype(np.int32)
+    width = np.clip(np.ceil(1.3 * point_size * camera.fx / z), 1, CloudPictureTuning.max_point).astype(np.int32)
     left = np.rint(camera.fx * x / z + camera.cx).clip(-(1 << 20), 1 << 20).astype(np.int32) - (width - 1) // 2
     top = np.rint(camera.fy * y / z + camera.cy).clip(-(1 << 20), 1 << 20).astype(np.int32) - (width - 1) // 2
-    picture = np.full((camera.height * camera.width, 3), _BACKGROUND, np.uint8)
+    picture = np.full((camera.height * camera.width, 3), CloudPictureTuning.background, np.uint8)
     depth, winner = np.full(len(picture), np.inf), np.empty(len(picture), np.int64)
     for down, across in np.ndindex(int(width.max(initial=0)), int(width.max(initial=0))):
         first = int(np.searchsorted(width, max(down, across) + 1))  # nearer points are drawn wider
@@ -124,7 +131,7 @@ def contact_sheet(pictures: Sequence[np.ndarray], captions: Sequence[str], colum
     strip = round(36 * scale)
     rows = -(-len(pictures) // columns)
     columns = min(columns, len(pictures))
-    sheet = np.full((rows * (height + strip), columns * width, 3), _BACKGROUND, np.uint8)
+    sheet = np.full((rows * (height + strip), columns * width, 3), CloudPictureTuning.background, np.uint8)
     for number, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
         top, left = number // columns * (height + strip), number % columns * width
         sheet[top : top + height, left : left + width] = picture

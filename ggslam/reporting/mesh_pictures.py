@@ -11,10 +11,16 @@ from ggslam.abi.core import MeshPictureInput
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.reporting.cloud_pictures import CloudView
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 
-_BACKGROUND = 255
-_AMBIENT = 0.35
-"""Share of its colour that a surface has which the light of the camera touches from the side."""
+
+class MeshDrawingTuning(Tuning):
+    """How meshes are drawn."""
+
+    background = 255
+    """Grey of the background."""
+    ambient = 0.35
+    """Share of its colour that a surface has which the camera's light meets from the side."""
 
 
 def draw_mesh(
@@ -43,11 +49,11 @@ def draw_mesh(
     T = inverse(view.T_world_camera).astype(np.float32)
     position = np.ascontiguousarray(vertices @ T[:3, :3].T + T[:3, 3], np.float32)
     facing = np.abs(((normals @ T[:3, :3].T) * position).sum(1)) / np.maximum(np.linalg.norm(position, axis=1), 1e-9)
-    shade = _AMBIENT + (1 - _AMBIENT) * np.minimum(facing, 1)
+    shade = MeshDrawingTuning.ambient + (1 - MeshDrawingTuning.ambient) * np.minimum(facing, 1)
     shaded = np.ascontiguousarray(np.rint(colors * shade[:, None]), np.uint8)
     corners = np.ascontiguousarray(triangles, np.int32)
     camera = view.camera
-    picture = np.full((camera.height, camera.width, 3), _BACKGROUND, np.uint8)
+    picture = np.full((camera.height, camera.width, 3), MeshDrawingTuning.background, np.uint8)
     inverse_depth = np.zeros((camera.height, camera.width), np.float32)
     mesh = MeshPictureInput(
         position.ctypes.data, shaded.ctypes.data, corners.ctypes.data, len(position), len(corners),

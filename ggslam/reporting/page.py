@@ -18,9 +18,16 @@ import numpy as np
 from ggslam.errors import RunFolderError
 from ggslam.reporting.plot_files import svg
 from ggslam.reporting.plots import Plot, draw
+from ggslam.system.tuning import Tuning
 
 _FOLDER = Path(__file__).parent
-_JPEG_QUALITY = 82
+
+
+class PageTuning(Tuning):
+    """How pictures are stored in a page."""
+
+    jpeg_quality = 82
+    """Quality of JPEG, of 100."""
 
 
 class Html(str):
@@ -96,7 +103,7 @@ def figure(plot: Plot) -> Html:
 
 def image(picture: np.ndarray, words: str) -> Html:
     """A picture, uint8 [H, W, 3], within the page; `words` describe it."""
-    good, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    good, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, PageTuning.jpeg_quality])
     if not good:
         raise RunFolderError(f"picture of {words}: cannot be encoded")
     height, width = picture.shape[:2]

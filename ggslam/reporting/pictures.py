@@ -12,9 +12,14 @@ from scipy.linalg import svd
 from ggslam.errors import RenderError, RunFolderError
 from ggslam.rendering.types import RenderBuffers
 from ggslam.system.atomic import write_bytes
+from ggslam.system.tuning import Tuning
 
-FITTED = 20_000
-"""Identity vectors that principal components are fitted to, at most about twice as many."""
+
+class IdentityPictureTuning(Tuning):
+    """How identity vectors become colours."""
+
+    fitted = 20_000
+    """Vectors that principal components are fitted to; at most about twice as many."""
 
 
 def color_to_uint8(image: np.ndarray) -> np.ndarray:
@@ -69,7 +74,7 @@ class IdentityColors:
     """
 
     def __init__(self, features: np.ndarray) -> None:
-        sample = features[:: max(1, len(features) // FITTED)]
+        sample = features[:: max(1, len(features) // IdentityPictureTuning.fitted)]
         if len(sample) < 3:  # too few to have components
             sample = np.concatenate([sample, np.zeros((3, features.shape[1]), np.float32)])
         self._mean = sample.mean(0)

@@ -14,6 +14,7 @@ import numpy as np
 from ggslam.reporting.pictures import write_picture
 from ggslam.reporting.plots import Box, Drawing, Plot, Stroke, Word, draw
 from ggslam.system.atomic import write_text
+from ggslam.system.tuning import Tuning
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#56b4e9", "#6a3d9a", "#444444")
 """Told apart with all common kinds of colour blindness (after Okabe and Ito, made dark enough for lines on white)."""
@@ -26,8 +27,13 @@ _FILE_STYLE = "".join(
     + [f".plot .{name}{{stroke:{color};fill:none}}" for name, color in _LIGHT.items()]
     + [f".plot rect.band{{fill:{_LIGHT['band']};stroke:none}}"]
 )
-_SHARPNESS = 4
-"""PNG files are drawn so many times larger, then made half as large again: two pixels for each of the plot's."""
+
+
+class PlotFileTuning(Tuning):
+    """How plots become PNG files."""
+
+    sharpness = 4
+    """They are drawn this many times larger, then reduced to two pixels for each of the plot's."""
 
 
 def svg(drawing: Drawing, plot: Plot, style: str = "") -> str:
@@ -79,7 +85,7 @@ def _rgb(name: str) -> tuple[int, int, int]:
 
 def rasterize(drawing: Drawing) -> np.ndarray:
     """A drawing as pixels, uint8 [2 height, 2 width, 3]. Letters that are not ASCII become question marks."""
-    s = _SHARPNESS
+    s = PlotFileTuning.sharpness
     canvas = np.full((s * drawing.height, s * drawing.width, 3), 255, np.uint8)
     for item in drawing.items:
         if isinstance(item, Box):
@@ -110,7 +116,7 @@ def _dashes(points: np.ndarray, length: float = 10.0, share: float = 0.6) -> lis
 
 
 def _write(canvas: np.ndarray, word: Word) -> None:
-    s, font = _SHARPNESS, cv2.FONT_HERSHEY_SIMPLEX
+    s, font = PlotFileTuning.sharpness, cv2.FONT_HERSHEY_SIMPLEX
     size, thick = 0.42 * s * (1.2 if word.strong else 1.0), round(1.1 * s / 2) + (s // 2 if word.strong else 0)
     text = word.text.encode("ascii", "replace").decode()
     (wide, tall), below = cv2.getTextSize(text, font, size, thick)

@@ -13,13 +13,28 @@ from typing import Literal
 
 import numpy as np
 
-MOST_POINTS = 800
-"""Of a curve; longer ones are drawn by the lowest and highest value of each stretch."""
-COLORS = 8
-_LEFT, _RIGHT, _TOP, _BOTTOM = 74, 16, 12, 46
-_CHARACTER = 9.0
-"""Mean width of a letter of the legend, pixels; pages on narrow windows have letters larger than lines."""
-_ROW = 20
+from ggslam.system.tuning import Tuning
+
+
+class PlotTuning(Tuning):
+    """How plots are laid out."""
+
+    max_points = 800
+    """Most points of a curve; a longer one is drawn by the lowest and highest value of each stretch."""
+    colors = 8
+    """Number of colours."""
+    left = 74
+    """Left margin, in pixels."""
+    right = 16
+    """Right margin, in pixels."""
+    top = 12
+    """Upper margin, in pixels."""
+    bottom = 46
+    """Lower margin, in pixels."""
+    character_width = 9.0
+    """Mean width of a letter of the legend, in pixels; narrow windows show letters larger than lines."""
+    legend_row = 20
+    """Height of a row of the legend, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -162,9 +177,9 @@ def draw(plot: Plot, width: int = 640, height: int = 300, titled: bool = False) 
         titled: whether the title is part of the drawing.
     """
     legend = _legend_rows(plot, width)
-    top = _TOP + (24 if titled else 0) + _ROW * len(legend)
+    top = PlotTuning.top + (24 if titled else 0) + PlotTuning.legend_row * len(legend)
     x0, x1, y0, y1 = _limits(plot)
-    left, right, bottom = float(_LEFT), float(width - _RIGHT), float(height - _BOTTOM)
+    left, right, bottom = float(PlotTuning.left), float(width - PlotTuning.right), float(height - PlotTuning.bottom)
     if plot.equal:
         x0, x1, y0, y1 = _equalise((x0, x1, y0, y1), right - left, bottom - top)
     drawing = Drawing(width, height, (left, top, right, bottom), (x0, x1, y0, y1))
@@ -182,7 +197,7 @@ def draw(plot: Plot, width: int = 640, height: int = 300, titled: bool = False) 
             drawing.items.append(Stroke(pixels, f"series{series.color}", 1.8, series.dashed, dots, number))
             if series.kind == "marked" and not dots:
                 drawing.items.append(Stroke(pixels, f"series{series.color}", dots=True))
-    _legend(drawing, plot, legend, _TOP + (24 if titled else 0))
+    _legend(drawing, plot, legend, PlotTuning.top + (24 if titled else 0))
     return drawing
 
 
@@ -197,7 +212,7 @@ def _parts(series: Series) -> list[np.ndarray]:
     if series.kind == "dots":
         return [xy[finite]] if finite.any() else []
     edges = np.flatnonzero(np.diff(np.concatenate([[False], finite, [False]]).astype(int)))
-    stride = max(1, math.ceil(len(xy) / MOST_POINTS))
+    stride = max(1, math.ceil(len(xy) / PlotTuning.max_points))
     return [_thin(xy[a:b], 2 * stride) for a, b in edges.reshape(-1, 2)]
 
 
@@ -272,7 +287,7 @@ def _legend_rows(plot: Plot, width: int) -> list[list[tuple[str, Series | None]]
     used = math.inf
     for entry in _entries(plot):
         wide = _entry_width(entry[0])
-        if used + wide > width - _LEFT - _RIGHT:
+        if used + wide > width - PlotTuning.left - PlotTuning.right:
             rows.append([])
             used = 0
         rows[-1].append(entry)
@@ -281,12 +296,12 @@ def _legend_rows(plot: Plot, width: int) -> list[list[tuple[str, Series | None]]
 
 
 def _entry_width(label: str) -> float:
-    return 40 + _CHARACTER * len(label)
+    return 40 + PlotTuning.character_width * len(label)
 
 
 def _legend(drawing: Drawing, plot: Plot, rows: list[list[tuple[str, Series | None]]], top: float) -> None:
     for number, row in enumerate(rows):
-        x, y = float(_LEFT), top + _ROW * number + 5
+        x, y = float(PlotTuning.left), top + PlotTuning.legend_row * number + 5
         for label, series in row:
             if series is None:
                 drawing.items.append(Box(x, y - 6, 18, 12, "band"))

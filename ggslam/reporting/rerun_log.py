@@ -12,10 +12,17 @@ import numpy as np
 from ggslam.errors import ConfigError, MissingDependency, RunFolderError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
+from ggslam.system.tuning import Tuning
 
 VIEWER = "rerun"
 _ENDING = ".rrd"
-_JPEG_QUALITY = 80
+
+
+class RerunImageTuning(Tuning):
+    """How images are sent to rerun."""
+
+    jpeg_quality = 80
+    """Quality of JPEG, of 100."""
 
 
 def check_target(target: str) -> None:
@@ -82,7 +89,7 @@ class RerunLog:
 
     def image(self, color: np.ndarray) -> None:
         """What the camera sees, uint8 [H, W, 3]; sent as JPEG."""
-        good, data = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        good, data = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, RerunImageTuning.jpeg_quality])
         if good:
             encoded = self._rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
             self._stream.log("world/camera/image", encoded)

@@ -45,7 +45,7 @@ from ggslam.coding.splats import (
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.gaussian_rows import GaussianRows
-from ggslam.merging.moving import with_channels
+from ggslam.merging.joint_map import with_channels
 from ggslam.objects.encoding import code_of
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder

@@ -11,7 +11,7 @@ from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.rendered_views import RenderedViews
 from ggslam.system.tuning import Tuning
-from ggslam.volumes.surface_points import MOST_BLOCKS
+from ggslam.volumes.surface_points import SurfacePointTuning
 
 
 class MapPointsTuning(Tuning):
@@ -55,4 +55,5 @@ def points_of_views(
     if discs or not len(views):
         return sample_parts(parts, voxel_size, min_opacity, views.segmented is not None)
     voxel_size = views.usual_voxel() if voxel_size is None else voxel_size
-    return views.points(voxel_size, MapPointsTuning.few_blocks if stored.in_cells else MOST_BLOCKS)
+    most = MapPointsTuning.few_blocks if stored.in_cells else SurfacePointTuning.max_blocks
+    return views.points(voxel_size, most)

@@ -11,7 +11,7 @@ import numpy as np
 from ggslam.errors import RunFolderError
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
-from ggslam.reporting.pictures import FITTED, IdentityColors
+from ggslam.reporting.pictures import IdentityColors, IdentityPictureTuning
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MapInParts
 from ggslam.scene.camera import Camera
@@ -64,7 +64,7 @@ class ObjectsInParts:
         """Colours of the identity vectors of the map, fitted to its labelled Gaussians; RunFolderError: it has none."""
         if not self.map.rows.like.feature_channels:
             raise RunFolderError(f"{self.folder.path}: its Gaussians have object ids, but no identity vectors")
-        step = max(1, sum(count for name, count in self.counts.items() if name > 0) // FITTED)
+        step = max(1, sum(count for name, count in self.counts.items() if name > 0) // IdentityPictureTuning.fitted)
         sample, seen = [np.empty((0, self.map.rows.like.features.shape[1]), np.float32)], 0
         for block in self.map.rows.blocks():
             labelled = np.flatnonzero(block.object_id.numpy() > 0)

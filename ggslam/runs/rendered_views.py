@@ -28,7 +28,7 @@ from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.poses import inverse
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.posed_view import PosedView
-from ggslam.volumes.surface_points import MOST_BLOCKS, surface_points
+from ggslam.volumes.surface_points import SurfacePointTuning, surface_points
 
 
 class RenderedViewTuning(Tuning):
@@ -159,7 +159,7 @@ class RenderedViews:
                 found.append((float(np.median(depth[depth > 0])), self.cameras[number].fx))
         return found
 
-    def points(self, voxel_size: float, most_blocks: int = MOST_BLOCKS) -> Iterator[VoxelCloud]:
+    def points(self, voxel_size: float, most_blocks: int = SurfacePointTuning.max_blocks) -> Iterator[VoxelCloud]:
         """The surface that the keyframes see, one point for each voxel of a grid; see
         `volumes.surface_points.surface_points`.
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.mapping.mapper import Mapper
-from ggslam.objects.same_object import FAINT, LabelledVoxels
+from ggslam.objects.same_object import LabelledVoxels, SameObjectTuning
 from ggslam.slam.loop_closing import Correction, LoopCloser
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
@@ -108,7 +108,7 @@ class MapCorrections:
         means, labels = gaussians.means.detach().cpu().numpy(), mapper.vote_labels().astype(np.int64)
         voxels = []
         for end in (correction.kept, correction.doubted):
-            rows = np.isin(birth, sorted(end)) & (opacities >= FAINT)
+            rows = np.isin(birth, sorted(end)) & (opacities >= SameObjectTuning.min_opacity)
             voxel = masks.settings.uniting.voxel
             voxels.append(LabelledVoxels.of(means[rows], labels[rows], opacities[rows], voxel))
         mapper.identity.merge(gaussians, masks.unite(voxels[0], voxels[1]))

@@ -10,11 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-TOP_MARGIN = 1.15
-"""How much more than the map the view from the top shows."""
-HEADROOM_M = 0.35
-"""The view from the top leaves out what is so much higher than the recording cameras: ceilings."""
+
+class CameraTuning(Tuning):
+    """From where a map is shown."""
+
+    top_margin = 1.15
+    """Factor on the map's size that the view from the top shows."""
+    headroom_m = 0.35
+    """The view from the top leaves out ceilings: what is this much higher than the cameras, in metres."""
+    look_ahead_m = 2.0
+    """Distance of the point that a page's camera turns around in front of a recorded camera, in metres."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +62,9 @@ def top_view(centers: np.ndarray, positions: np.ndarray, forward: np.ndarray, up
     low, high = np.percentile(centers, [1, 99], axis=0)
     middle = (low + high) / 2
     size = float(np.linalg.norm((high - low) - ((high - low) @ up) * up))
-    ceiling = float((positions @ up).max()) + HEADROOM_M
+    ceiling = float((positions @ up).max()) + CameraTuning.headroom_m
     cut = min(ceiling, float((centers @ up).max()))
-    height = TOP_MARGIN * size / 2 / math.tan(fov / 2)
+    height = CameraTuning.top_margin * size / 2 / math.tan(fov / 2)
     position = middle + (cut + height - float(middle @ up)) * up
     level = forward - (forward @ up) * up
     if np.linalg.norm(level) < 1e-3:

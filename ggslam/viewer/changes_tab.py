@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from ggslam.viewer.safe_text import plain
 from ggslam.viewer.stage import Stage
-from ggslam.viewer.words import plain
 
 NOTHING = "(none)"
 

@@ -12,17 +12,25 @@ import numpy as np
 
 from ggslam.errors import ConfigError
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
+from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import upright_axes
 from ggslam.viewer.model import EditableMap, ListedObject
+from ggslam.viewer.safe_text import plain
 from ggslam.viewer.stage import Stage
-from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser
 
 NOTHING = "(none)"
-_LIST_HEIGHT = 260
-_GIZMO_PIXELS = 110.0
+
+
+class ObjectsTabTuning(Tuning):
+    """How objects are listed and moved."""
+
+    list_height = 260
+    """Largest height of the list, in pixels."""
+    gizmo_size = 110.0
+    """Size of the handles that move an object, in pixels."""
 
 
 class ObjectsTab:
@@ -181,7 +189,7 @@ class ObjectsTab:
         record = self._records[self._one()]
         upright = upright_axes(self._model.up)
         gizmo = self._stage.server.scene.add_transform_controls(
-            "/selected/gizmo", scale=_GIZMO_PIXELS, fixed=True, position=record.centroid,
+            "/selected/gizmo", scale=ObjectsTabTuning.gizmo_size, fixed=True, position=record.centroid,
             wxyz=matrix_to_quaternion(upright),
         )  # fmt: skip
         self._gizmo = gizmo
@@ -221,5 +229,5 @@ def object_list(records: list[ListedObject], hidden: set[int], selected: int | N
             f'<div style="{style}"><span style="{swatch}"></span><span style="{clipped}">{label}</span>'
             f"<span>{record.gaussians:,}</span></div>"
         )
-    limits = f"max-height:{_LIST_HEIGHT}px;overflow-y:auto;margin:4px 10px;font-size:13px"
+    limits = f"max-height:{ObjectsTabTuning.list_height}px;overflow-y:auto;margin:4px 10px;font-size:13px"
     return f'<div style="{limits}">{"".join(rows)}</div>'

@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import matrix_to_quaternion
+from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import box_lines, frustum_lines, vertical_fov
 from ggslam.viewer.model import ShownChange, ShownMover
 from ggslam.viewer.splats import Splats
@@ -17,13 +18,25 @@ from ggslam.viewer.splats import Splats
 if TYPE_CHECKING:
     import viser
 
-UNIT_M = 0.01
-"""Splats are sent in centimetres and drawn at this scale: covariances travel in half precision, which in square metres
-would round splats of a millimetre to nothing."""
-_LABEL_GAP_M = 0.01
-_PATH, _KEYFRAMES, _SELECTED = (255, 176, 32), (110, 190, 255), (255, 235, 60)
-_WAS, _IS = (220, 30, 30), (20, 160, 60)
-"""As in the pictures of changes."""
+
+class SceneTuning(Tuning):
+    """How a map is drawn in space."""
+
+    unit_m = 0.01
+    """Unit that splats are sent in, in metres: covariances travel in half precision, which would round those of a
+    millimetre to nothing in square metres."""
+    label_gap_m = 0.01
+    """Distance of a label above its object, in metres."""
+    path_color = (255, 176, 32)
+    """RGB of the camera's path."""
+    keyframe_color = (110, 190, 255)
+    """RGB of keyframes."""
+    selected_color = (255, 235, 60)
+    """RGB of the selected object's box."""
+    old_color = (220, 30, 30)
+    """RGB of boxes where something was, as in the pictures of changes."""
+    new_color = (20, 160, 60)
+    """RGB of boxes where something is now."""
 
 
 class SceneNodes:
@@ -53,13 +66,13 @@ class SceneNodes:
     def set_group(self, object_id: int, splats: Splats) -> None:
         """Shows or replaces the splats of one object, where they belong."""
         values = (
-            splats.centers / np.float32(UNIT_M), splats.covariances / np.float32(UNIT_M**2),
+            splats.centers / np.float32(SceneTuning.unit_m), splats.covariances / np.float32(SceneTuning.unit_m**2),
             splats.colors, splats.opacities[:, None],
         )  # fmt: skip
         group = self._groups.get(object_id)
         if group is None:
             name = f"/map/{object_id}"
-            self._groups[object_id] = self._server.scene.add_gaussian_splats(name, *values, scale=UNIT_M)
+            self._groups[object_id] = self._server.scene.add_gaussian_splats(name, *values, scale=SceneTuning.unit_m)
         else:
             group.set_gaussians(*values)
             group.position, group.wxyz = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
@@ -84,11 +97,11 @@ class SceneNodes:
     def set_path(self, walks: list[np.ndarray]) -> None:
         """The ways of the cameras, [K, 3] each."""
         lines = np.concatenate([np.stack([walk[:-1], walk[1:]], axis=1) for walk in walks])
-        self._lines("/camera/path", lines, _PATH, 3.0)
+        self._lines("/camera/path", lines, SceneTuning.path_color, 3.0)
 
     def set_keyframes(self, T_world_camera: np.ndarray, camera: Camera, depth: float) -> None:
         """Pyramids at the keyframes, [K, 4, 4]."""
-        self._lines("/camera/keyframes", frustum_lines(T_world_camera, camera, depth), _KEYFRAMES, 1.0)
+        self._lines("/camera/keyframes", frustum_lines(T_world_camera, camera, depth), SceneTuning.keyframe_color, 1.0)
 
     def set_movers(self, movers: Sequence[ShownMover], frame: int) -> None:
         """The ways of what moved, and the boxes of what moves in a frame."""
@@ -104,18 +117,18 @@ class SceneNodes:
         """Boxes of what changed, and from middle to middle of what moved; None: nothing."""
         lines, colors = [np.zeros((0, 2, 3), np.float32)], [np.zeros((0, 2, 3), np.uint8)]
         if change is not None:
-            for box, color in ((change.old, _WAS), (change.new, _IS)):
+            for box, color in ((change.old, SceneTuning.old_color), (change.new, SceneTuning.new_color)):
                 lines += [] if box is None else [box_lines(*box)]
                 colors += [] if box is None else [np.broadcast_to(np.array(color, np.uint8), (12, 2, 3))]
             if change.old is not None and change.new is not None:
                 lines.append(np.array([[change.old[0], change.new[0]]], np.float32))
-                colors.append(np.array([[_WAS, _IS]], np.uint8))
+                colors.append(np.array([[SceneTuning.old_color, SceneTuning.new_color]], np.uint8))
         self._lines("/camera/change", np.concatenate(lines), np.concatenate(colors), 3.0)
 
     def set_box(self, center: np.ndarray, axes: np.ndarray, size: np.ndarray, up: np.ndarray, text: str) -> None:
         """Frames the selected object and writes a label above it."""
-        self._lines("/selected/box", box_lines(center, axes, size), _SELECTED, 2.0)
-        self._label_at = center + up * (np.abs(axes @ up) @ size / 2 + _LABEL_GAP_M)
+        self._lines("/selected/box", box_lines(center, axes, size), SceneTuning.selected_color, 2.0)
+        self._label_at = center + up * (np.abs(axes @ up) @ size / 2 + SceneTuning.label_gap_m)
         self._drop("/selected/label")
         self._marks["/selected/label"] = self._server.scene.add_label(
             "/selected/label", text, position=self._label_at, anchor="bottom-center"
@@ -133,7 +146,7 @@ class SceneNodes:
         scale = depth * float(np.cbrt(np.tan(fov / 2) ** 2 * aspect / 3))
         name = "/camera/now"
         self._marks[name] = self._server.scene.add_camera_frustum(
-            name, fov=fov, aspect=aspect, scale=scale, color=_PATH, image=picture,
+            name, fov=fov, aspect=aspect, scale=scale, color=SceneTuning.path_color, image=picture,
             thickness=2.5, thickness_units="screen", wxyz=matrix_to_quaternion(T_world_camera[:3, :3]),
             position=T_world_camera[:3, 3], visible=name not in self._hidden,
         )  # fmt: skip

@@ -8,19 +8,27 @@ import errno
 import io
 import socket
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
+from ggslam.viewer.access import Gate, guard
 from ggslam.viewer.cameras import fitting_fov
-from ggslam.viewer.gate import Gate, guard
 
 if TYPE_CHECKING:
     import viser
 
 DEFAULT_HOST = "127.0.0.1"
-DEFAULT_PORT = 8080
-PANEL_WIDTH = 384
+DEFAULT_PORT: Final = 8080
+"""Port of `--port` if it is left out."""
+
+
+class PanelTuning(Tuning):
+    """How the panel is laid out."""
+
+    width = 384
+    """Width of the panel, in pixels."""
 
 
 def open_server(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, title: str = "ggslam") -> viser.ViserServer:
@@ -65,7 +73,7 @@ def clear_page(server: viser.ViserServer, title: str = "ggslam") -> None:
     server.gui.set_panel_label(title)
     server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(64, 130, 230))
     server.gui.main_panel.dock_right()
-    server.gui.main_panel.set_width(PANEL_WIDTH)
+    server.gui.main_panel.set_width(PanelTuning.width)
     server.scene.world_axes.visible = False
 
 

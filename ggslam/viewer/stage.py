@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ggslam.errors import GgslamError
-from ggslam.viewer.cameras import Viewpoint, best_view, top_view, view_of_pose
+from ggslam.viewer.cameras import CameraTuning, Viewpoint, best_view, top_view, view_of_pose
 from ggslam.viewer.model import Box, Coloring, ViewedMap
+from ggslam.viewer.safe_text import plain
 from ggslam.viewer.scene_nodes import SceneNodes
-from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser
 
-LOOK_AHEAD_M = 2.0
-"""How far before a recorded camera the point lies that the page's camera turns around, metres."""
 
 
 class Stage:
@@ -94,7 +92,7 @@ class Stage:
 
     def _view_of(self, T_world_camera: np.ndarray) -> Viewpoint:
         """From a recorded camera, without the lines and the picture that are drawn right before it."""
-        return replace(view_of_pose(T_world_camera, LOOK_AHEAD_M), near=2.5 * self.depth)
+        return replace(view_of_pose(T_world_camera, CameraTuning.look_ahead_m), near=2.5 * self.depth)
 
     def go(self, client: viser.ClientHandle, view: Viewpoint) -> None:
         """Takes a page's camera to a place."""

@@ -17,19 +17,29 @@ import numpy as np
 
 from ggslam.rendering.types import Gaussians
 from ggslam.scene.gaussian_map import SH_C0
-from ggslam.viewer.cameras import Viewpoint, top_view, vertical_fov, view_of_pose
+from ggslam.system.tuning import Tuning
+from ggslam.viewer.cameras import CameraTuning, Viewpoint, top_view, vertical_fov, view_of_pose
 from ggslam.viewer.model import ListedObject, ViewedMap
-from ggslam.viewer.splats import LARGEST_M, colors_to_uint8, opacities_of
+from ggslam.viewer.splats import SplatTuning, colors_to_uint8, opacities_of
 
 STATIC = Path(__file__).with_name("static")
 _PARTS = ("renderer.js", "camera.js", "page.js")
-_SMALLEST_M = 1e-4
-SCALES = (float(np.log(_SMALLEST_M)), float(np.log(LARGEST_M)))
+
+
+class StaticPageTuning(Tuning):
+    """What a page of one file holds."""
+
+    min_size_m = 1e-4
+    """Smallest standard deviation that is stored, in metres."""
+    pictures = 24
+    """Most frames with pictures."""
+    max_path_points = 2000
+    """Most points of each path."""
+
+
+SCALES = (float(np.log(StaticPageTuning.min_size_m)), float(np.log(SplatTuning.max_size_m)))
 """Logarithms of the smallest and largest standard deviation that are written, 255 steps (4 %) apart."""
-PICTURES = 24
-"""Frames whose pictures are in the file, at most."""
-_PATH = 2000
-_LOOK_AHEAD_M = 2.0
+
 
 
 def pack_splats(
@@ -84,9 +94,11 @@ def static_page(
     packed, low, high = pack_splats(gaussians, rows, colors, owners, identity)
     objects = model.objects()
     frames = list(model.frame_poses)
-    shown = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, PICTURES).round().astype(int))]
+    shown = [
+        frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, StaticPageTuning.pictures).round().astype(int))
+    ]
     poses = np.stack(list(model.frame_poses.values()))
-    start = view_of_pose(poses[0], _LOOK_AHEAD_M)
+    start = view_of_pose(poses[0], CameraTuning.look_ahead_m)
     fov = vertical_fov(model.camera)
     top = top_view(gaussians.means.numpy()[rows], poses[:, :3, 3], poses[0, :3, 2], model.up, fov)
     scene = {
@@ -94,10 +106,10 @@ def static_page(
         "objects": [_object_values(record) for record in objects], "unlabelled": int((owners == 0).sum()),
         "about": model.describe(), "up": model.up, "fov": fov,
         "views": {"Start": _view(start), "Top": _view(top)},
-        "path": [walk[:: max(1, len(poses) // _PATH)].round(4) for walk in model.walks],
+        "path": [walk[:: max(1, len(poses) // StaticPageTuning.max_path_points)].round(4) for walk in model.walks],
         "frames": [
             {"frame": frame, "picture": _jpeg(model.frame_picture(frame)[0]),
-             "view": _view(view_of_pose(model.frame_poses[frame], _LOOK_AHEAD_M))} for frame in shown
+             "view": _view(view_of_pose(model.frame_poses[frame], CameraTuning.look_ahead_m))} for frame in shown
         ],
     }  # fmt: skip
     script = "\n".join((STATIC / name).read_text(encoding="utf-8") for name in _PARTS)

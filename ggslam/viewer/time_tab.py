@@ -7,10 +7,15 @@ import threading
 import time
 from typing import Any
 
+from ggslam.system.tuning import Tuning
 from ggslam.viewer.stage import Stage
 
-FRAMES_PER_SECOND = 8.0
-"""When playing."""
+
+class PlaybackTuning(Tuning):
+    """How a recording is played."""
+
+    frames_per_s = 8.0
+    """Frames per second."""
 
 
 class TimeTab:
@@ -81,4 +86,4 @@ class TimeTab:
             began = time.monotonic()
             self.slider.value = (int(self.slider.value) + 1) % len(self._frames)
             self._wanted.set()
-            time.sleep(max(0.01, 1 / FRAMES_PER_SECOND - (time.monotonic() - began)))
+            time.sleep(max(0.01, 1 / PlaybackTuning.frames_per_s - (time.monotonic() - began)))

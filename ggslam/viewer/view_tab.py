@@ -10,12 +10,19 @@ import cv2
 import numpy as np
 
 from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import canvas_camera, shorter_fov
 from ggslam.viewer.model import COLORINGS
 from ggslam.viewer.stage import Stage
 
-PICTURE_SIZE = 1920
-"""Pixels of the longer side of a saved picture."""
+
+class SavedPictureTuning(Tuning):
+    """How a picture is saved."""
+
+    size = 1920
+    """Longer side, in pixels."""
+
+
 _LINES = {"path": "Camera path", "keyframes": "Keyframes", "now": "Current frame"}
 
 
@@ -33,7 +40,9 @@ class ViewTab:
                 self._line_box(name, label)
             if stage.movers:
                 self._line_box("movers", "What moved")
-        save = gui.add_button("Save picture", icon="camera", hint=f"Rendered by ggslam, {PICTURE_SIZE} pixels wide")
+        save = gui.add_button(
+            "Save picture", icon="camera", hint=f"Rendered by ggslam, {SavedPictureTuning.size} pixels wide"
+        )
 
         @coloring.on_update
         @stage.guard
@@ -63,7 +72,9 @@ class ViewTab:
             self._stage.nodes.show_lines(name, box.value)
 
     def _save(self, client: Any) -> str:
-        camera = canvas_camera(client.camera.image_width, client.camera.image_height, client.camera.fov, PICTURE_SIZE)
+        camera = canvas_camera(
+            client.camera.image_width, client.camera.image_height, client.camera.fov, SavedPictureTuning.size
+        )
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = quaternion_to_matrix(client.camera.wxyz), client.camera.position
         picture = self._stage.model.picture(camera, T, self._stage.hidden)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -25,8 +26,8 @@ from ggslam.native.loader import load_library
 from ggslam.system.settings import setting, settings_class
 from ggslam.volumes.tsdf import VOXELS, TsdfMap
 
-_MOST_VOXELS = 2000
-"""Largest distance in voxels; the core counts them in 16 bits."""
+_MOST_VOXELS: Final = 2000
+"""Largest distance in voxels that the compiled core can count."""
 
 
 @settings_class(frozen=True)

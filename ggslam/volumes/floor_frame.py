@@ -13,12 +13,18 @@ import numpy as np
 
 from ggslam.scene.poses import inverse, matrix_to_quaternion
 from ggslam.system.atomic import write_text
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.output_frame import OutputFrame
 from ggslam.volumes.upright import Upright
 
 FLOOR_FILE = "floor.yaml"
-BELOW_CAMERAS = 1.0
-"""Metres below the lowest camera that stand for the floor where none was seen."""
+
+
+class FloorTuning(Tuning):
+    """Where the floor is if none was seen."""
+
+    below_cameras_m = 1.0
+    """Distance below the lowest camera, in metres."""
 
 
 def level_axes(up: np.ndarray) -> np.ndarray:
@@ -34,11 +40,11 @@ def level_axes(up: np.ndarray) -> np.ndarray:
 
 
 def floor_height(upright: Upright, poses: np.ndarray) -> float:
-    """Height of the floor along `upright.up`, metres from the map's origin; without one, `BELOW_CAMERAS` under the
-    lowest of the cameras T_map_camera [N, 4, 4]."""
+    """Height of the floor along `upright.up`, metres from the map's origin; without one, `FloorTuning.below_cameras_m`
+    under the lowest of the cameras T_map_camera [N, 4, 4]."""
     if upright.floor is not None:
         return upright.floor
-    return float((np.asarray(poses)[:, :3, 3] @ upright.up).min()) - BELOW_CAMERAS
+    return float((np.asarray(poses)[:, :3, 3] @ upright.up).min()) - FloorTuning.below_cameras_m
 
 
 def floor_from_map(upright: Upright, poses: np.ndarray) -> np.ndarray:

@@ -9,9 +9,14 @@ from ggslam.abi.core import FusionInput
 from ggslam.errors import InputError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 
-_RIGID = 0.02
-"""Largest entry by which R^T R of a pose may differ from the unit matrix."""
+
+class PoseCheckTuning(Tuning):
+    """When a pose is a rotation and a translation."""
+
+    max_error = 0.02
+    """Largest entry by which R^T R may differ from the unit matrix."""
 
 
 class FusionView:
@@ -48,7 +53,7 @@ class FusionView:
         if T.shape != (4, 4) or not np.isfinite(T).all():
             raise InputError(f"T_world_camera: expected a finite matrix [4, 4], found {T_world_camera}")
         R = T[:3, :3]
-        if np.abs(R.T @ R - np.eye(3)).max() > _RIGID or np.linalg.det(R) < 0:
+        if np.abs(R.T @ R - np.eye(3)).max() > PoseCheckTuning.max_error or np.linalg.det(R) < 0:
             raise InputError(f"T_world_camera: expected a rotation in the upper left, found {R.tolist()}")
         if np.abs(T[:3, 3]).max() > limit:
             raise InputError(f"T_world_camera: expected a position within {limit:g} m, found {T[:3, 3].tolist()}")

@@ -7,18 +7,24 @@ import numpy as np
 
 from ggslam.geometry.normals import estimate_normals, turn_toward
 from ggslam.rendering.types import Gaussians
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.upright import Upright, estimate_up
 
-_SAMPLED = 20_000
-"""Gaussians that are looked at, about."""
-_NEIGHBOURS = 64
-_THICKNESS = 0.1
-"""Most that a surface varies along its normal, as a share of its variance across. So many neighbours and this found up
-of five generated and rendered rooms to 0.1 to 1.8 degrees; by the axes in which single Gaussians are thinnest, which
-training leaves anywhere, two of them were 6 and 12 off."""
-_FAINTEST = 0.0
-"""Logit of the opacity of what belongs to a surface."""
-_LEAST_SUPPORT = 0.05
+
+class MapUprightTuning(Tuning):
+    """Which Gaussians show the direction up."""
+
+    samples = 20_000
+    """Gaussians that are used, about."""
+    neighbours = 64
+    """Neighbours that give the normal at a Gaussian."""
+    max_thickness = 0.1
+    """Largest variance along the normal, as a share of the variance across. Five rooms came out within 0.1 to 1.8
+    degrees."""
+    min_opacity_logit = 0.0
+    """Logit of the opacity above which a Gaussian belongs to a surface."""
+    min_support = 0.05
+    """Smallest share of the points on horizontal surfaces."""
 
 
 def upright_of(gaussians: Gaussians, poses: np.ndarray) -> Upright:
@@ -28,12 +34,12 @@ def upright_of(gaussians: Gaussians, poses: np.ndarray) -> Upright:
         gaussians: the map.
         poses: T_world_camera [N, 4, 4] of the frames.
     """
-    opaque = gaussians.opacity_logits.numpy() > _FAINTEST
+    opaque = gaussians.opacity_logits.numpy() > MapUprightTuning.min_opacity_logit
     points = gaussians.means.numpy()[opaque].astype(np.float64)
-    rows = np.arange(0, len(points), max(1, len(points) // _SAMPLED))
-    if len(points) <= _NEIGHBOURS:
+    rows = np.arange(0, len(points), max(1, len(points) // MapUprightTuning.samples))
+    if len(points) <= MapUprightTuning.neighbours:
         return estimate_up(poses, np.zeros((0, 3)), np.zeros((0, 3)))
-    normals = estimate_normals(points, rows, _NEIGHBOURS, thickness=_THICKNESS)
+    normals = estimate_normals(points, rows, MapUprightTuning.neighbours, thickness=MapUprightTuning.max_thickness)
     # A plane has no front; a camera saw it from the side where the cameras are.
     normals = turn_toward(normals, poses[:, :3, 3].mean(axis=0) - points[rows])
-    return estimate_up(poses, points[rows], normals, _LEAST_SUPPORT)
+    return estimate_up(poses, points[rows], normals, MapUprightTuning.min_support)

@@ -19,6 +19,7 @@ import torch
 from ggslam.errors import ConfigError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
@@ -27,8 +28,12 @@ from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.tsdf_torch import TorchTsdf
 from ggslam.volumes.volume_settings import VolumeSettings
 
-WINDOW = 50
-"""Frames over which times are averaged, to see whether they grow with the map."""
+
+class VolumeTimesTuning(Tuning):
+    """How times are summarised."""
+
+    window = 50
+    """Frames over which times are averaged, to see whether they grow with the map."""
 
 
 @dataclass
@@ -60,7 +65,7 @@ class VolumeTimes:
         return np.array([sum(row.values()) for row in self.rows if len(row) == len(parts)])
 
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Milliseconds a frame by part: mean, 95 %, largest, and means by `WINDOW` frames."""
+        """Milliseconds a frame by part: mean, 95 %, largest, and means by `VolumeTimesTuning.window` frames."""
         return {name: _statistics(seconds) for name, seconds in {**self.parts(), "all": self.whole()}.items()}
 
 
@@ -68,7 +73,7 @@ def _statistics(seconds: np.ndarray) -> dict[str, Any]:
     ms = 1e3 * seconds
     if not len(ms):
         return {"mean_ms": 0.0, "p95_ms": 0.0, "max_ms": 0.0, "by_window_ms": []}
-    windows = [float(ms[k : k + WINDOW].mean()) for k in range(0, len(ms), WINDOW)]
+    windows = [float(ms[k : k + VolumeTimesTuning.window].mean()) for k in range(0, len(ms), VolumeTimesTuning.window)]
     return {"mean_ms": float(ms.mean()), "p95_ms": float(np.percentile(ms, 95)), "max_ms": float(ms.max()),
             "by_window_ms": windows}  # fmt: skip
 

@@ -5,10 +5,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.tsdf import OCCUPIED_HITS, SIDE, VOXELS, TsdfMap
 
-_CHUNK = 4096
-"""Blocks read at a time."""
+
+class MeasuredPointTuning(Tuning):
+    """How points are read."""
+
+    blocks_at_once = 4096
+    """Blocks that are read at a time."""
+
+
 _VOXEL = np.stack(np.unravel_index(np.arange(VOXELS), (SIDE,) * 3)[::-1], 1)
 _OCTANT = np.stack(np.unravel_index(np.arange(8), (2,) * 3)[::-1], 1)
 
@@ -18,8 +25,8 @@ def measured_octants(tsdf: TsdfMap) -> np.ndarray:
     a quarter of a voxel from its centre along each axis."""
     blocks = tsdf.blocks()
     dense, found = blocks.coordinates[blocks.dense], [np.zeros((0, 3))]
-    for start in range(0, len(dense), _CHUNK):
-        at = dense[start : start + _CHUNK]
+    for start in range(0, len(dense), MeasuredPointTuning.blocks_at_once):
+        at = dense[start : start + MeasuredPointTuning.blocks_at_once]
         held = tsdf.read(at)
         bits = np.where(held.hits >= OCCUPIED_HITS, held.octants, 0)[:, :, None] >> np.arange(8) & 1
         block, voxel, octant = np.nonzero(bits)

@@ -13,7 +13,7 @@ import ctypes
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -27,7 +27,12 @@ from ggslam.volumes.occupancy_arrays import LEAF, contiguous_points, output_byte
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
 from ggslam.volumes.quantization import KEY_OFFSET, check_resolution
 
-UNKNOWN, FREE, OCCUPIED = -1, 0, 1
+UNKNOWN: Final = -1
+"""Value of a place that was not seen; the compiled core gives it."""
+FREE: Final = 0
+"""Value of a free place."""
+OCCUPIED: Final = 1
+"""Value of an occupied place."""
 _WHICH = {"all": 0, "occupied": 1, "free": 2}
 
 

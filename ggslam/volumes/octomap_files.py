@@ -16,31 +16,47 @@ import ctypes
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.system.atomic import write_bytes
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.occupancy_arrays import output_bytes
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
-from ggslam.volumes.quantization import RESOLUTION_RANGE
+from ggslam.volumes.quantization import QuantizationTuning
 
-_BINARY, _FULL = 0, 1
+_BINARY: Final = 0
+"""Code of OctoMap's binary format (.bt) in the compiled core."""
+_FULL: Final = 1
+"""Code of OctoMap's full format (.ot) there."""
 _FIRST_LINES = {_BINARY: "# Octomap OcTree binary file", _FULL: "# Octomap OcTree file"}
 _COMMENT = "# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
 _ORIGIN = "# origin "
-_MAXIMUM_HEADER_BYTES = 1 << 16
-_BLOCK_BYTES = 2112
-_CUT_OFF = 1
+
+
+class OctomapFileTuning(Tuning):
+    """Limits of files that are read."""
+
+    max_header_bytes = 1 << 16
+    """Largest header, in bytes."""
+
+
+_BLOCK_BYTES: Final = 2112
+"""Bytes of a block of the compiled core's tree."""
+_CUT_OFF: Final = 1
+"""The compiled core's code for a file that ends too early."""
 _FAULTS = {
     2: "a node of the finest level has children",
     3: "an inner node has no children",
     4: "a leaf's value is not finite",
 }
-_TOO_LARGE = 5
+_TOO_LARGE: Final = 5
+"""The compiled core's code for a tree above the memory limit."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +165,7 @@ def _read_header(data: bytes, name: str) -> _Header:
     kind = next((kind for kind, line in _FIRST_LINES.items() if line == first_line), None)
     if kind is None:
         raise FormatError(f"{name}: no OctoMap file: the first line should be {' or '.join(_FIRST_LINES.values())!r}")
-    end = data.find(b"\ndata\n", 0, _MAXIMUM_HEADER_BYTES)
+    end = data.find(b"\ndata\n", 0, OctomapFileTuning.max_header_bytes)
     if end < 0:
         raise FormatError(f"{name}: the header has no line 'data': cut off or damaged")
     fields, origin = {}, np.zeros(3)
@@ -162,7 +178,7 @@ def _read_header(data: bytes, name: str) -> _Header:
     if fields.get("id") != "OcTree":
         raise FormatError(f"{name}: expected a map of kind OcTree, found {fields.get('id', 'none')!r}")
     nodes, resolution = _number(fields, "size", name), _number(fields, "res", name)
-    low, high = RESOLUTION_RANGE
+    low, high = QuantizationTuning.resolution_range
     if not low <= resolution <= high:
         raise FormatError(f"{name}: res: expected {low:g} to {high:g} m, found {fields['res']}")
     if nodes < 0 or nodes != int(nodes):

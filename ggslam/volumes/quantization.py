@@ -8,17 +8,24 @@ centres, would put points into voxels that the map tells apart.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from ggslam.errors import ConfigError
 from ggslam.native.loader import NativeContext, load_library
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.occupancy_arrays import contiguous_points
 
-KEY_OFFSET = 32768
-"""Key of the voxel whose lower corner is the origin of the world."""
-RESOLUTION_RANGE = (1e-4, 1e3)
-"""Edges of a voxel that are possible, metres."""
+KEY_OFFSET: Final = 32768
+"""OctoMap's key of the voxel whose lower corner is the origin of the world."""
+
+
+class QuantizationTuning(Tuning):
+    """Limits of the key grid."""
+
+    resolution_range = (1e-4, 1e3)
+    """Smallest and largest edge of a voxel, in metres."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +81,6 @@ def key_centers(keys: np.ndarray, resolution: float) -> np.ndarray:
 
 def check_resolution(resolution: float) -> None:
     """Raises ConfigError for an impossible edge of a voxel."""
-    low, high = RESOLUTION_RANGE
+    low, high = QuantizationTuning.resolution_range
     if not low <= resolution <= high:
         raise ConfigError(f"resolution: expected {low:g} to {high:g} m, found {resolution}")

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import field
+from typing import Final
 
 from ggslam.system.settings import setting, settings_class
 
-GRAVITY = 9.81
-"""Metres per second squared."""
+GRAVITY: Final = 9.81
+"""Gravity of the earth, in metres per second squared."""
 
 
 @settings_class(frozen=True)

@@ -7,17 +7,29 @@ from dataclasses import replace
 
 from ggslam.geometry.scene_size import voxel_times
 from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
+from ggslam.system.tuning import Tuning
 
-_LARGEST_VOXEL, _FARTHEST, _LEAST_MAX_WEIGHT, _LEAST_FREE_WEIGHT = 1.0, 1000.0, 1.0, 0.1
+
+class TsdfLimits(Tuning):
+    """Limits of the settings of a TSDF."""
+
+    max_voxel = 1.0
+    """Largest voxel, in metres."""
+    max_depth = 1000.0
+    """Largest depth, in metres."""
+    min_max_weight = 1.0
+    """Smallest `max_weight`."""
+    min_max_free_weight = 0.1
+    """Smallest `max_free_weight`."""
 
 
 @tuning_class(frozen=True)
 class TsdfTuning:
     """Numbers of fusing depth."""
 
-    max_weight: float = setting(16.0, _LEAST_MAX_WEIGHT, 1000)
+    max_weight: float = setting(16.0, TsdfLimits.min_max_weight, 1000)
     """Largest weight of a voxel, in measurements from 1 m."""
-    max_free_weight: float = setting(1.0, _LEAST_FREE_WEIGHT, 1000)
+    max_free_weight: float = setting(1.0, TsdfLimits.min_max_free_weight, 1000)
     """Largest weight of a voxel in free space, small so that new things appear soon."""
     free_share: float = setting(0.9, 0.1, 1)
     """An empty block is free if all depth lies behind it and this share of its pixels has depth."""
@@ -34,14 +46,14 @@ class TsdfTuning:
 class TsdfSettings(TsdfTuning):
     """How depth is fused."""
 
-    voxel: float = setting(0.02, 1e-3, _LARGEST_VOXEL, "m", basic=True)
+    voxel: float = setting(0.02, 1e-3, TsdfLimits.max_voxel, "m", basic=True)
     """Edge of a voxel; half of it makes four times as many near surfaces. The default grows in scenes larger than rooms
     (median depth above 6 m)."""
     truncation_voxels: float = setting(4.0, 2, 32, "voxels")
     """Distances are stored up to this many voxels on both sides of a surface."""
     min_depth: float = setting(0.1, 0, 100, "m")
     """Nearer depth is ignored."""
-    max_depth: float = setting(7.0, 0.1, _FARTHEST, "m", basic=True)
+    max_depth: float = setting(7.0, 0.1, TsdfLimits.max_depth, "m", basic=True)
     """Farther depth makes no surface but frees the space up to this range. The default grows in scenes larger than
     rooms."""
 
@@ -64,10 +76,10 @@ class TsdfSettings(TsdfTuning):
         are as much as a measurement from so many metres: in a large scene nothing is seen from near."""
         usual, names = TsdfSettings(), ("voxel", "max_depth", "max_weight", "max_free_weight")
         new = (
-            min(usual.voxel * times, _LARGEST_VOXEL),
-            min(usual.max_depth * times, _FARTHEST),
-            max(usual.max_weight / times**2, _LEAST_MAX_WEIGHT),
-            max(usual.max_free_weight / times**2, _LEAST_FREE_WEIGHT),
+            min(usual.voxel * times, TsdfLimits.max_voxel),
+            min(usual.max_depth * times, TsdfLimits.max_depth),
+            max(usual.max_weight / times**2, TsdfLimits.min_max_weight),
+            max(usual.max_free_weight / times**2, TsdfLimits.min_max_free_weight),
         )
         left = {n: v for n, v in zip(names, new, strict=True) if getattr(self, n) == getattr(usual, n)}
         return replace(self, **left)

@@ -9,20 +9,34 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
 
 from ggslam.errors import InputError
 from ggslam.system.atomic import write_bytes, write_text
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
 from ggslam.volumes.measured_points import measured_octants
 from ggslam.volumes.tsdf import SIDE
 
-OCCUPIED, FREE, UNKNOWN = 0, 254, 205
-"""Grey values of a ROS map."""
-_MOST_CELLS = 50_000_000
+OCCUPIED: Final = 0
+"""Grey of an occupied cell in a ROS map."""
+FREE: Final = 254
+"""Grey of a free cell there."""
+UNKNOWN: Final = 205
+"""Grey of an unknown cell there."""
+
+
+class SliceTuning(Tuning):
+    """Limits of a slice."""
+
+    max_cells = 50_000_000
+    """Most cells."""
+
+
 _BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
@@ -120,8 +134,8 @@ def slice_field(
     if not resolution > 0 or (band is not None and not band[0] <= band[1]):
         raise InputError(f"expected a positive resolution and an ascending band, found {resolution} and {band}")
     width, height = (max(1, int(np.ceil((plane.high[a] - plane.low[a]) / resolution - 1e-6))) for a in (0, 1))
-    if width * height > _MOST_CELLS:
-        raise InputError(f"resolution: {width} x {height} cells are more than {_MOST_CELLS}")
+    if width * height > SliceTuning.max_cells:
+        raise InputError(f"resolution: {width} x {height} cells are more than {SliceTuning.max_cells}")
     x = plane.low[0] + (np.arange(width) + 0.5) * resolution
     y = plane.low[1] + (np.arange(height) + 0.5) * resolution
     centres = (plane.origin + y[::-1, None, None] * plane.y_axis + x[None, :, None] * plane.x_axis).reshape(-1, 3)

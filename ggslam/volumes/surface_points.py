@@ -19,26 +19,35 @@ from ggslam.formats.voxel_cloud import VoxelCloud, VoxelSums, cloud_of_sums, pac
 from ggslam.geometry.scene_size import surface_reach
 from ggslam.geometry.voxels import neighbour_step, voxel_keys
 from ggslam.native.loader import NativeContext
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.posed_view import PosedView
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import SIDE, TsdfMap
 
-_TRUNCATION = 3.0
-"""Voxels on either side of the surface that a view tells about."""
-LEAST_WEIGHT = 0.06
-"""In measurements from 1 m: what one view from 3 m tells of a voxel halfway through its truncation. Where more is asked
-for, a surface has a rim without points; where less, noisy maps have points that only one view shows."""
-_LEAST_AREA = 0.1
-"""Squared voxels: where the surface only cuts off a corner of a voxel, its neighbours have the point."""
-_CUBE_BLOCKS = 4
-"""Edge of the cubes that finished space is counted in, blocks."""
+
+class SurfacePointTuning(Tuning):
+    """How points of a surface are found."""
+
+    truncation = 3.0
+    """Voxels on either side of the surface that a view updates."""
+    min_weight = 0.06
+    """Smallest weight, in measurements from 1 m: what one view from 3 m gives a voxel halfway through its truncation. A
+    larger one leaves a rim without points, a smaller one keeps points that only one view shows."""
+    min_area = 0.1
+    """Smallest area of surface in a voxel, in squared voxels: where a corner is cut off, the neighbours have the point.
+    """
+    cube_blocks = 4
+    """Edge of the cubes that finished space is counted in, in blocks."""
+    triangles_at_once = 50_000
+    """Triangles whose points are held in memory at a time."""
+    growth = 1.5
+    """Growth of the blocks until finished ones are searched again."""
+    max_blocks = 40_000
+    """Blocks that are held before finished ones are handed out; 5 KB each."""
+
+
 _NEIGHBOURS = np.array([neighbour_step(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
-_CHUNK = 50_000
-"""Triangles whose points are held in memory at a time."""
-_GROWTH = 1.5
-MOST_BLOCKS = 40_000
-"""Blocks held before finished ones are handed out; 5 KB each."""
 
 
 Look = Callable[[int, bool], PosedView]
@@ -46,7 +55,8 @@ Look = Callable[[int, bool], PosedView]
 
 
 def surface_points(
-    look: Look, count: int, voxel_size: float, with_object_id: bool = False, most_blocks: int = MOST_BLOCKS,
+    look: Look, count: int, voxel_size: float, with_object_id: bool = False,
+    most_blocks: int = SurfacePointTuning.max_blocks,
     context: NativeContext | None = None, times: float = 1.0,
 ) -> Iterator[VoxelCloud]:  # fmt: skip
     """The points of a surface, in clouds one after the other that have no voxel in common.
@@ -59,22 +69,23 @@ def surface_points(
         count: their number.
         voxel_size: metres.
         with_object_id: whether the points carry object ids.
-        most_blocks: see `MOST_BLOCKS`.
+        most_blocks: see `SurfacePointTuning.max_blocks`.
         context: threads to work on.
         times: size of the scene against a room's, see `geometry.scene_size.voxel_times`: tells how far views are fused.
 
     Raises:
         VoxelError: voxels too small for what a view shows.
     """
-    settings = surface_settings(voxel_size, times, _TRUNCATION)
+    settings = surface_settings(voxel_size, times, SurfacePointTuning.truncation)
     of_view = [_cubes(look(k, True), voxel_size, settings.max_depth) for k in range(count)]
-    sweep = _Sweep(TsdfMap(settings, context, points=False), of_view, LEAST_WEIGHT / times**2)
+    sweep = _Sweep(TsdfMap(settings, context, points=False), of_view, SurfacePointTuning.min_weight / times**2)
     limit = most_blocks
     for number in range(count):
         sweep.add(number, look(number, False))
         if sweep.blocks > limit or number == count - 1:
             yield from sweep.take_finished(with_object_id)
-            limit = max(most_blocks, int(_GROWTH * sweep.blocks))  # where little is finished, it pays to look rarely
+            # Where little is finished, it pays to look rarely.
+            limit = max(most_blocks, int(SurfacePointTuning.growth * sweep.blocks))
 
 
 def surface_settings(voxel_size: float, times: float, truncation_voxels: float | None = None) -> TsdfSettings:
@@ -87,7 +98,7 @@ def surface_settings(voxel_size: float, times: float, truncation_voxels: float |
 def _cubes(view: PosedView, voxel_size: float, reach: float) -> np.ndarray:
     """The cubes that a view's surfaces within reach lie in, keys, each once."""
     near = replace(view, depth=np.where(view.depth <= reach, view.depth, np.float32(0)))
-    return np.unique(voxel_keys(near.points(), voxel_size * SIDE * _CUBE_BLOCKS))
+    return np.unique(voxel_keys(near.points(), voxel_size * SIDE * SurfacePointTuning.cube_blocks))
 
 
 class _Sweep:
@@ -112,7 +123,9 @@ class _Sweep:
         """The points of what is finished, which is forgotten when all were taken."""
         out = self._handed_out
         for cloud in _clouds_of(extract_mesh(self._tsdf, self._least), self._voxel, with_object_id):
-            of_point = voxel_keys(cloud.grid + np.rint(cloud.origin / self._voxel), SIDE * _CUBE_BLOCKS)
+            of_point = voxel_keys(
+                cloud.grid + np.rint(cloud.origin / self._voxel), SIDE * SurfacePointTuning.cube_blocks
+            )
             present = np.unique(of_point)
             ripe = present[self._all_around(present, self._to_come.are_done)]
             new = np.setdiff1d(ripe, out, assume_unique=True)
@@ -130,7 +143,7 @@ class _Sweep:
     def _forget(self) -> None:
         """Blocks that no cube to be handed out needs go."""
         at = self._tsdf.blocks().coordinates
-        cubes = voxel_keys(at, _CUBE_BLOCKS)
+        cubes = voxel_keys(at, SurfacePointTuning.cube_blocks)
         present = np.unique(cubes)
         needless = self._all_around(present, lambda keys: self._to_come.are_done(keys) & self._is_out(keys, present))
         self._tsdf.erase(at[np.isin(cubes, present[needless])])
@@ -145,8 +158,10 @@ def _clouds_of(mesh: Mesh, voxel: float, with_object_id: bool) -> Iterator[Voxel
     labels = mesh.triangle_labels().astype(np.int32) if with_object_id else np.zeros(len(mesh.triangles), np.int32)
     start = 0
     while start < len(mesh.triangles):
-        keys, centroid, area = _triangles(mesh, start, start + _CHUNK, voxel)
-        if start + _CHUNK < len(mesh.triangles):  # the last voxel may go on in the next chunk
+        keys, centroid, area = _triangles(mesh, start, start + SurfacePointTuning.triangles_at_once, voxel)
+        if start + SurfacePointTuning.triangles_at_once < len(
+            mesh.triangles
+        ):  # the last voxel may go on in the next chunk
             others = np.flatnonzero(keys != keys[-1])
             count = int(others[-1]) + 1 if len(others) else len(keys)
         else:
@@ -154,7 +169,7 @@ def _clouds_of(mesh: Mesh, voxel: float, with_object_id: bool) -> Iterator[Voxel
         part, weight = slice(start, start + count), area[:count, None]
         color = mesh.colors[mesh.triangles[part]].mean(1) / 255
         sums = VoxelSums(keys[:count], labels[part], area[:count], weight * color, weight * centroid[:count])
-        yield cloud_of_sums(VoxelSums.of([sums]), voxel, with_object_id, _LEAST_AREA * voxel**2)
+        yield cloud_of_sums(VoxelSums.of([sums]), voxel, with_object_id, SurfacePointTuning.min_area * voxel**2)
         start += count
 
 

@@ -5,17 +5,26 @@ tsdf_candidates.cpp), for all blocks of the frustum at once instead of from larg
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-TILE = 4
-NEAR = 0.02
-_CHUNK = 1 << 22
-"""Pairs of block and tile looked at together."""
+TILE: Final = 4
+"""Pixels along the edge of the compiled core's tiles of depth."""
+NEAR: Final = 0.02
+"""Depth from which the compiled core updates blocks, in metres."""
+
+
+class CandidateTuning(Tuning):
+    """How blocks are searched."""
+
+    pairs_at_once = 1 << 22
+    """Pairs of a block and a tile that are checked at a time."""
 
 
 @dataclass(frozen=True)
@@ -161,8 +170,8 @@ def _look(
     counts = columns * (area[:, 3] - area[:, 1] + 1)
     ends = counts.cumsum(0)
     total = int(ends[-1]) if n else 0
-    for begin in range(0, total, _CHUNK):
-        pair = torch.arange(begin, min(begin + _CHUNK, total), device=device)
+    for begin in range(0, total, CandidateTuning.pairs_at_once):
+        pair = torch.arange(begin, min(begin + CandidateTuning.pairs_at_once, total), device=device)
         b = torch.searchsorted(ends, pair, right=True)
         within = pair - (ends[b] - counts[b])
         u, v = area[b, 0] + within % columns[b], area[b, 1] + within // columns[b]

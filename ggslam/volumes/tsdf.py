@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass, fields, replace
+from typing import Final
 
 import numpy as np
 
@@ -24,18 +25,21 @@ from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.working_voxel import working_voxel
 
-SIDE = 8
+SIDE: Final = 8
+"""Voxels along the edge of a block."""
 VOXELS = SIDE**3
-FREE_VALUE = 32767
-FULL_WEIGHT = 65535
-LEAST_WEIGHT = 65
-"""Decay forgets voxels of less than this."""
-MOST_VOXELS = 1e9
-"""Voxels farther than this from the origin could not be numbered."""
+FREE_VALUE: Final = 32767
+"""Value of a free voxel: the largest of 16 bits."""
+FULL_WEIGHT: Final = 65535
+"""The largest weight: 16 bits."""
+LEAST_WEIGHT: Final = 65
+"""Decay forgets voxels of less weight; 65535 is full."""
+MOST_VOXELS: Final = 1e9
+"""Voxels farther from the origin than this cannot be numbered."""
 _DTYPES = {"value": np.int16, "weight": np.uint16, "label": np.uint16, "color": np.uint8, "votes": np.uint8,
            "hits": np.uint8, "octants": np.uint8}  # fmt: skip
-OCCUPIED_HITS = 128
-"""Voxels of so much evidence have measured points in them."""
+OCCUPIED_HITS: Final = 128
+"""Evidence from which a voxel holds measured points; the compiled core counts in 8 bits."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from ggslam.system.atomic import write_bytes
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import VOXELS, TsdfMap
 
-_VERSION = 2
+_VERSION: Final = 2
+"""Version of the file."""
 _ORIGIN = "origin"
 """Where in the world blocks are counted from, float64 [3]; there if it is not zero."""
 _CONTENT = "a TSDF"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,16 +19,31 @@ from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.torch_candidates import NEAR, BlockCandidates, DeviceView, find_candidates
 from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, MOST_VOXELS, OCCUPIED_HITS, SIDE, VOXELS, TsdfMap
 
-_DOUBT, _DOUBTFUL_SHARE = 0.03, 0.03
-_SURPRISE = 0.5
+_DOUBT: Final = 0.03
+"""The compiled core's: share of the depth behind a voxel that makes free space certain."""
+_DOUBTFUL_SHARE: Final = 0.03
+"""The compiled core's: share of its weight that an uncertain view may take from a voxel."""
+_SURPRISE: Final = 0.5
+"""The compiled core's: difference to the stored value, as a share of the truncation, that is unexpected."""
 _FREE_FROM = 0.98 * FREE_VALUE
-_EROSION = 2
-_RANGE_SLACK = 1.00001
-_LABEL_VOXELS = 2.0
-_HIT, _MISS, _LEAST_HITS, _MOST_HITS = 41, 20, OCCUPIED_HITS - 47, OCCUPIED_HITS + 83
-_COLOR_SHARE = 0.125
-_OFFSET = 1 << 20
-"""Block coordinates are below this in size, so that three of them make one number."""
+_EROSION: Final = 2
+"""The compiled core's: pixels by which depth is eroded to be certain."""
+_RANGE_SLACK: Final = 1.00001
+"""The compiled core's: factor on the largest depth, for rounding."""
+_LABEL_VOXELS: Final = 2.0
+"""The compiled core's: voxels around the surface that vote for an object."""
+_HIT: Final = 41
+"""The compiled core's: evidence that a measured point adds."""
+_MISS: Final = 20
+"""The compiled core's: evidence that a view through a voxel takes."""
+_LEAST_HITS: Final = OCCUPIED_HITS - 47
+"""The compiled core's: smallest evidence."""
+_MOST_HITS: Final = OCCUPIED_HITS + 83
+"""The compiled core's: largest evidence."""
+_COLOR_SHARE: Final = 0.125
+"""The compiled core's: smallest share of a new colour."""
+_OFFSET: Final = 1 << 20
+"""Block coordinates are smaller than this, so that three of them make one number of 64 bits."""
 
 
 @dataclass

@@ -7,12 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_NEAR_DEGREES = 30.0
-_AGREE_DEGREES = 5.0
-_BIN = 0.02
-"""Metres; heights are counted in these to find the floor."""
-_FLOOR_SHARE = 0.2
-"""A plane is large if it has at least this share of the points of the largest one that faces up."""
+from ggslam.system.tuning import Tuning
+
+
+class UprightSearchTuning(Tuning):
+    """How the direction up and the floor are found."""
+
+    max_start_deg = 30.0
+    """Largest angle between up and the first guess from the cameras, in degrees."""
+    max_normal_deg = 5.0
+    """Largest angle between the normal of a horizontal surface and up, in degrees."""
+    bin_m = 0.02
+    """Width of the bins that heights are counted in, in metres."""
+    floor_share = 0.2
+    """The floor is the lowest plane with at least this share of the points of the largest plane that faces up."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +70,17 @@ def estimate_up(
 def _dominant_direction(normals: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
     """The direction near `start` that most normals agree with, and their share."""
     side = normals @ start
-    near = np.abs(side) > np.cos(np.radians(_NEAR_DEGREES))
+    near = np.abs(side) > np.cos(np.radians(UprightSearchTuning.max_start_deg))
     if not near.any():
         return start, 0.0
     candidates = normals[near] * np.sign(side[near])[:, None]
     # A grid of directions around the start, as coarse as the agreement; then means of those that agree.
     across = np.linalg.svd(start[None])[2][1:]
-    reach = np.tan(np.radians(_NEAR_DEGREES))
+    reach = np.tan(np.radians(UprightSearchTuning.max_start_deg))
     flat = np.stack(np.meshgrid(*2 * [np.linspace(-reach, reach, 27)]), -1).reshape(-1, 2)
     grid = start + flat @ across
     grid /= np.linalg.norm(grid, axis=1, keepdims=True)
-    agree = np.cos(np.radians(_AGREE_DEGREES))
+    agree = np.cos(np.radians(UprightSearchTuning.max_normal_deg))
     sample = candidates[:: max(1, len(candidates) // 20_000)]
     up = grid[np.argmax((sample @ grid.T > agree).sum(axis=0))]
     for _ in range(5):
@@ -80,23 +88,23 @@ def _dominant_direction(normals: np.ndarray, start: np.ndarray) -> tuple[np.ndar
         if not np.linalg.norm(mean) > 0:
             break
         up = mean / np.linalg.norm(mean)
-    if up @ start < np.cos(np.radians(_NEAR_DEGREES + _AGREE_DEGREES)):
+    if up @ start < np.cos(np.radians(UprightSearchTuning.max_start_deg + UprightSearchTuning.max_normal_deg)):
         return start, 0.0
     return up, float((np.abs(normals @ up) > agree).mean())
 
 
 def _floor_height(points: np.ndarray, normals: np.ndarray, up: np.ndarray) -> float | None:
     """Height of the lowest large surface that faces up."""
-    facing = normals @ up > np.cos(np.radians(2 * _AGREE_DEGREES))
+    facing = normals @ up > np.cos(np.radians(2 * UprightSearchTuning.max_normal_deg))
     if facing.sum() < 50:
         return None
     heights = points[facing] @ up
-    first = np.floor(heights.min() / _BIN)
-    counts = np.bincount((np.floor(heights / _BIN) - first).astype(np.int64))
+    first = np.floor(heights.min() / UprightSearchTuning.bin_m)
+    counts = np.bincount((np.floor(heights / UprightSearchTuning.bin_m) - first).astype(np.int64))
     # A plane that is not exactly level or noisy spreads over neighbouring bins.
     spread = np.convolve(counts, np.ones(5), "same")
-    lowest = int(np.argmax(spread >= _FLOOR_SHARE * spread.max()))
+    lowest = int(np.argmax(spread >= UprightSearchTuning.floor_share * spread.max()))
     while lowest + 1 < len(spread) and spread[lowest + 1] > spread[lowest]:
         lowest += 1
-    middle = (first + lowest + 0.5) * _BIN
-    return float(np.median(heights[np.abs(heights - middle) <= 2.5 * _BIN]))
+    middle = (first + lowest + 0.5) * UprightSearchTuning.bin_m
+    return float(np.median(heights[np.abs(heights - middle) <= 2.5 * UprightSearchTuning.bin_m]))

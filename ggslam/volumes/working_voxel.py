@@ -6,23 +6,28 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ggslam.errors import InputError
+from ggslam.system.tuning import Tuning
 
-EDGES = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
-"""Metres, those that are tried."""
-MOST_BLOCKS = 100_000
-"""With voxels, of a view; 5 KB each."""
+
+class WorkingVoxelTuning(Tuning):
+    """Which voxels are proposed."""
+
+    edges = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
+    """Edges of voxels that are tried, in metres."""
+    max_blocks = 100_000
+    """Most blocks of a view; 5 KB each."""
 
 
 def working_voxel(blocks_of: Callable[[float], int], asked: float) -> float | None:
-    """The smallest of `EDGES`, larger than the one asked for, with which a view takes at most `MOST_BLOCKS`; None if
-    even the largest is too small.
+    """The smallest of `WorkingVoxelTuning.edges`, larger than the one asked for, with which a view takes at most
+    `WorkingVoxelTuning.max_blocks`; None if even the largest is too small.
 
     Args:
         blocks_of: fuses the view with voxels of an edge in metres; returns the number of blocks, or raises InputError.
         asked: metres.
     """
     found = None
-    for edge in EDGES:  # from the largest on: each takes several times as long as the one before
+    for edge in WorkingVoxelTuning.edges:  # from the largest on: each takes several times as long as the one before
         if edge <= asked or not _fits(blocks_of, edge):
             break
         found = edge
@@ -31,6 +36,6 @@ def working_voxel(blocks_of: Callable[[float], int], asked: float) -> float | No
 
 def _fits(blocks_of: Callable[[float], int], edge: float) -> bool:
     try:
-        return blocks_of(edge) <= MOST_BLOCKS
+        return blocks_of(edge) <= WorkingVoxelTuning.max_blocks
     except InputError:
         return False

@@ -26,7 +26,7 @@ from pathlib import Path
 from ggslam.jobs.batch.batch import run_batch
 from ggslam.jobs.batch.job_states import JobState, State
 from ggslam.jobs.batch.manifest import Manifest, read_manifest
-from ggslam.jobs.tasks.processors import PROCESSORS
+from ggslam.jobs.tasks.processors import ProcessorTuning
 from ggslam.synthetic import write_synthetic_sequence
 
 COMPARED = ("map.ply", "trajectory.txt", "objects.json", "classifier.npz", "votes.npz", "points.ply", "frames.csv")
@@ -46,7 +46,7 @@ def write_rooms(folder: Path, rooms: int, frames: int, width: int, seeds: int) -
 def run_alone(manifest: Manifest, out: Path) -> float:
     """Each run by itself, one after the other, those that are there left out; seconds."""
     start = time.perf_counter()
-    environment = os.environ | {"OMP_NUM_THREADS": str(PROCESSORS), "OMP_WAIT_POLICY": "PASSIVE"}
+    environment = os.environ | {"OMP_NUM_THREADS": str(ProcessorTuning.per_worker), "OMP_WAIT_POLICY": "PASSIVE"}
     for job in manifest.jobs:
         if (out / job.name / "metrics.json").is_file():
             continue
@@ -98,7 +98,8 @@ def two_workers() -> Iterator[str]:
     its address. Whoever joins it needs a token, which is made here and handed on by the environment."""
     os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
     program = (
-        f"import ray, sys; ray.init(num_cpus={2 * PROCESSORS}, include_dashboard=False, log_to_driver=False); "
+        f"import ray, sys; ray.init(num_cpus={2 * ProcessorTuning.per_worker}, include_dashboard=False, "
+        "log_to_driver=False); "
         "print(ray.get_runtime_context().gcs_address, flush=True); sys.stdin.read(); ray.shutdown()"
     )
     words = [sys.executable, "-c", program]

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ggslam.changes.change import Change
-from ggslam.changes.found import ChangeTable
+from ggslam.changes.change_table import ChangeTable
 from ggslam.formats.trajectory import read_tum
 from ggslam.jobs.changes.changes import find_changes
 from ggslam.runs.folder import RunFolder

@@ -25,7 +25,7 @@ from ggslam.coding.container import UnitType, read_units
 from ggslam.coding.metrics import color_quality, matching_rows
 from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud
 from ggslam.formats.point_ply import GRID_FILE, VoxelCloud, read_points
-from ggslam.jobs.code.coding import decode_file, encode_file
+from ggslam.jobs.encode.coding import decode_file, encode_file
 
 COLUMNS = ("run", "points", "encoder", "geometry", "colours", "ids", "decoder", "voxels", "metres", "Y dB", "U dB",
            "V dB", "ids")  # fmt: skip

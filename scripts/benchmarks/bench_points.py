@@ -36,8 +36,8 @@ from ggslam.evaluation.surface import SurfaceScores, score_surface
 from ggslam.formats.point_ply import GRID_FILE, write_points_in_parts
 from ggslam.formats.voxel_cloud import VoxelCloud, join_clouds
 from ggslam.geometry.voxels import voxel_keys
-from ggslam.jobs.code.coding import encode_file
-from ggslam.jobs.score.surface import SurfaceScorer
+from ggslam.jobs.encode.coding import encode_file
+from ggslam.jobs.eval.surface import SurfaceScorer
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_points import map_points
 from ggslam.runs.recordings import open_recording_of

@@ -157,7 +157,7 @@ sys.exit(70 if code is None else code)
 KILLED = """
 import os, sys
 from ggslam.cli.main import main
-from ggslam.jobs.refine.cells_done import CellsDone
+from ggslam.jobs.refine.finished_cells import CellsDone
 CellsDone.finish = lambda self: os.kill(os.getpid(), 9)
 sys.argv = ["ggslam", *sys.argv[1:]]
 main()

@@ -274,7 +274,7 @@ def coded_cells(folder: Path) -> list[Path]:
 
 def read_coded_cells(path: Path) -> Any:
     """Decodes it into a store."""
-    from ggslam.jobs.code.coded_cells import decode_store
+    from ggslam.jobs.encode.coded_cells import decode_store
 
     with tempfile.TemporaryDirectory() as name:
         repaired = Path(name) / path.name
@@ -366,7 +366,7 @@ def records(folder: Path) -> list[Path]:
 
 def read_record(path: Path) -> Any:
     """What commands do with them."""
-    from ggslam.jobs.changes.shown import motion_words, read_changes, sentence_of
+    from ggslam.jobs.changes.saved_changes import motion_words, read_changes, sentence_of
     from ggslam.runs.records.loops import LoopsRecord
     from ggslam.runs.records.movers import MoversRecord
 

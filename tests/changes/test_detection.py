@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from small_visits import Box, SmallVisit, detect
 
+from ggslam.changes.alignment_score import Fit
+from ggslam.changes.candidates import Candidate
 from ggslam.changes.change import UNCLEAR, Change, Detection
+from ggslam.changes.change_table import ChangeTable
 from ggslam.changes.detection import ChangeDetector
-from ggslam.changes.fits import Fit
-from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
-from ggslam.changes.things import Thing
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import inverse, transform_points, turning_angle
 
@@ -73,7 +73,7 @@ def test_a_thin_thing_that_was_pushed_along_the_floor_is_moved() -> None:
     size = (0.3, 0.12, 0.006)
     before, after = Box(5, (-0.1, -0.3), size), Box(5, (-0.02, -0.26), size, turn=30)
     found, detector = detect(SmallVisit([before, CUP, BRICK]), SmallVisit([after, CUP, BRICK]))
-    thing = next(t for t in detector.things[0] if t.label == 5)
+    thing = next(t for t in detector.candidates[0] if t.label == 5)
     assert thing.changed < detector.settings.min_changed  # neither gone nor come by its surface
     assert kinds(found) == ["moved"]
     check_moved(found.changes[0], before, after)
@@ -175,7 +175,7 @@ def test_a_thing_that_moved_to_where_the_first_visit_saw_nothing_is_moved() -> N
     before, after = Box(2, (-0.1, -0.3)), Box(2, (0.0, 0.3), turn=20)
     front = SmallVisit([before, wall], around=(-130, -110, -90, -70, -50))
     found, detector = detect(front, SmallVisit([after, wall]), True)
-    new = next(t for t in detector.things[1] if t.label == 2)
+    new = next(t for t in detector.candidates[1] if t.label == 2)
     assert new.seen < detector.settings.min_seen
     assert kinds(found) == ["moved"]
 
@@ -214,7 +214,7 @@ def test_why_a_turn_is_not_known(doubts: dict[str, Any], reason: str | None) -> 
 def test_what_the_first_visit_hardly_saw_was_not_added() -> None:
     speck = Box(2, (-0.3, 0.3), (0.004, 0.004, 0.004))
     found, detector = detect(SmallVisit([speck, CRATE, BRICK]), SmallVisit([CUP, CRATE, BRICK]), True)
-    assert all(t.label != 2 for t in detector.things[0])
+    assert all(t.label != 2 for t in detector.candidates[0])
     assert found.changes == []
 
 
@@ -223,8 +223,8 @@ def test_what_only_one_visit_shows_much_of_was_not_pushed(count: int, shifted: b
     """A strip of a cupboard behind a chair, 259 points of it from one side and 742 from the other, bore other ids at
     its ends: it was said to have been pushed."""
 
-    def strip(points: int) -> Thing:
-        return Thing(19, (19,), np.arange(points), 1.0, 0.0, 0.05)
+    def strip(points: int) -> Candidate:
+        return Candidate(19, (19,), np.arange(points), 1.0, 0.0, 0.05)
 
     judged = SimpleNamespace(points=np.zeros((1000, 3)))
     others = SimpleNamespace(
@@ -247,7 +247,7 @@ def test_what_moved_is_placed_before_it_is_told(placed_m: float, told: bool) -> 
         _with_turn=lambda old, new, fit: fit,
     )  # fmt: skip
     fit = Fit(shifted(0.27), share=0.9, seen=1.0, color_apart=0.0)
-    thing = Thing(2, (2,), np.arange(3), 1.0, 1.0, 0.0)
+    thing = Candidate(2, (2,), np.arange(3), 1.0, 1.0, 0.0)
     change = ChangeDetector._motion_change(detector, thing, thing, fit)  # type: ignore[arg-type]
     assert (change is not None) is told
     if change is not None:

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ggslam.changes.fits import Fit
+from ggslam.changes.alignment_score import Fit
 from ggslam.changes.motions import likeliest_motions
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape, Target

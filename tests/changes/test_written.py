@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from small_visits import Box, SmallVisit
 
+from ggslam.changes.change_table import ChangeTable
 from ggslam.changes.detection import ChangeDetector
-from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
 from ggslam.jobs.changes.changes import ChangesOutcome, write_changes
-from ggslam.jobs.changes.pictures import NEW_COLOR, OLD_COLOR
+from ggslam.jobs.changes.pictures import PictureTuning
 from ggslam.native.loader import NativeContext
 
 
@@ -34,8 +34,8 @@ def test_every_change_has_numbers_and_a_picture(tmp_path: Path) -> None:
     assert by_kind["added"]["old"] is None and by_kind["added"]["new"]["ids"] == [3]
     names = [str(tmp_path / "out" / by_kind[kind]["picture"]) for kind in ("moved", "added")]
     moved, added = (cv2.imread(name)[..., ::-1] for name in names)
-    assert has_color(moved, OLD_COLOR) and has_color(moved, NEW_COLOR)
-    assert has_color(added, NEW_COLOR) and not has_color(added, OLD_COLOR)
+    assert has_color(moved, PictureTuning.old_color) and has_color(moved, PictureTuning.new_color)
+    assert has_color(added, PictureTuning.new_color) and not has_color(added, PictureTuning.old_color)
 
 
 def has_color(picture: np.ndarray, color: tuple[int, int, int]) -> bool:

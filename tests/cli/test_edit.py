@@ -113,7 +113,7 @@ def test_most_of_a_map_is_removed_only_when_that_is_confirmed(finished: Path, tm
     one_error(ggslam("edit", finished, "--remove", objects, "--out", out), "of the map", "--yes")
     assert not out.exists() and contents(finished) == before
     edit_run(finished, [Edit("remove", objects)], tmp_path / "asked", confirm=lambda what: f"of {count}" in what)
-    with pytest.raises(ConfigError, match="not confirmed"):
+    with pytest.raises(ConfigError, match="`remove` 3,9,22,31,1,8,33"):
         edit_run(finished, [Edit("remove", objects)], tmp_path / "refused", confirm=lambda _: False)
     assert not (tmp_path / "refused").exists()
     done("edit", finished, "--remove", objects, "--yes", "--out", out)

@@ -19,7 +19,7 @@ from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
 from ggslam.formats.point_ply import read_points, write_points
 from ggslam.formats.point_sampling import VoxelCloud
-from ggslam.jobs.code.coding import study_cloud
+from ggslam.jobs.encode.coding import study_cloud
 from ggslam.scene.gaussian_map import GaussianMap
 
 Ggslam = Callable[..., tuple[int, str, str]]
@@ -255,7 +255,7 @@ def test_ctrl_c_is_said(ggslam: Ggslam, tmp_path: Path, monkeypatch: pytest.Monk
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ggslam.jobs.code.coding.encode_file", interrupted)
+    monkeypatch.setattr("ggslam.jobs.encode.coding.encode_file", interrupted)
     code, _, err = ggslam("encode", tmp_path / "a.ply", tmp_path / "a.bin")
     assert code == 130 and err == "interrupted"
 

@@ -14,7 +14,7 @@ from ggslam.coding import CodecSettings
 from ggslam.coding.outliers import bulk_of, reach_of
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
-from ggslam.jobs.code.coding import decode_file, encode_file
+from ggslam.jobs.encode.coding import decode_file, encode_file
 from ggslam.scene.gaussian_map import GaussianMap
 
 

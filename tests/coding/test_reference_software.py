@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
 from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
 from ggslam.formats.point_ply import VoxelCloud, write_points
-from ggslam.jobs.code.coding import decode_file, encode_file
+from ggslam.jobs.encode.coding import decode_file, encode_file
 
 TOOLS = ["--trisoupNodeSizeLog2=0", "--mergeDuplicatedPoints=1", "--positionQuantizationScale=1", "--transformType=0"]
 

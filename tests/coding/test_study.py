@@ -15,7 +15,7 @@ from ggslam.coding import CodecSettings
 from ggslam.coding.energy import EnergyMeter
 from ggslam.coding.study import GridCloud, on_grid, run_sweep, sweep_steps
 from ggslam.errors import ConfigError
-from ggslam.jobs.code.study import write_study
+from ggslam.jobs.encode.study import write_study
 
 
 def surface(side: int = 64) -> tuple[np.ndarray, np.ndarray]:

@@ -53,37 +53,37 @@ def test_a_short_manifest(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("recordings: []", "recordings: expected a list"),
-        ("seeds: [1]", "expected recordings"),
-        ("recordings: [a]\nworkers: 3", "no other keys"),
-        ("recordings: [{name: b}]", r"recordings\[0\]: expected a path"),
-        ("recordings: [a]\nseeds: [-1]", "seeds: expected whole numbers"),
-        ("recordings: [a]\nseeds: [true]", "seeds: expected whole numbers"),
-        ("recordings: [a]\nsettings: [x]", "settings: expected names"),
-        ("recordings: [a]\nsettings: {x: --out b}", "settings.x: --out is not for batches"),
-        ("recordings: [a]\noptions: --seed=3", "options: --seed is not for batches"),
-        ("recordings: [a]\noptions: 'unclosed \"'", "options: No closing quotation"),
-        ("recordings: [a]\noptions: [x]", "options: expected options of"),
-        ("recordings: [a]\noptions: --log=x.rrd", "options: --log is not for batches"),
-        ("recordings: [a]\nsettings: {x: --record b}", "settings.x: --record is not for batches"),
-        ("recordings: [{path: a, options: -h}]", r"recordings\[0\].options: -h is not for batches"),
-        ("recordings: [a]\noptions: --help-settings", "options: --help-settings is not for batches"),
-        ("recordings: [a]\noptions: --set masks.model=a.onnx", "a model of masks, which is run like a program"),
-        ("recordings: [a]\nsettings: {x: '--set=masks.model=a.onnx'}", "a model of masks"),
-        ("recordings: [{path: a, options: --config own.yaml}]", "a model of masks"),
-        ("recordings: [a]\nout: ../elsewhere", "out: ../elsewhere lies outside"),
-        ("recordings: [a]\nout: /elsewhere", "out: /elsewhere lies outside"),
-        ("recordings: [a]\nout: linked/elsewhere", "out: linked/elsewhere lies outside"),
-        ("recordings: [a, b/a]", "two runs would have the folder a/default/seed0"),
+        ("recordings: []", r"recordings.*\[\]"),
+        ("seeds: [1]", "options, out, recordings, seeds, settings"),
+        ("recordings: [a]\nworkers: 3", "options, out, recordings, seeds, settings"),
+        ("recordings: [{name: b}]", r"recordings\[0\].*'name': 'b'"),
+        ("recordings: [a]\nseeds: [-1]", r"seeds.*\[-1\]"),
+        ("recordings: [a]\nseeds: [true]", r"seeds.*\[True\]"),
+        ("recordings: [a]\nsettings: [x]", r"settings.*\['x'\]"),
+        ("recordings: [a]\nsettings: {x: --out b}", r"settings\.x.*--out"),
+        ("recordings: [a]\noptions: --seed=3", "options.*--seed"),
+        ("recordings: [a]\noptions: 'unclosed \"'", "options: "),
+        ("recordings: [a]\noptions: [x]", r"options.*\['x'\]"),
+        ("recordings: [a]\noptions: --log=x.rrd", "options.*--log"),
+        ("recordings: [a]\nsettings: {x: --record b}", r"settings\.x.*--record"),
+        ("recordings: [{path: a, options: -h}]", r"recordings\[0\]\.options.* -h\b"),
+        ("recordings: [a]\noptions: --help-settings", "options.*--help-settings"),
+        ("recordings: [a]\noptions: --set masks.model=a.onnx", r"masks\.model"),
+        ("recordings: [a]\nsettings: {x: '--set=masks.model=a.onnx'}", r"masks\.model"),
+        ("recordings: [{path: a, options: --config own.yaml}]", r"masks\.model"),
+        ("recordings: [a]\nout: ../elsewhere", r"out.*\.\./elsewhere.*--out"),
+        ("recordings: [a]\nout: /elsewhere", "out: /elsewhere.*--out"),
+        ("recordings: [a]\nout: linked/elsewhere", "out.*linked/elsewhere.*--out"),
+        ("recordings: [a, b/a]", "a/default/seed0"),
         ("recordings: [a", "experiments.yaml: "),
-        ('recordings: [{path: "a\\0b"}]', "a path cannot have a zero byte"),
-        ('recordings: [a]\nout: "x\\0y"', "a path cannot have a zero byte"),
-        (f"recordings: [{'a' * 5000}]", "a{60}...': too long for a path: 5,000 characters$"),
-        (f"recordings: [a]\nout: {'x' * 300}", "x{60}...': too long for a path: 300 characters$"),
-        (f"recordings: [a]\nout: {'x/' * 2048}y", "too long for a path: 4,097 characters$"),
-        (f"recordings: [{{path: a, name: {'n' * 300}}}]", "a name that is too long: n{60}...$"),
-        (f"recordings: [a]\nsettings: {{{'s' * 300}: ''}}", "a name that is too long: a/s{58}...$"),
-        (f"recordings: [a]\nseeds: [1{'0' * 300}]", "a name that is too long: a/default/seed10{45}...$"),
+        ('recordings: [{path: "a\\0b"}]', r"recordings\[0\].*a\\x00b"),
+        ('recordings: [a]\nout: "x\\0y"', r"out.*x\\x00y"),
+        (f"recordings: [{'a' * 5000}]", "a{60}...'.*5,000"),
+        (f"recordings: [a]\nout: {'x' * 300}", "x{60}...'.*300"),
+        (f"recordings: [a]\nout: {'x/' * 2048}y", "out.*4,097"),
+        (f"recordings: [{{path: a, name: {'n' * 300}}}]", "n{60}...$"),
+        (f"recordings: [a]\nsettings: {{{'s' * 300}: ''}}", "a/s{58}...$"),
+        (f"recordings: [a]\nseeds: [1{'0' * 300}]", "a/default/seed10{45}...$"),
     ],
 )
 def test_what_is_wrong_is_named(
@@ -113,7 +113,7 @@ def test_all_recordings_of_a_folder(room: Path, tmp_path: Path) -> None:
     replica = manifest_of_folder(tmp_path, only=REPLICA)
     assert [job.recording for job in replica.jobs] == ["room0", "office1"]  # in the order of papers
     for folder in (tmp_path / "empty", tmp_path / "nothing"):
-        with pytest.raises(ConfigError, match="no recording|no such folder"):
+        with pytest.raises(ConfigError, match=folder.name):
             manifest_of_folder(folder)
 
 
@@ -123,7 +123,7 @@ def test_who_calls_may_name_a_model_and_any_folder(tmp_path: Path, tmp_path_fact
     found = read_manifest(path, elsewhere, asked)
     assert found.out == elsewhere
     assert found.jobs[0].words[1:5] == ("--set", "masks.model=a.onnx", "--scale", "0.5")
-    with pytest.raises(ConfigError, match="a model of masks"):  # the file's own is another one
+    with pytest.raises(ConfigError, match=r"masks\.model"):  # the file's own is another one
         read_manifest(written(tmp_path, "recordings: [a]\noptions: --set masks.model=b.onnx"), None, asked)
 
 
@@ -143,12 +143,12 @@ def test_every_option_of_a_run_is_passed_on_or_refused_on_purpose() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--set masks.model=a.onnx --camera --set=masks.model=", "--camera: expected a value, found '--set="),
-        ("--config own.yaml --masks --config=plain.yaml", "--masks: expected a value, found '--config=plain.yaml'"),
-        ("--set", "--set needs a value"),
-        ("--scale 0.5 elsewhere", "expected an option, found 'elsewhere'"),
-        ("--strict elsewhere", "expected an option, found 'elsewhere'"),
-        ("-- --scale 0.5", "-- is not for batches"),
+        ("--set masks.model=a.onnx --camera --set=masks.model=", "--camera.*'--set="),
+        ("--config own.yaml --masks --config=plain.yaml", "--masks.*'--config=plain.yaml'"),
+        ("--set", "options: --set"),
+        ("--scale 0.5 elsewhere", "options.*'elsewhere'"),
+        ("--strict elsewhere", "options.*'elsewhere'"),
+        ("-- --scale 0.5", "options: -- "),
     ],
 )
 def test_no_option_hides_behind_another(tmp_path: Path, options: str, words: str) -> None:

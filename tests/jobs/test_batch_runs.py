@@ -109,7 +109,7 @@ def test_no_link_in_a_batch_leads_its_runs_elsewhere(tmp_path: Path, place: str)
     link = out / place
     link.parent.mkdir(parents=True)
     link.symlink_to(victim / "run.json" if place.endswith(".txt") else victim)
-    with pytest.raises(RunFolderError, match="is a link"):
+    with pytest.raises(RunFolderError, match="victim"):
         JobProcess.begin(JobState(BatchJob("a", "b", 0, ("nowhere",)), out), ())
     assert [path.name for path in victim.iterdir()] == ["run.json"]
     assert (victim / "run.json").read_text() == "precious"
@@ -129,6 +129,6 @@ def test_tables_are_not_written_through_links(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "precious").write_text("precious")
     (tmp_path / "out" / "table.csv").symlink_to(tmp_path / "precious")
-    with pytest.raises(RunFolderError, match=r"table\.csv: is a link"):
+    with pytest.raises(RunFolderError, match=r"table\.csv.*precious"):
         run_batch(Manifest("mine", tmp_path / "out", []), engine="none")
     assert (tmp_path / "precious").read_text() == "precious"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError, RunFolderError
-from ggslam.jobs.changes.shown import ChangesShown, changes_of, read_changes, sentence_of
+from ggslam.jobs.changes.saved_changes import ChangesShown, changes_of, read_changes, sentence_of
 from ggslam.jobs.report.change_section import changes_part
 from ggslam.objects.history import History, VisitRecord
 from ggslam.runs.folder import RunFolder
@@ -66,7 +66,7 @@ def test_pictures_that_are_not_shown_are_counted(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_changes_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"holds no changes\.json"):
+    with pytest.raises(ConfigError, match=r"changes\.json"):
         read_changes(tmp_path)
 
 

@@ -12,7 +12,7 @@ from command_line import ggslam
 from kept import session_folder
 from small_runs import run_of
 
-from ggslam.jobs.changes.ghosts import own_keyframes
+from ggslam.jobs.changes.stale_gaussians import own_keyframes
 from ggslam.runs.records.keyframes import KeyframesRecord
 
 pytest.importorskip("gtsam")

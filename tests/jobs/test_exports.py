@@ -52,7 +52,7 @@ def test_only_keyframes_and_what_is_held_out(run: RunFolder, tmp_path: Path) -> 
 def test_a_folder_with_something_in_it_is_left_alone(run: RunFolder, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     for kind in ("colmap", "nerfstudio"):
-        with pytest.raises(RunFolderError, match="not an empty folder"):
+        with pytest.raises(RunFolderError, match="`out`"):
             export_run(run, tmp_path, kind)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
@@ -70,9 +70,9 @@ def test_gaussians_for_a_larger_window_are_wider(run: RunFolder, tmp_path: Path,
 
 
 def test_a_zoom_goes_with_gaussians_and_is_at_least_one(run: RunFolder, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="`zoom` goes with formats of Gaussians, not trajectory"):
+    with pytest.raises(ConfigError, match="`zoom`.*trajectory"):
         export_run(run, tmp_path / "poses.txt", zoom=2.0)
-    with pytest.raises(ConfigError, match="`zoom`: expected 1 to 1000, found 0.5"):
+    with pytest.raises(ConfigError, match=r"`zoom`.* 1 .*1000.* 0\.5"):
         export_run(run, tmp_path / "map.ply", zoom=0.5)
     result = CliRunner().invoke(app, ["export", str(run.path), "--out", str(tmp_path / "map.ply"), "--zoom", "0"])
     assert str(result.exception) == "--zoom: expected 1 to 1000, found 0" and not list(tmp_path.iterdir())
@@ -130,7 +130,7 @@ def test_gltf_plain_and_of_objects(run: RunFolder, tmp_path: Path) -> None:
     gltf, count = gltf_of(out), int((gaussians.object_id == object_id).sum())
     assert {accessor["count"] for accessor in gltf["accessors"]} == {count}
     assert list(gltf["meshes"][0]["extras"]["objects"]) == [str(object_id)]
-    with pytest.raises(FormatError, match=r"ends in \.glb"):
+    with pytest.raises(FormatError, match=r"splats\.gltf.*\.glb"):
         export_run(run, tmp_path / "splats.gltf", "gltf")
     assert choose_writer(None, out, None).name == "mesh"
 
@@ -164,6 +164,6 @@ def test_what_does_not_go_together(run: RunFolder, tmp_path: Path) -> None:
     assert "says ply, but --format says pcd" in str(refused(str(run.path), "--format", "pcd", *out))
     assert isinstance(refused(str(run.path), "--format", "splat", "--keyframes", *out), ConfigError)
     assert isinstance(refused(str(run.path), "--format", "colmap", "--voxel", "0", *out), ConfigError)
-    with pytest.raises(RunFolderError, match="nothing to export"):
+    with pytest.raises(RunFolderError, match=r"1\.1"):
         export_run(run, tmp_path / "map.splat", "splat", min_opacity=1.1)
     assert not list(tmp_path.iterdir())

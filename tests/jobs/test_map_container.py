@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 from ggslam.cli.main import app
 from ggslam.coding.listing import list_units
 from ggslam.errors import FormatError, GgslamError, RunFolderError
-from ggslam.jobs.code.contents import contents_of_run
+from ggslam.jobs.encode.contents import contents_of_run
 from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_container import read_container
@@ -182,21 +182,21 @@ def test_what_is_damaged_is_refused(container: Path, tmp_path: Path) -> None:
         head = json.loads(archive.read("container.json"))
     cases: list[tuple[Path, str]] = [
         (_rewritten(container, tmp_path / "later.ggz", container_json=json.dumps({**head, "version": 3}).encode()),
-         "version 3"),
-        (_rewritten(container, tmp_path / "other.ggz", container_json=b"{}"), "not the head"),
+         r"\b3\b.*\b2\b"),
+        (_rewritten(container, tmp_path / "other.ggz", container_json=b"{}"), "container.json"),
         (_rewritten(container, tmp_path / "wrong.ggz", container_json=json.dumps({**head, "files": {}}).encode()),
-         "is damaged"),
-        (_rewritten(container, tmp_path / "less.ggz", map_bin=None), "holds no map.bin"),
-        (_rewritten(container, tmp_path / "more.ggz", **{"../../outside": b"x"}), "no map of ggslam"),
+         "run.json.xz.*container.json"),
+        (_rewritten(container, tmp_path / "less.ggz", map_bin=None), "map.bin"),
+        (_rewritten(container, tmp_path / "more.ggz", **{"../../outside": b"x"}), r"\.\./\.\./outside"),
         (_rewritten(container, tmp_path / "stream.ggz", map_bin=b"no stream"), "map.bin"),
         (_rewritten(container, tmp_path / "record.ggz", **{"run.json.xz": pack_bytes(b"[]")}), "run.json"),
-        (_rewritten(container, tmp_path / "packed.ggz", **{"run.json.xz": b"[]"}), "run.json.xz: damaged"),
-        (_rewritten(container, tmp_path / "twice.ggz", **{"run.json": b"[]"}), "no map of ggslam"),
-        (_rewritten(container, tmp_path / "places.ggz", **{"places.bin": b"[]"}), "places.bin: no packed"),
-        (_rewritten(container, tmp_path / "nowhere.ggz", **{"places.bin": None}), "holds no places.bin"),
+        (_rewritten(container, tmp_path / "packed.ggz", **{"run.json.xz": b"[]"}), "run.json.xz"),
+        (_rewritten(container, tmp_path / "twice.ggz", **{"run.json": b"[]"}), r"run\.json$"),
+        (_rewritten(container, tmp_path / "places.ggz", **{"places.bin": b"[]"}), "places.bin"),
+        (_rewritten(container, tmp_path / "nowhere.ggz", **{"places.bin": None}), "places.bin"),
     ]  # fmt: skip
     bad.write_bytes(content[: len(content) // 2])
-    cases.append((bad, "no whole container"))
+    cases.append((bad, "bad.ggz"))
     content[len(content) // 2] ^= 255
     (tmp_path / "flipped.ggz").write_bytes(content)
     cases.append((tmp_path / "flipped.ggz", "flipped.ggz"))
@@ -216,7 +216,7 @@ def test_what_cannot_be_sent(run: RunFolder, container: Path, tmp_path: Path) ->
         result = ggslam(*words)
         assert isinstance(result.exception, GgslamError) and reason in str(result.exception)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(FormatError, match="missing"):
+    with pytest.raises(FormatError, match=r"none\.ggz"):
         read_container(tmp_path / "none.ggz", tmp_path / "out")
-    with pytest.raises(RunFolderError, match="there is a run already"):
+    with pytest.raises(RunFolderError, match="`overwrite`.*`out`"):
         read_container(container, run.path)

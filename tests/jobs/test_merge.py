@@ -98,9 +98,9 @@ def test_its_recordings_are_read_as_one(halves: Halves, room: Path) -> None:
     assert [f.index for f in sequence.stream(masks=False)] == list(range(32))
     assert (np.diff(sequence.timestamps) > 0).all() and sequence.has_masks
     assert halves.merged.sequence().own_number(19) == 3
-    with pytest.raises(SequenceError, match="slices"):
+    with pytest.raises(SequenceError, match="room"):
         sequence[2:4]
-    with pytest.raises(SequenceError, match="0 to 31"):
+    with pytest.raises(SequenceError, match="room.* 0 .*31.*32"):
         sequence.frame(32)
 
 
@@ -196,22 +196,22 @@ def test_the_command_line_says_what_came_of_it(halves: Halves, tmp_path: Path) -
 
 def test_what_cannot_be_merged_is_said(halves: Halves, tmp_path: Path) -> None:
     first, second = halves.first.path, halves.second.path
-    with pytest.raises(ConfigError, match="two runs"):
+    with pytest.raises(ConfigError, match=" 1$"):
         merge_runs([first], tmp_path / "out")
-    with pytest.raises(ConfigError, match="given twice"):
+    with pytest.raises(ConfigError, match="first"):
         merge_runs([first, second, first], tmp_path / "out")
-    with pytest.raises(ConfigError, match="is one of the runs"):
+    with pytest.raises(ConfigError, match="`out`.*first"):
         merge_runs([first, second], first, overwrite=True)
-    with pytest.raises(RunFolderError, match="there is a run already"):
+    with pytest.raises(RunFolderError, match="whole.*`overwrite`"):
         merge_runs([first, second], halves.merged.path)
     shutil.copytree(first, tmp_path / "again")
-    with pytest.raises(ConfigError, match="again: is the same run as"):
+    with pytest.raises(ConfigError, match="again.*first"):
         merge_runs([second, first, tmp_path / "again"], tmp_path / "out")
     edited = tmp_path / "edited"
     shutil.copytree(second, edited)
     (edited / "places.npz").unlink()
     mark = json.loads((edited / "run.json").read_text())
     (edited / "run.json").write_text(json.dumps({**mark, "edits": ["removed mug (7)"]}))
-    with pytest.raises(RunFolderError, match=r"places.npz: missing.*merge first, then edit"):
+    with pytest.raises(RunFolderError, match=r"edited/places\.npz"):
         merge_runs([first, edited], tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -21,11 +21,11 @@ from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.refine import refine_store as refine_store_module
 from ggslam.jobs.refine.cell_mapper import CellBox
 from ggslam.jobs.refine.cell_training import CellTask, TrainedCell, train_cell
-from ggslam.jobs.refine.cells_done import CellsDone
-from ggslam.jobs.refine.cells_of_store import StoreCells
+from ggslam.jobs.refine.finished_cells import CellsDone
 from ggslam.jobs.refine.refine_run import refine_run
 from ggslam.jobs.refine.refine_store import refine_store
 from ggslam.jobs.refine.settings import RefineSettings
+from ggslam.jobs.refine.training_inputs import StoreCells
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, cell_arrays, gaussians_of_cell
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.rendering.cpu import CpuRasterizer
@@ -331,7 +331,7 @@ def test_a_run_is_refined_in_place(room_run: RunFolder, tmp_path: Path) -> None:
 
 def test_runs_that_cannot_be_refined(room_run: RunFolder, tmp_path: Path) -> None:
     shutil.copytree(room_run.path, tmp_path / "run")
-    with pytest.raises(ConfigError, match="lies in the run"):
+    with pytest.raises(ConfigError, match="`out`.*better"):
         refine_run(tmp_path / "run", tmp_path / "run" / "better")
     sequence = RunFolder.open(tmp_path / "run").sequence()
     moved = sequence.open.model_copy(update={"path": str(tmp_path / "gone")})

@@ -118,9 +118,9 @@ def test_a_run_killed_at_any_moment_goes_on(room: Path, whole: Path, tmp_path: P
     with pytest.raises(Killed):
         execute(request(room, out), KillAt(**moment))
     assert not (out / "run.json").exists()
-    with pytest.raises(RunFolderError, match="cut off before it was saved; go on with it: `resume`"):
+    with pytest.raises(RunFolderError, match="`resume`$"):
         RunFolder.open(out)
-    with pytest.raises(RunFolderError, match="a run that was cut off; use `resume` or `overwrite`"):
+    with pytest.raises(RunFolderError, match="`resume`.*`overwrite`"):
         execute(request(room, out))
     outcome = resume(out)
     assert outcome.error is None
@@ -167,14 +167,14 @@ def test_a_damaged_checkpoint_is_passed_over(cut: Path, whole: Path) -> None:
 def test_no_checkpoint_is_whole(cut: Path) -> None:
     for path in states(cut):
         path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(RunFolderError, match=r"no checkpoint is whole: .*state-0000.*damaged: it ends too early"):
+    with pytest.raises(RunFolderError, match=r"state-0000"):
         resume(cut)
 
 
 def test_what_a_state_needs_is_checked_too(cut: Path) -> None:
     for path in (cut / checkpoints.FOLDER).glob("kept-*.bin"):
         path.unlink()
-    with pytest.raises(RunFolderError, match="no checkpoint is whole: .*kept-000001.bin: file is missing"):
+    with pytest.raises(RunFolderError, match=r"kept-000001\.bin"):
         resume(cut)
 
 
@@ -183,7 +183,7 @@ def test_another_recording_is_refused(cut: Path, room: Path, whole: Path, tmp_pa
     images = [sorted((moved / name).iterdir()) for name in ("rgb", "depth")]
     original = images[1][4].read_bytes()
     images[1][4].write_bytes(images[1][5].read_bytes() + b"0")
-    with pytest.raises(RunFolderError, match="moved: changed since the run was cut off: its frames 0 to 8"):
+    with pytest.raises(RunFolderError, match="moved.* 0 .* 8 "):
         resume(cut, recording=moved)
     images[1][4].write_bytes(original)
     for image in (images[0][-1], images[1][-1]):
@@ -193,7 +193,7 @@ def test_another_recording_is_refused(cut: Path, room: Path, whole: Path, tmp_pa
     for kind in images:
         for image in kind[12:]:
             image.unlink(missing_ok=True)
-    refuse_words = "not the recording that .*other was begun with"
+    refuse_words = "moved.*other.*14.*12"
     with pytest.raises(GgslamError, match=refuse_words):
         resume(shorter, recording=moved)
     assert resume(cut).error is None  # where it was, it is as it was
@@ -383,9 +383,9 @@ def test_a_model_runs_only_if_it_is_named_again(cut: Path) -> None:
     command = f"ggslam run --resume {cut} --set masks.model='a model.onnx'"
     refuse(ggslam("run", "--resume", cut), "a model of masks, which is run like a program", command)
     assert go_on_command(cut) == [f"next: {command}"]
-    with pytest.raises(ConfigError, match="which is run like a program"):
+    with pytest.raises(ConfigError, match=r"--set masks\.model"):
         resume(cut, model="another.onnx")
-    with pytest.raises(GgslamError, match=r"a model\.onnx: (file is missing|.*onnxruntime)"):
+    with pytest.raises(GgslamError, match=r"a model\.onnx"):
         resume(cut, model="a model.onnx")
 
 

@@ -17,8 +17,7 @@ from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.evaluate_run import evaluate_run
 from ggslam.jobs.run.grades import (
-    BAD_AGREEMENT,
-    BAD_STRUCTURE,
+    MapGradeTuning,
     ScoredFigures,
     grade_geometry,
     grade_movers,
@@ -129,14 +128,14 @@ def test_depth_that_is_elsewhere_is_measured(sound: RunOutcome) -> None:
         moved.append(replace(keyframe, depth=depth))
     share = np.mean([(k.depth[:36] > 0).sum() / (k.depth > 0).sum() for k in sound.result.keyframes])
     fit = fit_of(sound, moved)
-    assert fit.agreeing == pytest.approx(1 - share, abs=0.03) and fit.agreeing < BAD_AGREEMENT
+    assert fit.agreeing == pytest.approx(1 - share, abs=0.03) and fit.agreeing < MapGradeTuning.bad_depth_agreement
     assert grade_geometry(fit, []).grade == "bad"
 
 
 def test_images_that_are_elsewhere_are_measured(sound: RunOutcome) -> None:
     moved = [replace(k, color=np.roll(k.color, 4, 1)) for k in sound.result.keyframes]
     fit = fit_of(sound, moved)
-    assert fit.structure < BAD_STRUCTURE and fit.psnr < fit_of(sound).psnr - 8
+    assert fit.structure < MapGradeTuning.bad_structure and fit.psnr < fit_of(sound).psnr - 8
     assert grade_sharp(fit, ScoredFigures()).grade == "bad"
 
 

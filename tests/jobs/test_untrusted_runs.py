@@ -187,7 +187,7 @@ def test_a_store_with_links_touches_nothing(store: Path, home: Path, place: str)
     else:
         path.unlink()
     path.symlink_to(home / "map.ply" if path.suffix else home)
-    with pytest.raises(FormatError, match="link"), GridStore.open(store, write=True) as opened:
+    with pytest.raises(FormatError, match=path.name), GridStore.open(store, write=True) as opened:
         opened.get((0, 0, 0), "points.pcd")
         opened.put((0, 0, 0), {"points.pcd": b"3"})
 
@@ -224,7 +224,7 @@ def test_a_recording_that_names_files_elsewhere(tmp_path: Path, home: Path) -> N
     (recording / "rgb.txt").write_text("0.0 ../home/map.ply\n1.0 ../home/map.ply\n")
     (recording / "depth.txt").write_text("0.0 depth/0.png\n1.0 depth/1.png\n")
     np.zeros(1).tofile(recording / "depth" / "0.png")
-    with pytest.raises(SequenceError, match="outside"):
+    with pytest.raises(SequenceError, match=r"home/map\.ply"):
         open_sequence(recording)
 
 

@@ -105,9 +105,9 @@ def test_names_say_the_format(tmp_path: Path) -> None:
              "a.usdc": "usd", "a.usdz": "usd", "a.compressed.ply": "compressed-ply"}  # fmt: skip
     for name, kind in named.items():
         assert choose_writer(None, Path(name), None).name == kind
-    with pytest.raises(ConfigError, match="does not say"):
+    with pytest.raises(ConfigError, match=r"my-meta\.json.*`format`"):
         choose_writer(None, tmp_path / "my-meta.json", None)
-    with pytest.raises(ConfigError, match="says sog, but `format` says usd"):
+    with pytest.raises(ConfigError, match=r"a\.sog.*sog.*`format`.*usd"):
         choose_writer("usd", Path("a.sog"), None)
 
 
@@ -119,9 +119,9 @@ def test_what_is_refused(room_run: RunFolder, store: Path, tmp_path: Path) -> No
     refused("nothing to export", room_run.path, "--out", tmp_path / "a.sog", "--min-opacity", 1.1)
     refused("at least one Gaussian", store, "--format", "streamed-sog", "--out", out, "--min-opacity", 1.1)
     refused("not an empty folder", room_run.path, "--format", "streamed-sog", "--out", store)
-    with pytest.raises(FormatError, match=r"ends in \.sog, or is called meta\.json"):
+    with pytest.raises(FormatError, match=r"web\.zip.*\.sog.*meta\.json"):
         export_run(room_run, tmp_path / "web.zip", "sog")
-    with pytest.raises(RunFolderError, match="nothing to export"):
+    with pytest.raises(RunFolderError, match=r"1\.1"):
         export_run(room_run, out, "streamed-sog", min_opacity=1.1)
     assert not (tmp_path / "a.sog").exists() and not list(out.iterdir())
 

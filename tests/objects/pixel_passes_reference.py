@@ -242,7 +242,7 @@ def count_alike(
     return np.count_nonzero(((away * away).sum(2) < limit**2) & (pieces[None] != asked[:, None]), 1)
 
 
-def strange_colors(
+def outlier_colors(
     lab: np.ndarray, inside: np.ndarray, pieces: np.ndarray, *, light: np.ndarray, bins: tuple[float, float, float],
     cell: int, least_cell: float, occurs: float, usual: float, base: float, same_hue: float,
     shade: tuple[float, float],

@@ -271,7 +271,7 @@ def test_modes() -> None:
     raw = scene(7, 8, 9)
     never = started(scene(1, 2, 3), AssociationSettings(mode="never"))
     np.testing.assert_array_equal(never.associate(raw, shown(scene(1, 2, 3)), DEPTH).ids, raw)
-    with pytest.raises(ConfigError, match="mode: expected auto, always or never, found 'sometimes'"):
+    with pytest.raises(ConfigError, match="mode.*auto.*always.*never.*'sometimes'"):
         AssociationSettings(mode="sometimes")  # type: ignore[arg-type]
 
 
@@ -298,7 +298,7 @@ def test_a_thousand_ids() -> None:
 
 
 def test_images_of_different_size_are_refused() -> None:
-    with pytest.raises(ValueError, match="one size"):
+    with pytest.raises(ValueError, match=r"\(10, 160\).*\(120, 160\)"):
         Associator().associate(scene(1, 2, 3), None, DEPTH[:10])
 
 

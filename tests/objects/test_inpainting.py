@@ -19,11 +19,12 @@ from ggslam.objects.hole_refinement import Recorded
 from ggslam.objects.hole_views import CameraView, HoleView
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.plane_filling import Chart, as_seen, paint
+from ggslam.objects.removal_artifacts import drop_artifacts, places
 from ggslam.objects.segmented_rows import copies_of, join_gaussians
-from ggslam.objects.traces import drop_traces, places
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import overridden
 
 
 @dataclass
@@ -148,7 +149,7 @@ def test_traces_that_bear_another_label_go_and_the_rest_stays(table: TableScene)
     gaussians.keep(rest)
     table.scene.votes = None
     count = len(gaussians)
-    dropped = drop_traces(table.scene, removed, table.views)
+    dropped = drop_artifacts(table.scene, removed, table.views)
     left = sum(row.tobytes() in wrong for row in gaussians.means.numpy())
     assert left < 0.05 * len(wrong)
     assert dropped == count - len(gaussians) < 3 * len(wrong)
@@ -165,13 +166,14 @@ def test_things_apart_leave_holes_of_their_own(table: TableScene) -> None:
 
 
 @pytest.mark.parametrize("patches", [400, 20])
-def test_stripes_run_on_through_a_gap(patches: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(texture, "_MOST", patches)  # 20: too few for this gap, so that it is filled coarsely
+def test_stripes_run_on_through_a_gap(patches: int) -> None:
+    """20 patches are too few for this gap, so that it is filled coarsely."""
     stripes = np.where(np.arange(120) // 10 % 2, 0.8, 0.2)
     image = np.broadcast_to(stripes[None, :, None], (60, 120, 3)).astype(np.float32)
     gap = np.zeros((60, 120), bool)
     gap[15:45, 30:90] = True
-    filled = texture.fill_gap(np.where(gap[..., None], 0, image).astype(np.float32), ~gap, gap)
+    with overridden(texture.TextureTuning, max_patches=patches):
+        filled = texture.fill_gap(np.where(gap[..., None], 0, image).astype(np.float32), ~gap, gap)
     wrong = (np.abs(filled - image[gap]).mean(1) > 0.25).mean()
     assert wrong < 0.15
 

@@ -21,9 +21,8 @@ from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_parts,
 from ggslam.formats.gaussian_rows import GaussianRows, GaussianRowsTuning
 from ggslam.formats.point_ply import read_points
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
-from ggslam.objects import segmented_map
-from ggslam.objects.segmented_map import ObjectVotes
-from ggslam.reporting.pictures import IdentityColors
+from ggslam.objects.segmented_map import ObjectVotes, SegmentedMapTuning
+from ggslam.reporting.pictures import IdentityColors, IdentityPictureTuning
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX, MapInParts, write_map_index
 from ggslam.runs.objects_in_parts import ObjectsInParts
@@ -55,14 +54,13 @@ def stored(shared_segmented_room: Any, tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.fixture
-def pair(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[RunFolder, RunFolder]]:
+def pair(stored: Path, tmp_path: Path) -> Iterator[tuple[RunFolder, RunFolder]]:
     """A run in cells, and the same run without their index."""
     for name in ("cells", "whole"):
         shutil.copytree(stored, tmp_path / name)
     (tmp_path / "whole" / MAP_INDEX).unlink()
     accept_files(tmp_path / "whole")
-    monkeypatch.setattr(segmented_map, "_ROWS_AT_ONCE", 500)
-    with overridden(GaussianRowsTuning, rows_at_once=700):
+    with overridden(GaussianRowsTuning, rows_at_once=700), overridden(SegmentedMapTuning, rows_at_once=500):
         yield RunFolder.open(tmp_path / "cells"), RunFolder.open(tmp_path / "whole")
 
 
@@ -189,19 +187,18 @@ class Counts(dict[int, int]):
         super().__init__(zip(*(column.tolist() for column in np.unique(values, return_counts=True)), strict=True))
 
 
-def test_votes_and_colors_of_parts(pair: tuple[RunFolder, RunFolder], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_votes_and_colors_of_parts(pair: tuple[RunFolder, RunFolder]) -> None:
     folder, _ = pair
     path = folder.path / "votes.npz"
     assert np.array_equal(ObjectVotes.labels_in_file(path), ObjectVotes.from_file(path).labels())
-    monkeypatch.setattr("ggslam.runs.objects_in_parts.FITTED", 300)
-    monkeypatch.setattr("ggslam.reporting.pictures.FITTED", 300)
     gaussians = folder.gaussians()
-    whole = IdentityColors(gaussians.features.numpy()[gaussians.object_id.numpy() > 0])
-    parts = ObjectsInParts.of(folder).identity_colors()
+    with overridden(IdentityPictureTuning, fitted=300):
+        whole = IdentityColors(gaussians.features.numpy()[gaussians.object_id.numpy() > 0])
+        parts = ObjectsInParts.of(folder).identity_colors()
     image = gaussians.features.numpy()[:64].T.reshape(16, 8, 8)
     assert np.array_equal(parts.picture(image, np.ones((8, 8))), whole.picture(image, np.ones((8, 8))))
     path.write_bytes(path.read_bytes()[:-3000])
-    with pytest.raises(FormatError, match="votes"):
+    with pytest.raises(FormatError, match=r"votes\.npz"):
         ObjectVotes.labels_in_file(path)
 
 
@@ -209,7 +206,7 @@ def test_damage_is_named_by_its_row(pair: tuple[RunFolder, RunFolder], tmp_path:
     gaussians = pair[0].gaussians()
     gaussians.means[1500, 1] = torch.nan
     write_gaussian_ply(tmp_path / "map.ply", gaussians)
-    with pytest.raises(FormatError, match="'y' of vertex 1500"):
+    with pytest.raises(FormatError, match=r"map\.ply.*'y'.*1500"):
         list(GaussianRows(tmp_path / "map.ply").blocks())
 
 
@@ -221,10 +218,10 @@ def test_other_encodings_are_read_whole(tmp_path: Path, pair: tuple[RunFolder, R
     (tmp_path / "text.ply").write_text("\n".join([*header, "end_header", *numbers, ""]))
     rows = GaussianRows(tmp_path / "text.ply")
     assert len(rows) == 2 and rows.read(1, 1).means.tolist() == [[4, 5, 6]] and len(rows.like) == 0
-    with pytest.raises(FormatError, match="file is missing"):
+    with pytest.raises(FormatError, match=r"none\.ply"):
         GaussianRows(tmp_path / "none.ply")
     index = json.loads((pair[0].path / MAP_INDEX).read_text())
     index["cells"].pop()
     (pair[0].path / MAP_INDEX).write_text(json.dumps(index))
-    with pytest.raises(FormatError, match="speaks of others"):
+    with pytest.raises(FormatError, match=r"map\.ply.*9277.*map_cells\.json"):
         pair[0].map_in_parts()

@@ -219,36 +219,36 @@ def test_models_that_are_not_understood(tmp_path: Path) -> None:
         [value("masks", [1, 256, 64, 64])], {},
     )  # fmt: skip
     with pytest.raises(
-        ConfigError, match=r"decoder\.onnx: not a .* image_embeddings tensor\(float\) \[1, 256, 64, 64\]"
+        ConfigError, match=r"decoder\.onnx.* image_embeddings tensor\(float\) \[1, 256, 64, 64\]"
     ):
         OnnxSegmenter(decoder)
     classifier = save(
         tmp_path / "classifier.onnx", [h.make_node("GlobalAveragePool", ["image"], ["pooled"])],
         [value("image", [1, 3, 64, 64])], [value("pooled", [1, 3, 1, 1])], {},
     )  # fmt: skip
-    with pytest.raises(ConfigError, match=r"found inputs image .*; outputs pooled tensor\(float\) \[1, 3, 1, 1\]"):
+    with pytest.raises(ConfigError, match=r"classifier\.onnx.* image .*pooled tensor\(float\) \[1, 3, 1, 1\]"):
         OnnxSegmenter(classifier)
 
 
 def test_detections_of_another_layout(tmp_path: Path) -> None:
     """[1, n, 5 + classes + 32] of an older family is refused, not misread."""
     segmenter = OnnxSegmenter(yolo(tmp_path / "old.onnx", np.zeros((1, 200, 117))))
-    with pytest.raises(ConfigError, match=r"old\.onnx: expected detections .* found \[1, 200, 117\]"):
+    with pytest.raises(ConfigError, match=r"old\.onnx.*\[1, 200, 117\]"):
         segmenter.segment(picture())
 
 
 def test_files_that_are_no_models(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime", reason="the package onnxruntime is not installed")
-    with pytest.raises(ConfigError, match=r"none\.onnx: file is missing"):
+    with pytest.raises(ConfigError, match=r"none\.onnx"):
         OnnxSegmenter(tmp_path / "none.onnx")
     (tmp_path / "text.onnx").write_text("hello")
-    with pytest.raises(ConfigError, match=r"text\.onnx: cannot be loaded as an ONNX model"):
+    with pytest.raises(ConfigError, match=r"text\.onnx"):
         OnnxSegmenter(tmp_path / "text.onnx")
 
 
 def test_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(MissingDependency, match=r"pip install 'ggslam\[masks\]'"):
+    with pytest.raises(MissingDependency, match=r"ggslam\[masks\]"):
         OnnxSegmenter(tmp_path / "model.onnx")
 
 

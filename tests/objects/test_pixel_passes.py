@@ -31,7 +31,7 @@ from ggslam.sequences import open_sequence
 
 NAMES = (
     "link_surfaces", "connected_pieces", "grow_regions", "claim_planes", "share_near_planes", "find_bodies",
-    "count_borders", "count_contacts", "normals_of_inverse", "count_alike", "strange_colors",
+    "count_borders", "count_contacts", "normals_of_inverse", "count_alike", "outlier_colors",
 )  # fmt: skip
 PASSES = {name: getattr(depth_surface if name == "normals_of_inverse" else pixel_passes, name) for name in NAMES}
 Image = tuple[np.ndarray, np.ndarray, Camera]
@@ -167,10 +167,10 @@ def test_numbers_outside_of_their_tables_are_refused() -> None:
     regions, points = np.array([0, 3, 1], np.int32), np.zeros((3, 3), np.float32)
     asked = core.RegionOnPlane(region=1)
     job = core.RegionsOnPlanesJob(address(points), address(regions), 3, 3, 0.1, ctypes.addressof(asked), 1)
-    with pytest.raises(CoreInputError, match="regions: expected numbers from 0 to 2, found 3"):
+    with pytest.raises(CoreInputError, match="regions:.* 0 .*2.* 3"):
         load_library().ggslam_regions_on_planes(ctypes.byref(job))
     regions[1], asked.region = 2, -1
-    with pytest.raises(CoreInputError, match="region: expected 0 to 2, found -1"):
+    with pytest.raises(CoreInputError, match="region:.* 0 .*2.* -1"):
         load_library().ggslam_regions_on_planes(ctypes.byref(job))
 
 
@@ -179,5 +179,5 @@ def test_surfaces_of_another_type_are_refused_and_depth_of_any_is_taken() -> Non
     surface = surface_of(np.full((30, 40), 2.0), camera, 8.0)  # float64
     assert pixel_passes.link_surfaces(surface, surface.valid, GeometricSettings())[0][0].all()
     wrong = replace(surface, depth=surface.depth.astype(np.float64))
-    with pytest.raises(InputError, match=r"surface: depth: expected contiguous float32 \[30, 40\], found float64"):
+    with pytest.raises(InputError, match=r"depth.*float32 \[30, 40\].*float64"):
         pixel_passes.link_surfaces(wrong, surface.valid, GeometricSettings())

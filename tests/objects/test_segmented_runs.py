@@ -122,7 +122,7 @@ def test_what_is_saved_is_loaded(run: RunFolder, shared_segmented_room: Any) -> 
 def test_a_run_without_objects_says_so(plain_run: RunFolder) -> None:
     assert not plain_run.has_objects() and plain_run.votes() is None
     assert len(plain_run.gaussians()) > 0
-    with pytest.raises(RunFolderError, match="this run has no objects"):
+    with pytest.raises(RunFolderError, match="plain"):
         plain_run.segmented_map()
 
 
@@ -154,14 +154,14 @@ def test_a_save_that_fails_leaves_a_map_without_objects(run: RunFolder, monkeypa
 def test_files_that_do_not_belong_together(run: RunFolder) -> None:
     rest = votes_for(np.ones(5, np.uint16))
     (run.path / "votes.npz").write_bytes(rest.to_bytes())
-    with pytest.raises(RunFolderError, match="votes.npz.*found 5"):
+    with pytest.raises(RunFolderError, match=r"votes\.npz.* 5$"):
         run.segmented_map()
     (run.path / "votes.npz").write_bytes(b"PK\x03\x04 nonsense")
     with pytest.raises(FormatError, match="votes.npz"):
         run.segmented_map()
     (run.path / "votes.npz").unlink()
     (run.path / "classifier.npz").write_bytes(IdentityClassifier.empty(8).to_bytes())
-    with pytest.raises(RunFolderError, match="expected 8 properties identity_\\*, found 16"):
+    with pytest.raises(RunFolderError, match=r"map\.ply.* 8 .*identity_\*.*16"):
         run.segmented_map()
     (run.path / "classifier.npz").unlink()
     with pytest.raises(FormatError, match="classifier.npz"):

@@ -13,11 +13,13 @@ import torch
 
 from ggslam.errors import ConfigError, FormatError
 from ggslam.objects.boxes import middle_of, oriented_box
-from ggslam.objects.colors import UNLABELLED, id_palette
+from ggslam.objects.colors import PaletteTuning, id_palette
+from ggslam.objects.settings import ClassifierTuning
 from ggslam.objects.table import ObjectRecord, ObjectTable, Observation
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
 from ggslam.scene.oriented_box import OrientedBox
+from ggslam.system.tuning import overridden
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -64,14 +66,14 @@ def test_a_table_counts_names_and_observes() -> None:
         ObjectTable.build(map_of([70000]), IdentityClassifier.empty(), "masks")
 
 
-def test_confidence_is_the_mean_probability_of_the_own_class(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ggslam.objects.table._VALUES_AT_ONCE", 3)  # one Gaussian at a time
+def test_confidence_is_the_mean_probability_of_the_own_class() -> None:
     weight = np.zeros((2, 16), np.float32)
     weight[0, 0], weight[1, 1] = 1, 1
     classifier = IdentityClassifier(np.array([3, 7], np.uint16), weight, np.zeros(2, np.float32))
     features = np.zeros((3, 16))
     features[0, 0], features[1, 0], features[2, 1] = np.log(4), np.log(9), 0
-    table = ObjectTable.build(map_of([3, 3, 7], features=features), classifier, "masks")
+    with overridden(ClassifierTuning, values_at_once=3):  # one Gaussian at a time
+        table = ObjectTable.build(map_of([3, 3, 7], features=features), classifier, "masks")
     nothing = np.exp(NOTHING_LOGIT)
     assert table.record(3).confidence == pytest.approx((4 / (5 + nothing) + 9 / (10 + nothing)) / 2)
     assert table.record(7).confidence == pytest.approx(1 / (2 + nothing))
@@ -121,7 +123,7 @@ def test_a_real_segmented_map(segmented_room: Any) -> None:
 
 def test_colours_are_distinct_and_never_grey() -> None:
     colors = id_palette()
-    assert tuple(colors[0]) == UNLABELLED and not colors.flags.writeable
+    assert tuple(colors[0]) == PaletteTuning.unlabelled and not colors.flags.writeable
     first = colors[1:601].astype(int)
     steps = {step: np.abs(first[step:] - first[:-step]).sum(-1).min() for step in (1, 2, 3, 5, 8, 13, 21, 34, 144, 288)}
     assert min(steps.values()) > 50, steps  # also where hues come near each other again
@@ -148,8 +150,8 @@ def test_names_and_ids() -> None:
 
 @pytest.mark.parametrize(
     ("wanted", "hint"),
-    [("mgu", "did you mean mug"), ("bigbook", "did you mean Big Book"), ("99", "mug \\(2\\)"), ("", "''"),
-     ("-7", "no object '-7'"), ("³", "no object")],
+    [("mgu", r"'mgu'.*mug\W*$"), ("bigbook", r"'bigbook'.*Big Book\W*$"), ("99", "mug \\(2\\)"), ("", "''"),
+     ("-7", "'-7'"), ("³", "'³'")],
 )  # fmt: skip
 def test_unknown_names_are_answered_with_near_ones(wanted: str, hint: str) -> None:
     table = table_of({2: "mug", 7: "Big Book"})
@@ -158,9 +160,9 @@ def test_unknown_names_are_answered_with_near_ones(wanted: str, hint: str) -> No
 
 
 def test_unknown_names_in_long_and_empty_tables() -> None:
-    with pytest.raises(ConfigError, match="object 12 and 88 more"):
+    with pytest.raises(ConfigError, match="object 12 .*88"):
         table_of(dict.fromkeys(range(1, 101))).find("mug")
-    with pytest.raises(ConfigError, match="none"):
+    with pytest.raises(ConfigError, match="'3'"):
         table_of({}).record(3)
 
 
@@ -213,5 +215,5 @@ def test_damaged_files_are_named(tmp_path: Path, content: str, words: str) -> No
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="missing"):
+    with pytest.raises(FormatError, match=r"objects\.json"):
         ObjectTable.load(tmp_path / "objects.json")

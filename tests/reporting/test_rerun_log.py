@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError, MissingDependency
-from ggslam.jobs.watch.rerun_follower import MAP_EVERY, LiveLog
+from ggslam.jobs.watch.rerun_follower import LiveLog, RerunTuning
 from ggslam.movers.found import MoverSight
 from ggslam.reporting.rerun_log import RerunLog
 from ggslam.scene.camera import Camera
@@ -106,14 +106,14 @@ def _tensor(*shape: int) -> Any:
 def test_poses_images_map_and_numbers_are_sent() -> None:
     log = RerunLog("run.rrd", "kitchen")
     stream: Stream = log._stream
-    live = follow(log, 4 * MAP_EVERY)
+    live = follow(log, 4 * RerunTuning.keyframes_per_map)
     assert stream.saved_to == "run.rrd" and stream.name == "kitchen"
     assert stream.entities("world/camera")[0].image_from_camera == [[5, 0, 3.5], [0, 5, 2.5], [0, 0, 1]]
     poses = [a.translation[0] for a in stream.entities("world/camera")[1:]]
     assert poses == [k for k in range(20) if k != 3]  # the lost frame has none
     images = stream.entities("world/camera/image")
     assert len(images) == 20 and images[0].contents[:2] == b"\xff\xd8"
-    assert [f for e, _, f in stream.logged if e == "world/map"] == [0, 2 * MAP_EVERY]
+    assert [f for e, _, f in stream.logged if e == "world/map"] == [0, 2 * RerunTuning.keyframes_per_map]
     assert (stream.entities("world/camera/depth")[0].values[0] == 1000).all()
     assert len(stream.entities("plots/loss")) == 19 and len(stream.entities("plots/overlap")) == 20
     assert stream.times == {"frame": 19, "time": pytest.approx(1.9)}
@@ -139,7 +139,7 @@ def test_targets_that_are_none_are_refused(target: str) -> None:
 
 def test_without_rerun_one_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(MissingDependency, match=r"pip install 'ggslam\[rerun\]'"):
+    with pytest.raises(MissingDependency, match=r"ggslam\[rerun\]"):
         RerunLog("rerun", "kitchen")
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from ggslam.errors import ConfigError, GgslamError, SequenceError
+from ggslam.jobs.eval.run import score_run
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
-from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, open_recording_of
 from ggslam.runs.records.metrics import MetricsRecord

@@ -18,9 +18,9 @@ from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.point_ply import read_points
 from ggslam.formats.trajectory import read_tum
 from ggslam.formats.voxel_cloud import join_clouds
+from ggslam.jobs.eval.run import score_run
 from ggslam.jobs.progress import SilentObserver
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
-from ggslam.jobs.score.run import score_run
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.map_points import map_points

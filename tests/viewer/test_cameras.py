@@ -8,7 +8,7 @@ import numpy as np
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose, se3_exp, transform_points
 from ggslam.viewer.cameras import (
-    HEADROOM_M,
+    CameraTuning,
     best_view,
     box_lines,
     canvas_camera,
@@ -48,8 +48,8 @@ def test_the_top_view_sees_the_map_from_above_without_the_ceiling() -> None:
     fov = math.radians(50)
     view = top_view(centers, np.zeros((3, 3)), np.array([0.0, 0, 1]), up, fov)
     depth = (view.position - centers) @ up
-    assert (depth[(centers @ up) > HEADROOM_M + 0.01] < view.near).all()  # cut away
-    below = (centers @ up) < HEADROOM_M - 0.01
+    assert (depth[(centers @ up) > CameraTuning.headroom_m + 0.01] < view.near).all()  # cut away
+    below = (centers @ up) < CameraTuning.headroom_m - 0.01
     assert (depth[below] > view.near).all()
     sideways = np.linalg.norm((centers - view.position)[:, [0, 2]], axis=1)[below]
     assert (sideways < math.tan(fov / 2) * depth[below] * 1.05).all()

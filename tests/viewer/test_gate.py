@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from ggslam.viewer.gate import MAX_MESSAGE_BYTES, Gate
+from ggslam.viewer.access import AccessTuning, Gate
 from ggslam.viewer.server import address, close_server, open_server
 
 pytest.importorskip("viser")
@@ -131,7 +131,7 @@ def test_sockets_are_judged_like_pages(server: Any) -> None:
 
 
 def test_messages_have_an_end(server: Any) -> None:
-    said = connect(server, b"x" * (MAX_MESSAGE_BYTES + 1), Cookie=cookie_of(server))
+    said = connect(server, b"x" * (AccessTuning.max_message_bytes + 1), Cookie=cookie_of(server))
     assert said.startswith("closed")
 
 

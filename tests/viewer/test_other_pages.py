@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from ggslam.viewer.gate import Gate
+from ggslam.viewer.access import Gate
 from ggslam.viewer.server import address, close_server, open_server
 
 from . import browser as b

@@ -16,8 +16,8 @@ from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.runs.folder import RunFolder
 from ggslam.viewer.objects_tab import object_list
 from ggslam.viewer.page import Page
+from ggslam.viewer.safe_text import plain
 from ggslam.viewer.server import address, close_server, open_server
-from ggslam.viewer.words import plain
 
 
 def test_a_taken_port_is_told() -> None:

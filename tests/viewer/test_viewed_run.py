@@ -150,12 +150,12 @@ STRAY_NAMES = ["", "..", "/tmp/elsewhere", "../elsewhere", "~nobody/x", "a\x00b"
 @pytest.mark.parametrize("target", STRAY_NAMES)
 def test_a_page_saves_in_one_folder_only(viewed: ViewedRun, target: str) -> None:
     viewed.rename(some_object(viewed), "thing")
-    with pytest.raises(ConfigError, match="a name is needed"):
+    with pytest.raises(ConfigError, match=f"{viewed.save_folder()}"):
         viewed.save(target, inpaint=False)
 
 
 def test_names_of_objects_have_an_end(viewed: ViewedRun) -> None:
-    with pytest.raises(ConfigError, match="201 characters"):
+    with pytest.raises(ConfigError, match="201.*200"):
         viewed.rename(some_object(viewed), "x" * 201)
 
 
@@ -191,7 +191,7 @@ def test_a_pose_that_is_no_number_is_told(run: RunFolder, tmp_path: Path) -> Non
     record = json.loads(path.read_text())
     record["frames"][2]["T_keyframe_camera"][0][3] = None
     path.write_text(json.dumps(record))
-    with pytest.raises(RunFolderError, match="keyframes.json: pose of frame 2"):
+    with pytest.raises(RunFolderError, match=r"keyframes\.json.*\b2\b"):
         ViewedRun(copied)
 
 
@@ -226,9 +226,9 @@ def test_changes_of_other_runs_are_told(run: RunFolder, tmp_path: Path) -> None:
     other = written_changes(tmp_path / "other", tmp_path / "older", tmp_path / "newer")
     assert [note for note in ViewedRun(run, changes=other).notes if "not of this run" in note]
     newer = written_changes(tmp_path / "newer", tmp_path / "older", run.path)
-    with pytest.raises(ConfigError, match="world of the older run"):
+    with pytest.raises(ConfigError, match="newer.*older"):
         ViewedRun(run, changes=newer)
-    with pytest.raises(ConfigError, match=r"holds no changes\.json"):
+    with pytest.raises(ConfigError, match=r"changes\.json"):
         ViewedRun(run, changes=tmp_path)
 
 

@@ -132,18 +132,18 @@ def test_damaged_files_are_refused_or_read_but_never_worse(encode: Any) -> None:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "first line"),
-        (b"#OcTree legacy", "first line"),
-        (b"# Octomap OcTree binary file\nid OcTree\nsize 1\nres 0.1\n", "no line 'data'"),
+        (b"", "# Octomap OcTree"),
+        (b"#OcTree legacy", "# Octomap OcTree"),
+        (b"# Octomap OcTree binary file\nid OcTree\nsize 1\nres 0.1\n", "'data'"),
         (HEADER.replace(b"OcTree\ns", b"ColorOcTree\ns") % 9 + b"UU", "ColorOcTree"),
-        (HEADER.replace(b"0.1", b"nan") % 9 + b"UU", "res"),
-        (HEADER.replace(b"0.1", b"-3") % 9 + b"UU", "res"),
-        (HEADER.replace(b"0.1", b"1e300") % 9 + b"UU", "res"),
-        (HEADER.replace(b"0.1", b"ten") % 9 + b"UU", "res"),
+        (HEADER.replace(b"0.1", b"nan") % 9 + b"UU", "res.*'nan'"),
+        (HEADER.replace(b"0.1", b"-3") % 9 + b"UU", "res.* -3"),
+        (HEADER.replace(b"0.1", b"1e300") % 9 + b"UU", "res.*1e300"),
+        (HEADER.replace(b"0.1", b"ten") % 9 + b"UU", "res.*'ten'"),
         (HEADER.replace(b"res 0.1\n", b"") % 9 + b"UU", "'res'"),
-        (HEADER.replace(b"%d", b"-9") + b"UU", "size"),
-        (HEADER % 10**15 + b"UU", "1000000000000000 nodes, the tree has 9"),
-        (HEADER % 9 + b"U", "cut off"),
+        (HEADER.replace(b"%d", b"-9") + b"UU", "size.* -9"),
+        (HEADER % 10**15 + b"UU", "1000000000000000.* 9$"),
+        (HEADER % 9 + b"U", " 9 .* 1$"),
         (HEADER % 1 + b"\0\0", "no children"),
         (HEADER % 17 + b"\x03\0" * 17, "finest level"),
         (FULL_HEADER % 1 + b"\0\0\xc0\x7f\0", "finite"),
@@ -159,14 +159,14 @@ def test_wrong_files_are_refused_with_the_reason(data: bytes, reason: str, tmp_p
 
 def test_maps_beyond_the_memory_allowed_are_refused() -> None:
     data = full_octomap(random_map())
-    with pytest.raises(FormatError, match="GiB"):
+    with pytest.raises(FormatError, match=r"map\.ot.*0\.0 GiB"):
         decode_octomap(data, "map.ot", memory_limit=20000)
 
 
 def test_missing_files_and_other_endings(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"absent\.bt"):
         read_octomap(tmp_path / "absent.bt")
-    with pytest.raises(FormatError, match="ending"):
+    with pytest.raises(FormatError, match=r"map\.ply.*\.bt.*\.ot"):
         write_octomap(OccupancyMap(0.1), tmp_path / "map.ply")
 
 

@@ -303,14 +303,18 @@ def test_wrong_input_is_refused() -> None:
     tsdf, depth = TsdfMap(SETTINGS), np.ones((120, 160), np.float32)
     broken = FRONT.copy()
     broken[0, 3] = np.nan
-    for pose, words in [(broken, "finite"), (np.eye(3), "finite"), (np.diag([2.0, 1, 1, 1]), "rotation")]:
+    for pose, words in [
+        (broken, "T_world_camera.*nan"),
+        (np.eye(3), r"T_world_camera.*\[4, 4\]"),
+        (np.diag([2.0, 1, 1, 1]), r"T_world_camera.* \[\[2\.0"),
+    ]:
         with pytest.raises(ValueError, match=words):
             tsdf.integrate(depth, CAMERA, pose)
     far = FRONT.copy()
     far[0, 3] = 1e12
-    with pytest.raises(ValueError, match="position within"):
+    with pytest.raises(ValueError, match=r"T_world_camera.*3e\+07.*1000000000000"):
         tsdf.integrate(depth, CAMERA, far)
-    with pytest.raises(ValueError, match=r"depth: expected float32 \[120, 160\], found float32 \[160, 120\]"):
+    with pytest.raises(ValueError, match=r"depth.*float32 \[120, 160\].*float32 \[160, 120\]"):
         tsdf.integrate(depth.T, CAMERA, FRONT)
     with pytest.raises(ValueError, match="depth: .*uint16"):
         tsdf.integrate(depth.astype(np.uint16), CAMERA, FRONT)

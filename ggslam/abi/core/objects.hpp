@@ -50,7 +50,7 @@ struct AlikeColorsJob {
 };
 
 // Which colours of a plane occur in few places of it.
-struct StrangeColorsJob {
+struct OutlierColorsJob {
   const float* lab;       // [H, W, 3], CIELAB, each channel 0 to 255
   const uint8_t* inside;  // [H, W], not 0: the plane
   const int32_t* pieces;  // [H, W], from 0 to `pieces_end`, between which colours change abruptly
@@ -187,4 +187,4 @@ GGSLAM_EXPORT int ggslam_regions_on_planes(const ggslam::RegionsOnPlanesJob* job
 GGSLAM_EXPORT int ggslam_region_bodies(const ggslam::BodiesJob* job);
 GGSLAM_EXPORT int ggslam_surface_normals(const ggslam::NormalsJob* job);
 GGSLAM_EXPORT int ggslam_alike_colors(const ggslam::AlikeColorsJob* job);
-GGSLAM_EXPORT int ggslam_strange_colors(const ggslam::StrangeColorsJob* job);
+GGSLAM_EXPORT int ggslam_outlier_colors(const ggslam::OutlierColorsJob* job);

@@ -19,11 +19,19 @@ from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.record import RecordFile
 from ggslam.system.atomic import make_folder
 from ggslam.system.links import refuse_link
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted, printable
 
 _log = logging.getLogger(__name__)
-_TAIL, _LINE = 8192, 300
-"""Bytes at the end of a log that are looked at, and characters of a line that are shown."""
+
+
+class LogTuning(Tuning):
+    """How much of a run's log is read and shown."""
+
+    tail_bytes = 8192
+    """Bytes at the end of a log that are read."""
+    line_length = 300
+    """Characters of its last line that are shown."""
 
 
 class State(enum.Enum):
@@ -85,14 +93,14 @@ class JobState:
         """The error that the run printed, or else the last thing it said."""
         try:
             with open_untrusted(self.log) as file:
-                file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
-                text = file.read(_TAIL).decode(errors="replace")
+                file.seek(max(0, os.fstat(file.fileno()).st_size - LogTuning.tail_bytes))
+                text = file.read(LogTuning.tail_bytes).decode(errors="replace")
         except (OSError, FormatError):
             return ""
         lines = [line.strip() for line in text.splitlines()]
         errors = [line.removeprefix("error:").strip() for line in lines if line.startswith("error:")]
         said = errors or [line for line in lines if line]
-        return printable(said[-1][:_LINE]) if said else ""
+        return printable(said[-1][:LogTuning.line_length]) if said else ""
 
     def memory(self) -> JobRecord | None:
         """What an earlier call noted of a run with the same arguments."""

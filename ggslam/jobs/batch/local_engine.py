@@ -9,8 +9,14 @@ from collections.abc import Callable, Sequence
 from ggslam.jobs.batch.job_process import JobProcess
 from ggslam.jobs.batch.job_states import JobState, State
 from ggslam.jobs.tasks.processors import shares
+from ggslam.system.tuning import Tuning
 
-_WAIT_S = 0.1
+
+class LocalEngineTuning(Tuning):
+    """How local runs are waited for."""
+
+    wait_s = 0.1
+    """Seconds between two looks at the running processes."""
 
 
 def run_locally(
@@ -34,7 +40,7 @@ def run_locally(
                 free.append(worker.processors)
                 worker.end()
             changed()
-            time.sleep(_WAIT_S)
+            time.sleep(LocalEngineTuning.wait_s)
     finally:
         for worker in busy:
             worker.ask_to_stop()  # all together: saving takes a while

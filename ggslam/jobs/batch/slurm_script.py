@@ -8,10 +8,17 @@ import sys
 from collections.abc import Mapping, Sequence
 
 from ggslam.jobs.batch.manifest import Manifest, option
-from ggslam.jobs.tasks.processors import PROCESSORS
+from ggslam.jobs.tasks.processors import ProcessorTuning
+from ggslam.system.tuning import Tuning
 
-_MEMORY_GB = 4
-_HOURS = 4
+
+class SlurmTuning(Tuning):
+    """What a job asks Slurm for."""
+
+    memory_gb = 4
+    """Memory of a run, in GB."""
+    hours = 4
+    """Longest time of a run, in hours."""
 
 
 def slurm_script(manifest: Manifest, arguments: Sequence[str], only: str, table: str) -> str:
@@ -26,8 +33,9 @@ def slurm_script(manifest: Manifest, arguments: Sequence[str], only: str, table:
     out, command = manifest.out.absolute(), shlex.join([sys.executable, "-m", "ggslam", "batch", *arguments])
     title = " ".join(manifest.title.split())  # a comment ends with its line
     runs = {
-        "job-name": title, "array": f"0-{len(manifest.jobs) - 1}", "cpus-per-task": str(PROCESSORS),
-        "mem": f"{_MEMORY_GB}G", "time": f"{_HOURS}:00:00", "output": str(out / "slurm-%A_%a.log"),
+        "job-name": title, "array": f"0-{len(manifest.jobs) - 1}", "cpus-per-task": str(ProcessorTuning.per_worker),
+        "mem": f"{SlurmTuning.memory_gb}G", "time": f"{SlurmTuning.hours}:00:00",
+        "output": str(out / "slurm-%A_%a.log"),
         "wrap": f"{command} {only} $SLURM_ARRAY_TASK_ID",
     }  # fmt: skip
     end = {"job-name": f"{title} table", "cpus-per-task": "1", "wrap": f"{command} {table}"}

@@ -12,15 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
+from ggslam.changes.change_table import ChangeTable
 from ggslam.changes.detection import ChangeDetector
-from ggslam.changes.found import ChangeTable
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.sightings import Visit
 from ggslam.errors import ConfigError
-from ggslam.jobs.changes.ghosts import own_keyframes, without_ghosts
 from ggslam.jobs.changes.pictures import picture_of_change
-from ggslam.jobs.changes.shown import MOST_PICTURES, ChangesShown
-from ggslam.jobs.merge.placing import find_joint_poses, place_maps
+from ggslam.jobs.changes.saved_changes import ChangesShown, SavedChangesTuning
+from ggslam.jobs.changes.stale_gaussians import own_keyframes, without_stale_gaussians
+from ggslam.jobs.merge.joint_poses import find_joint_poses, place_maps
 from ggslam.jobs.merge.sources import MergeSource, read_sources
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.merging.coverage import PlacedRun
@@ -143,7 +143,9 @@ def make_folder_of_changes(out: Path) -> None:
         raise write_failure(out, error) from None
 
 
-def show_changes(outcome: ChangesOutcome, old: str | Path, new: str | Path, most: int = MOST_PICTURES) -> ChangesShown:
+def show_changes(
+    outcome: ChangesOutcome, old: str | Path, new: str | Path, most: int = SavedChangesTuning.pictures
+) -> ChangesShown:
     """What `find_changes` found, as pages show it, with so many pictures; `old`, `new`: as the runs are named there."""
     found = outcome.table.found.changes
     record = ChangesRecord.of({"old": str(old), "new": str(new), **outcome.table.to_dict()})
@@ -162,7 +164,7 @@ def _visit(
     poses = T_new_old @ known.poses
     points = [transform_points(known.points[k].astype(float), poses[k]) for k in counted]
     normals = [known.normals[k].astype(float) @ poses[k, :3, :3].T for k in counted]
-    gaussians = without_ghosts(source, placed, notes)
+    gaussians = without_stale_gaussians(source, placed, notes)
     return Visit(
         gaussians, [placed.cameras[k] for k in counted], placed.T_world_camera[list(counted)],
         np.concatenate(points), np.concatenate(normals), source.objects is not None,

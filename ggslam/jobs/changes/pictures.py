@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from ggslam.changes.change import Change
-from ggslam.changes.found import ChangeTable
+from ggslam.changes.change_table import ChangeTable
 from ggslam.changes.sightings import Visit
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
@@ -17,12 +17,22 @@ from ggslam.reporting.pictures import color_to_uint8, side_by_side
 from ggslam.scene.camera import Camera
 from ggslam.scene.oriented_box import OrientedBox
 from ggslam.scene.poses import inverse, transform_points
+from ggslam.system.tuning import Tuning
 
-NEAR = 0.1
-"""Metres before the camera from which lines are drawn on."""
-_FAR_OFF = 9999
-"""Pixels beyond which lines are bent: OpenCV's coordinates are small."""
-OLD_COLOR, NEW_COLOR = (220, 30, 30), (20, 160, 60)
+
+class PictureTuning(Tuning):
+    """How boxes are drawn around changes."""
+
+    near_m = 0.1
+    """Depth from which lines are drawn, in metres."""
+    max_coordinate = 9999
+    """Largest pixel coordinate that is given to OpenCV."""
+    old_color = (220, 30, 30)
+    """RGB of boxes where something was."""
+    new_color = (20, 160, 60)
+    """RGB of boxes where something is now."""
+
+
 _EDGES = [(a, b) for a, b in product(range(8), repeat=2) if a < b and bin(a ^ b).count("1") == 1]
 
 
@@ -35,7 +45,7 @@ def picture_of_change(
     for visit in visits:
         view = rasterizer.forward(visit.gaussians, camera, T_camera_world, features=False)
         picture = np.ascontiguousarray(color_to_uint8(view.image.numpy()))
-        for number, color in ((0, OLD_COLOR), (1, NEW_COLOR)):
+        for number, color in ((0, PictureTuning.old_color), (1, PictureTuning.new_color)):
             box = table.box(change, number)
             if box is not None:
                 _draw_box(picture, box, camera, T_camera_world, color)
@@ -57,10 +67,10 @@ def _best_view(change: Change, table: ChangeTable, visits: tuple[Visit, Visit]) 
 
 def _score(points: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> float:
     x, y, z = transform_points(points, inverse(T_world_camera)).T
-    ahead = np.where(z > NEAR, z, np.inf)
+    ahead = np.where(z > PictureTuning.near_m, z, np.inf)
     column, row = x / ahead * camera.fx + camera.cx, y / ahead * camera.fy + camera.cy
     off = np.maximum(np.abs(2 * column / camera.width - 1), np.abs(2 * row / camera.height - 1))
-    inside = (z > NEAR) & (off < 1)
+    inside = (z > PictureTuning.near_m) & (off < 1)
     if not inside.any():
         return 0.0
     return float(inside.mean() * (1.2 - off[inside].mean()) / np.median(z[inside]))
@@ -73,8 +83,10 @@ def _draw_box(
     local = transform_points(corners + np.array(box.center), T_camera_world)
     for a, b in _EDGES:
         ends = local[[a, b]]
-        if (ends[:, 2] < NEAR).any():
+        if (ends[:, 2] < PictureTuning.near_m).any():
             continue
         pixels = ends[:, :2] / ends[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-        start, end = np.clip(np.rint(pixels), -_FAR_OFF, _FAR_OFF).astype(int).tolist()
+        start, end = (
+            np.clip(np.rint(pixels), -PictureTuning.max_coordinate, PictureTuning.max_coordinate).astype(int).tolist()
+        )
         cv2.line(picture, start, end, color, 1, cv2.LINE_AA)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.changes.changes import ChangesOutcome, find_changes
-from ggslam.jobs.changes.ghosts import own_keyframes
+from ggslam.jobs.changes.stale_gaussians import own_keyframes
 from ggslam.jobs.changes.store_events import (
     add_evidence,
     events_of_changes,
@@ -39,11 +39,18 @@ from ggslam.submaps.store_objects import (
     read_objects,
     write_objects,
 )
+from ggslam.system.tuning import Tuning
 
-_OFF_METRES, _OFF_DEGREES = 0.2, 5.0
-"""How far the world of a run may lie from the store's."""
-_MANY_OFF = 3
-"""Keyframes at least, to tell that."""
+
+class SameWorldTuning(Tuning):
+    """When a run lies in the world of a store."""
+
+    max_shift_m = 0.2
+    """Largest distance between the two worlds, in metres."""
+    max_rotation_deg = 5.0
+    """Largest rotation between them, in degrees."""
+    min_keyframes = 3
+    """Fewest keyframes that are compared."""
 
 
 @dataclass
@@ -177,11 +184,11 @@ def _compare_maps(
 def _check_world(folder: RunFolder, outcome: ChangesOutcome, visit: str) -> None:
     record, placed = folder.keyframes(), outcome.visits[1].T_world_camera
     own = own_keyframes(record)
-    if len(own) != len(placed) or len(own) < _MANY_OFF:
+    if len(own) != len(placed) or len(own) < SameWorldTuning.min_keyframes:
         return
     apart = [separation(record.keyframes[k].T_world_camera, T) for k, T in zip(own, placed, strict=True)]
     metres, degrees = np.median(apart, axis=0)
-    if metres > _OFF_METRES or degrees > _OFF_DEGREES:
+    if metres > SameWorldTuning.max_shift_m or degrees > SameWorldTuning.max_rotation_deg:
         raise ConfigError(
             f"{folder.path}: lies {metres:.2f} m and {degrees:.0f} degrees from where visit {visit!r} has it; "
             "add the run that `ggslam update` makes of the two, or start this one in the earlier run's map"

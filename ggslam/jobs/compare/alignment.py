@@ -18,18 +18,25 @@ from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.poses import fit_similarity, inverse
 from ggslam.sequences.association import PairingTuning, pair_times
+from ggslam.system.tuning import Tuning
 
 Alignment = Literal["auto", "none", "truth", "icp", "trajectory"]
-_ARM_M = 1.0
-"""Metres: poses are laid upon one another by the camera's place and by points this far along its axes, so that the
-rotation is known where the camera hardly moved. The scene is about so far away."""
-_WORST_FIT = 0.2
-"""A trajectory that misses the truth by more than this share of the truth's extent says nothing about the frame."""
-_LEAST_OVERLAP = 0.3
-"""Share of the points of the cloud that overlaps more, below which a registration is nonsense."""
-_PROBES = 5000
-_CLEARLY = 0.1
-"""So much more of the points must lie near the other side for "auto" to choose the truth."""
+
+
+class AlignmentTuning(Tuning):
+    """When an alignment of two runs is believed."""
+
+    arm_m = 1.0
+    """Poses are aligned by points this far along the camera's axes, too, in metres: about the distance of the scene.
+    They fix the rotation where the camera hardly moved."""
+    max_error = 0.2
+    """Largest error of a trajectory, as a share of the true path's extent."""
+    min_overlap = 0.3
+    """Smallest share of points with a partner after registration, in the cloud that overlaps more."""
+    probes = 5000
+    """Points that are tried to choose between the true poses and the poses as they are."""
+    min_gain = 0.1
+    """"auto" chooses the true poses if this much larger a share of points then lies near the other side."""
 
 
 @dataclass(frozen=True)
@@ -101,9 +108,9 @@ def best_of_truth_and_none(
         T = by_truth(a, b)
     except ConfigError:
         return "none", np.eye(4)
-    few = Cloud(a.points[Cloud(a.points).sample(_PROBES, seed)])
+    few = Cloud(a.points[Cloud(a.points).sample(AlignmentTuning.probes, seed)])
     plain, moved = (overlap(few, cloud_b, max_distance, start, seed).fitness for start in (np.eye(4), T))
-    return ("truth", T) if moved > plain + _CLEARLY else ("none", np.eye(4))
+    return ("truth", T) if moved > plain + AlignmentTuning.min_gain else ("none", np.eye(4))
 
 
 def check_registration(a: Side, b: Side, found: CloudRegistration, back: float) -> None:
@@ -117,12 +124,12 @@ def check_registration(a: Side, b: Side, found: CloudRegistration, back: float) 
         ConfigError: it is nonsense.
     """
     best = max(found.overlap.fitness, back)
-    if best < _LEAST_OVERLAP:
+    if best < AlignmentTuning.min_overlap:
         raise ConfigError(
             f"`align` icp: {a.path} cannot be registered upon {b.path} by ICP: at the best pose found "
             f"({100 * found.moved_m:.0f} cm, {found.turned_deg:.0f} degrees away) {best:.0%} of the points "
-            f"have a partner, {_LEAST_OVERLAP:.0%} needed; ICP needs a start within about a metre: use truth or "
-            "trajectory, or move one of them first"
+            f"have a partner, {AlignmentTuning.min_overlap:.0%} needed; ICP needs a start within about a metre: use "
+            "truth or trajectory, or move one of them first"
         )
 
 
@@ -140,11 +147,11 @@ def _true_world(side: Side) -> np.ndarray:
     T = fit_similarity(_arms(found), _arms(true))[0]
     positions = true[:, :3, 3]
     error = float(np.sqrt((((T @ found)[:, :3, 3] - positions) ** 2).sum(1).mean()))
-    extent = float(np.linalg.norm(np.ptp(positions, axis=0))) + _ARM_M
-    if error > _WORST_FIT * extent:
+    extent = float(np.linalg.norm(np.ptp(positions, axis=0))) + AlignmentTuning.arm_m
+    if error > AlignmentTuning.max_error * extent:
         raise ConfigError(
             f"`align` truth: the trajectory of {side.path} does not fit its true poses: {100 * error:.0f} cm off "
-            f"(RMSE) along a path that spans {extent - _ARM_M:.2f} m"
+            f"(RMSE) along a path that spans {extent - AlignmentTuning.arm_m:.2f} m"
         )
     return T
 
@@ -152,4 +159,6 @@ def _true_world(side: Side) -> np.ndarray:
 def _arms(poses: np.ndarray) -> np.ndarray:
     """Places [4 N, 3]: of each camera [N, 4, 4], and points along its axes."""
     places = poses[:, None, :3, 3]
-    return np.concatenate([places, places + _ARM_M * poses[:, :3, :3].transpose(0, 2, 1)], 1).reshape(-1, 3)
+    return np.concatenate([places, places + AlignmentTuning.arm_m * poses[:, :3, :3].transpose(0, 2, 1)], 1).reshape(
+        -1, 3
+    )

@@ -38,11 +38,16 @@ from ggslam.runs.opened_points import opened_points
 from ggslam.runs.writing import TRUTH_FILE
 from ggslam.scene.poses import inverse
 from ggslam.system.json_files import json_ready
+from ggslam.system.tuning import Tuning
 
-MESH_SPACING = 0.01
-"""Metres: a mesh is sampled with one point per square of this side..."""
-MOST_SAMPLES = 2_000_000
-"""...but with no more points than this."""
+
+class MeshSamplingTuning(Tuning):
+    """How a mesh is sampled."""
+
+    spacing_m = 0.01
+    """One point is sampled for each square of this side, in metres."""
+    max_points = 2_000_000
+    """Most points that are sampled."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +196,7 @@ def read_side(path: Path, seed: int = 0) -> Side:
         mesh = read_mesh(path) if path.suffix.lower() == ".ply" else None
         if mesh is None:
             return Side(path, read_point_cloud(path).points)
-        count = int(np.clip(mesh.area() / MESH_SPACING**2, 1000, MOST_SAMPLES))
+        count = int(np.clip(mesh.area() / MeshSamplingTuning.spacing_m**2, 1000, MeshSamplingTuning.max_points))
         return Side(path, mesh.sample(count, seed)[0])
     except ValueError as error:
         raise FormatError(f"{path}: {error}") from None

@@ -25,6 +25,7 @@ from typing import Literal
 
 from ggslam import __version__
 from ggslam.errors import GgslamError
+from ggslam.system.tuning import Tuning
 
 State = Literal["ok", "missing", "warning", "broken"]
 """missing: optional, something cannot be done without it; warning: works, but badly; broken: ggslam does not work."""
@@ -67,7 +68,14 @@ EXTRAS = {
 }
 """By their names in pyproject.toml."""
 
-_LEAST_MEMORY_GB, _LEAST_DISK_GB = 2.0, 1.0
+
+class CheckupTuning(Tuning):
+    """What a machine should have free."""
+
+    memory_gb = 2.0
+    """Memory, in GB."""
+    disk_gb = 1.0
+    """Space on the disk, in GB."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ def _system() -> Iterator[Finding]:
     yield Finding("system", "python", "ok" if good else "broken", python, "" if good else "use Python 3.10 or newer")
     yield Finding("system", "platform", "ok", f"{platform.system()} {platform.release()}, {platform.machine()}")
     total, available = _memory_gb()
-    short = available is not None and available < _LEAST_MEMORY_GB
+    short = available is not None and available < CheckupTuning.memory_gb
     detail = "unknown" if total is None else f"{total:.1f} GB" + (f", {available:.1f} GB free" if available else "")
     advice = "limit a run with --set memory_limit_mb=1000" if short else ""
     yield Finding("system", "memory", "warning" if short else "ok", detail, advice)
@@ -150,7 +158,7 @@ def _temporary_folder() -> Finding:
         free = shutil.disk_usage(folder).free / 1e9
     except OSError as error:
         return Finding("system", "temporary files", "broken", f"{folder}: {error}", "point TMPDIR to a writable folder")
-    short = free < _LEAST_DISK_GB
+    short = free < CheckupTuning.disk_gb
     advice = "point TMPDIR to a disk with more room" if short else ""
     return Finding("system", "temporary files", "warning" if short else "ok", f"{folder}: {free:.1f} GB free", advice)
 

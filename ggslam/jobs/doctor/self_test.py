@@ -15,12 +15,18 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
+from ggslam.system.tuning import Tuning
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 _STEP = np.array([0.02, -0.01, 0.015])
 """Metres that the camera moves between the two frames."""
-_WALLS = ((0, 0.9), (0, -1.1), (1, 0.7), (1, -0.8), (2, 2.5))
-"""Axis and place of the walls of a box around the camera, metres."""
+
+
+class SelfTestTuning(Tuning):
+    """The room that is tracked."""
+
+    walls = ((0, 0.9), (0, -1.1), (1, 0.7), (1, -0.8), (2, 2.5))
+    """Axis and place of the walls of a box around the camera, metres."""
 
 
 def checks() -> dict[str, Callable[[], str]]:
@@ -62,7 +68,7 @@ def _track() -> str:
 def _frame(index: int) -> Frame:
     place, rays = index * _STEP, CAMERA.rays().astype(np.float64)
     depth = np.full(rays.shape[:2], np.inf)
-    for axis, wall in _WALLS:
+    for axis, wall in SelfTestTuning.walls:
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = (wall - place[axis]) / rays[..., axis]
         depth = np.where(reach > 0, np.minimum(depth, reach), depth)

@@ -32,10 +32,10 @@ from ggslam.objects.hole_refinement import Recorded
 from ggslam.objects.hole_views import CameraView
 from ggslam.objects.inpainting import Filling, InpaintSettings, inpaint
 from ggslam.objects.recoloring import parse_color
+from ggslam.objects.removal_artifacts import drop_artifacts, places
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import join_gaussians
 from ggslam.objects.table import ObjectTable
-from ggslam.objects.traces import drop_traces, places
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import MapFile, open_map
 from ggslam.runs.recordings import open_recording_of
@@ -43,9 +43,16 @@ from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.tuning import Tuning
 
-MOST_OF_A_MAP = 0.5
-"""Removing a larger share has to be confirmed."""
+
+class EditTuning(Tuning):
+    """Which edits have to be confirmed."""
+
+    confirmed_share = 0.5
+    """Removing a larger share of the map has to be confirmed."""
+
+
 Apply = Callable[[SegmentedMap, Edit], Change]
 """Does an edit to a map."""
 
@@ -221,7 +228,7 @@ def _with_consent(confirm: Callable[[str], bool] | None) -> Apply:
         names, before = edit.objects, len(scene.gaussians)
         change = apply_edit(scene, edit)
         removed = len(change.before.means)
-        if confirm is None or edit.kind != "remove" or removed <= MOST_OF_A_MAP * before:
+        if confirm is None or edit.kind != "remove" or removed <= EditTuning.confirmed_share * before:
             return change
         if not confirm(f"`remove` {names}: {removed} of {before} Gaussians, {removed / before:.0%} of the map"):
             raise ConfigError(f"`remove` {names}: not confirmed; nothing was changed")
@@ -291,7 +298,7 @@ def _mend(
     if settings is not None:
         filling = inpaint(scene, removed, source.views, displaced, recording, settings)
     else:
-        filling = Filling(dropped=sum(drop_traces(scene, part, source.views, displaced) for part in places(removed)))
+        filling = Filling(dropped=sum(drop_artifacts(scene, part, source.views, displaced) for part in places(removed)))
     rebuild_table(scene)
     return filling
 

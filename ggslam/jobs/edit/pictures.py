@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ggslam.objects.editing import Change
-from ggslam.objects.hole_views import COVERED, CameraView, mark_removed
+from ggslam.objects.hole_views import CameraView, HoleViewTuning, mark_removed
 from ggslam.objects.segmented_rows import join_gaussians
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians
@@ -17,10 +17,16 @@ from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 
-PICTURES = 4
-_LOOKED_AT = 60
-"""Frames, at most, among which those are chosen that show an edit best."""
+
+class EditPictureTuning(Tuning):
+    """Which frames show an edit."""
+
+    pictures = 4
+    """Pictures that are written."""
+    candidates = 60
+    """Most frames among which the best are chosen."""
 
 
 def before_and_after(
@@ -44,12 +50,12 @@ def before_and_after(
         return {}
     poses = record.poses()
     numbers = np.array(sorted(poses))
-    looked_at = numbers[np.unique(np.linspace(0, len(numbers) - 1, _LOOKED_AT).round().astype(int))]
+    looked_at = numbers[np.unique(np.linspace(0, len(numbers) - 1, EditPictureTuning.candidates).round().astype(int))]
     views = [CameraView(camera_of(frame), inverse(poses[frame]), frame) for frame in looked_at.tolist()]
     before, after = (join_gaussians([getattr(c, name) for c in visible]) for name in ("before", "after"))
     areas = _areas(original, before, views) + _areas(edited, after, views)
     pictures, rasterizer = {}, CpuRasterizer()
-    for number in _best(areas, PICTURES):
+    for number in _best(areas, EditPictureTuning.pictures):
         images = []
         for gaussians in (original, edited):
             out = rasterizer.forward(gaussians, views[number].camera, views[number].T_camera_world, features=False)
@@ -67,7 +73,7 @@ def _areas(gaussians: Gaussians, part: Gaussians, views: Sequence[CameraView]) -
     rasterizer, both, out = CpuRasterizer(), mark_removed(gaussians, part), []
     for view in views:
         image = rasterizer.forward(both, view.camera, view.T_camera_world).features
-        out.append(0 if image is None else int((image[0].numpy() > COVERED / 2).sum()))
+        out.append(0 if image is None else int((image[0].numpy() > HoleViewTuning.covered / 2).sum()))
     return np.array(out)
 
 

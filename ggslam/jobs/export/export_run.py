@@ -11,10 +11,10 @@ from ggslam.errors import ConfigError
 from ggslam.formats.table import choose_writer, names_of, writers
 from ggslam.formats.writer import Takes, Writer
 from ggslam.jobs.export.map_files import export_objects, points_to_export
+from ggslam.jobs.export.map_rotation import upward_turn
 from ggslam.jobs.export.meshes import MeshRequest, export_mesh
 from ggslam.jobs.export.movers import export_movers
 from ggslam.jobs.export.splats import SplatRequest, in_turn, splats_of, splats_of_store
-from ggslam.jobs.export.turning import upward_turn
 from ggslam.jobs.export.views import posed_views
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import is_store

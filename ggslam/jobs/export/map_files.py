@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ggslam.errors import ConfigError, InputError, RunFolderError
 from ggslam.formats.writer import SurfacePoints
-from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
+from ggslam.jobs.export.selection import ChosenGaussians, Prepare
 from ggslam.objects.table import ObjectRecord
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.objects_in_parts import ObjectsInParts

@@ -22,7 +22,7 @@ from ggslam.runs.rendered_views import RenderedViews
 from ggslam.scene.frame import Frame
 from ggslam.scene.object_names import object_file_name
 from ggslam.system.atomic import make_folder
-from ggslam.volumes.floor_frame import BELOW_CAMERAS, FLOOR_FILE, write_floor_file
+from ggslam.volumes.floor_frame import FLOOR_FILE, FloorTuning, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh
 from ggslam.volumes.output_frame import OutputFrame
@@ -182,7 +182,7 @@ def _write_floor(folder: Path, surface: Surface, is_level: bool) -> str:
         return ""
     seen = surface.upright.floor is not None
     command = write_floor_file(folder / FLOOR_FILE, surface.T_floor_map, OutputFrame.floor, seen)
-    guess = "" if seen else f" (no floor was found: z = 0 is {BELOW_CAMERAS:g} m below the lowest camera)"
+    guess = "" if seen else f" (no floor was found: z = 0 is {FloorTuning.below_cameras_m:g} m below the lowest camera)"
     return f"\n{folder / FLOOR_FILE}{guess}: {command}"
 
 

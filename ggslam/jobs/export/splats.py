@@ -14,7 +14,7 @@ import torch
 from ggslam.errors import RunFolderError
 from ggslam.formats.point_sampling import MapPart
 from ggslam.formats.writer import Splats, Takes, Writer
-from ggslam.jobs.export.chosen import ChosenGaussians, Prepare
+from ggslam.jobs.export.selection import ChosenGaussians, Prepare
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, gaussians_of_cell
 from ggslam.objects.table import ObjectTable

@@ -44,20 +44,27 @@ from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.settings import tuning_note
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import TargetSettings
 
 GIVEN = "given"
 """As a start pose: the recording's own first pose."""
 _CELLS = "cells"
-_SHORT = 8
-"""Letters of a run's fingerprint in the name of the store of its map."""
-_FARTHEST = 1e7
-"""Metres from the origin of the map that a start pose may be."""
-_WHOLE = GRID / 4
-"""Metres that are a whole number of a scan's voxels: origins lie on the grid of coarse ones, four times as wide."""
-_FINEST = 1.5
-"""A target's voxels are at least this many times as wide as those that the map was thinned with, and for scans as its
-points are apart."""
+
+
+class LocateTuning(Tuning):
+    """How maps to localize in are prepared."""
+
+    fingerprint_letters = 8
+    """Letters of a run's fingerprint in the name of its store."""
+    max_start_m = 1e7
+    """Largest distance of a start pose from the map's origin, in metres."""
+    whole_voxel_m = GRID / 4
+    """Coarser voxels for scans are a whole number of these, in metres, so that origins lie on the grid of the coarse
+    voxels, which are four times as wide."""
+    min_voxel_ratio = 1.5
+    """A target's voxels are at least this many times as wide as the voxels that thinned the map; for scans also as the
+    distance between points."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +195,7 @@ def _store_beside(path: Path, results: Path, opened: ExitStack, observer: Observ
     visit = visit_of(folder)
     if folder.path.resolve() in (results.resolve(), *results.resolve().parents):  # nothing is written into a run
         results = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="ggslam-")))
-    cells = results / f"{folder.path.resolve().name}-{visit[-_SHORT:]}.grid"
+    cells = results / f"{folder.path.resolve().name}-{visit[-LocateTuning.fingerprint_letters:]}.grid"
     if is_store(cells):
         store = GridStore.open(cells)
         if store.visits()[-1:] == [visit]:
@@ -212,7 +219,7 @@ def parse_pose(text: str) -> np.ndarray:
     except ValueError:
         numbers = np.zeros(0)
     norm = float(np.linalg.norm(numbers[3:]))
-    if len(numbers) != 7 or not (np.abs(numbers) <= _FARTHEST).all() or not 0.9 < norm < 1.1:
+    if len(numbers) != 7 or not (np.abs(numbers) <= LocateTuning.max_start_m).all() or not 0.9 < norm < 1.1:
         expected = f'"x y z qx qy qz qw", metres and a unit quaternion, or "{GIVEN}"'
         frame = " (the first frame to use is `start`)" if text.strip().isdecimal() else ""
         raise ConfigError(f"`start_pose`: expected {expected}, found {text!r}{frame}")
@@ -243,9 +250,9 @@ def _start(request: LocalizeRequest, truth: np.ndarray | None) -> np.ndarray | N
 def _target(request: LocalizeRequest, submaps: SubmapSettings, own: TargetSettings, spacing: float) -> TargetSettings:
     """Of images or (`own` is `SCAN_TARGET`) scans, whose map may lie anywhere in the world: a map moved by whole
     hundreds of metres has the same voxels."""
-    voxel = max(own.voxel, _FINEST * submaps.voxel, _FINEST * spacing)
-    if own is SCAN_TARGET and voxel < _WHOLE:
-        voxel = _WHOLE / math.floor(_WHOLE / voxel * (1 + 1e-9))
+    voxel = max(own.voxel, LocateTuning.min_voxel_ratio * submaps.voxel, LocateTuning.min_voxel_ratio * spacing)
+    if own is SCAN_TARGET and voxel < LocateTuning.whole_voxel_m:
+        voxel = LocateTuning.whole_voxel_m / math.floor(LocateTuning.whole_voxel_m / voxel * (1 + 1e-9))
     return replace(own, voxel=voxel if request.voxel is None else request.voxel)
 
 

@@ -21,9 +21,14 @@ from ggslam.scene.poses import turning_angle
 from ggslam.system.atomic import make_folder
 from ggslam.system.json_files import write_json
 from ggslam.system.process_memory import peak_memory_mb
+from ggslam.system.tuning import Tuning
 
-_MOST = 0.5
-"""A warning where more than this share of a scan lies beyond the map."""
+
+class BeyondMapTuning(Tuning):
+    """When a scan lies beyond the map."""
+
+    max_share = 0.5
+    """Largest share of a scan beyond the map without a warning."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class LocalizationReport:
 
     def warnings(self) -> list[str]:
         """What the user should know of the map and the recording."""
-        if self.beyond() <= _MOST:
+        if self.beyond() <= BeyondMapTuning.max_share:
             return []
         what = f"{self.beyond():.0%} of the points of a scan (median) lie beyond"
         if self.full:

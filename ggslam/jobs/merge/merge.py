@@ -13,14 +13,14 @@ import torch
 from ggslam.errors import ConfigError
 from ggslam.jobs.merge.clock import Clock
 from ggslam.jobs.merge.joint_folder import joint_folder
+from ggslam.jobs.merge.joint_poses import find_joint_poses, place_maps
 from ggslam.jobs.merge.merged_run import MergedRun
-from ggslam.jobs.merge.placing import find_joint_poses, place_maps
 from ggslam.jobs.merge.seams import train_seams
 from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.merging.coverage import Coverage, PlacedRun
 from ggslam.merging.joint_graph import JointPoses
-from ggslam.merging.moving import append_map
+from ggslam.merging.joint_map import append_map
 from ggslam.merging.objects import UnitedObjects
 from ggslam.merging.ownership import Ownership
 from ggslam.merging.settings import MergeSettings

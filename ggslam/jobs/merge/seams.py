@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ggslam.jobs.merge.sources import MergeSource
-from ggslam.jobs.merge.unseen import UnseenGaussians
+from ggslam.jobs.merge.unseen_gaussians import UnseenGaussians
 from ggslam.jobs.progress import Observer
 from ggslam.mapping.finished import adopt_finished, train_by_turns
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe

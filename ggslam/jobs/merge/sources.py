@@ -25,10 +25,16 @@ from ggslam.runs.records.sequence import PartRecord, SequenceRecord
 from ggslam.runs.writing import TRUTH_FILE
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
+from ggslam.system.tuning import Tuning
 
-_SAME_TIME_S = 1e-6
-_PAUSE_S = 1.0
-"""Between the last frame of a recording and the first of the next one, at least, where times have to be shifted."""
+
+class MergeTimeTuning(Tuning):
+    """How the times of several recordings are compared."""
+
+    same_time_s = 1e-6
+    """Largest difference between equal times, in seconds."""
+    pause_s = 1.0
+    """Smallest gap between two recordings whose times are shifted, in seconds."""
 
 
 @dataclass
@@ -138,9 +144,11 @@ class MergeSource:
         if path.is_file():
             truth = read_tum(path)
             times = np.array([f.timestamp for f in frames], float)
-            at = np.clip(np.searchsorted(truth.timestamps, times - _SAME_TIME_S), 0, max(0, len(truth) - 1))
+            at = np.clip(
+                np.searchsorted(truth.timestamps, times - MergeTimeTuning.same_time_s), 0, max(0, len(truth) - 1)
+            )
             if len(truth):
-                known = np.abs(truth.timestamps[at] - times) < 2 * _SAME_TIME_S
+                known = np.abs(truth.timestamps[at] - times) < 2 * MergeTimeTuning.same_time_s
                 if self.recording.rig is not None:  # the others' truth is not in the file
                     numbers = self.recording.rig.places[[f.frame for f in frames], 1]
                     known &= numbers == 0
@@ -208,5 +216,5 @@ def _shift_times(sources: list[MergeSource]) -> None:
             continue
         begin = float(np.nanmin(times))
         if begin <= end:
-            source.time_shift_s = float(math.ceil(end - begin + _PAUSE_S))
+            source.time_shift_s = float(math.ceil(end - begin + MergeTimeTuning.pause_s))
         end = float(np.nanmax(times)) + source.time_shift_s

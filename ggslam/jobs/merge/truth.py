@@ -9,9 +9,16 @@ import numpy as np
 
 from ggslam.evaluation.trajectory import FEWEST_POSES
 from ggslam.scene.poses import inverse, separation, transform_points
+from ggslam.system.tuning import Tuning
 
-NEAR_M, NEAR_DEG = 0.25, 6.0
-"""True worlds are one if the common map has them so near to each other; a drifting run may be off by less."""
+
+class SameTruthTuning(Tuning):
+    """When the true poses of several recordings are in one world."""
+
+    max_distance_m = 0.25
+    """Largest mean distance between the true worlds in the common map, in metres; a drifting run is off by less."""
+    max_rotation_deg = 6.0
+    """Largest rotation between them, in degrees."""
 
 
 def truth_transforms(estimated: ListOf[np.ndarray], truth: ListOf[np.ndarray | None]) -> list[np.ndarray | None]:
@@ -49,4 +56,7 @@ def _is_one_world(T_map_first: np.ndarray, T_map_this: np.ndarray, true: np.ndar
     known = true[np.isfinite(true).all((1, 2))]
     apart = transform_points(known[:, :3, 3], T_map_first) - transform_points(known[:, :3, 3], T_map_this)
     turned = separation(T_map_first, T_map_this)[1]
-    return bool(np.linalg.norm(apart, axis=1).mean() < NEAR_M and turned < NEAR_DEG)
+    return bool(
+        np.linalg.norm(apart, axis=1).mean() < SameTruthTuning.max_distance_m
+        and turned < SameTruthTuning.max_rotation_deg
+    )

@@ -19,9 +19,9 @@ from ggslam import __version__
 from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.refine.cell_training import TrainedCell, train_cell
-from ggslam.jobs.refine.cells_done import CellsDone, is_cut_off
-from ggslam.jobs.refine.cells_of_store import StoreCells
+from ggslam.jobs.refine.finished_cells import CellsDone, is_cut_off
 from ggslam.jobs.refine.settings import RefineSettings
+from ggslam.jobs.refine.training_inputs import StoreCells
 from ggslam.jobs.stores.over_cells import over_cells, raise_own_fault
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS
 from ggslam.jobs.submaps.stores import is_store

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.jobs.changes.shown import ChangesShown, motion_words, word_of_kind
+from ggslam.jobs.changes.saved_changes import ChangesShown, motion_words, word_of_kind
 from ggslam.objects.history import History, ObjectPast
 from ggslam.reporting import page as p
 from ggslam.reporting.page import Html

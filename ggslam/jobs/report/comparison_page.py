@@ -7,9 +7,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from ggslam.jobs.changes.shown import ChangesShown
+from ggslam.jobs.changes.saved_changes import ChangesShown
 from ggslam.jobs.report.change_section import changes_part
-from ggslam.jobs.report.metric_words import MEANINGS, METRICS, Metric
+from ggslam.jobs.report.metrics import MEANINGS, METRICS, Metric
 from ggslam.jobs.report.run_data import FrameView, RunData
 from ggslam.jobs.report.run_page import FOOTER
 from ggslam.jobs.report.run_plots import (

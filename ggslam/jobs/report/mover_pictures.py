@@ -15,10 +15,18 @@ from ggslam.runs.records.movers import MoverRecord, mover_colors
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sequences import Sequence as Recording
+from ggslam.system.tuning import Tuning
 
-MOST = 6
-"""Frames that are shown."""
-_NEAREST = 0.05
+
+class MoverPictureTuning(Tuning):
+    """How movers are drawn."""
+
+    pictures = 6
+    """Most frames that are shown."""
+    near_m = 0.05
+    """Depth from which boxes are drawn, in metres."""
+
+
 _EDGES = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
 
 
@@ -33,7 +41,13 @@ def mover_views(
         movers: of the run.
         poses: T_world_camera [4, 4] by frame.
     """
-    frames = sorted({frame for mover in movers[:MOST] if (frame := _telling_frame(mover, poses)) is not None})
+    frames = sorted(
+        {
+            frame
+            for mover in movers[: MoverPictureTuning.pictures]
+            if (frame := _telling_frame(mover, poses)) is not None
+        }
+    )
     if recording is None:
         return []
     found = []
@@ -70,9 +84,9 @@ def draw_movers(
         lines = [(corners[i], corners[j]) for i, j in _EDGES]
         lines += [(a, b) for a, b in zip(way[:-1], way[1:], strict=True)]
         for a, b in lines:
-            if min(a[2], b[2]) > _NEAREST:
+            if min(a[2], b[2]) > MoverPictureTuning.near_m:
                 cv2.line(picture, _pixel(a, camera), _pixel(b, camera), paints[mover.id], 1, cv2.LINE_AA)
-        top = corners[corners[:, 2] > _NEAREST]
+        top = corners[corners[:, 2] > MoverPictureTuning.near_m]
         if len(top):
             u, v = min((_pixel(corner, camera) for corner in top), key=lambda pixel: pixel[1])
             u, v = min(max(u, 2), camera.width - 60), min(max(v - 3, 10), camera.height - 3)

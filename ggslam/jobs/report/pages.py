@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError
 from ggslam.evaluation.trajectory import FEWEST_POSES, align_points
-from ggslam.jobs.changes.shown import ChangesShown, changes_of
+from ggslam.jobs.changes.saved_changes import ChangesShown, changes_of
 from ggslam.jobs.report.comparison_page import by_recording, comparison_page
 from ggslam.jobs.report.gather import has_limit, load_run, save_truth
 from ggslam.jobs.report.run_data import FrameView, RunData
@@ -24,9 +24,14 @@ from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.writing import REPORT_FILE, TRUTH_FILE
 from ggslam.sequences import Sequence
 from ggslam.system.atomic import make_folder, write_text
+from ggslam.system.tuning import Tuning
 
-COMPARED_VIEWS = 3
-"""Frames that a comparison shows of each run."""
+
+class ComparisonPageTuning(Tuning):
+    """What a comparison of runs shows."""
+
+    views = 3
+    """Frames that are shown of each run."""
 
 
 def write_report(folder: RunFolder, sequence: Sequence | None = None, plots: Path | None = None) -> Path:
@@ -92,7 +97,7 @@ def write_comparison(
     groups, views = [], []
     for numbers in by_recording(runs):
         common = set.intersection(*({*runs[i].camera_path.frames.tolist()} for i in numbers))
-        frames = pick_frames(common, COMPARED_VIEWS)
+        frames = pick_frames(common, ComparisonPageTuning.views)
         group = [replace(runs[i], views=rendered_views(folders[i], recordings[i], frames)) for i in numbers]
         groups.append(_in_one_world(group))
         views.append(_same_views(group, frames))

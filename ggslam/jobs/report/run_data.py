@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.jobs.changes.shown import ChangesShown
+from ggslam.jobs.changes.saved_changes import ChangesShown
 from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoverRecord

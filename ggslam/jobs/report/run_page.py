@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from ggslam.jobs.report.change_section import changes_part
-from ggslam.jobs.report.metric_words import MEANINGS, METRICS, TILES
+from ggslam.jobs.report.metrics import MEANINGS, METRICS, TILES
 from ggslam.jobs.report.mover_section import movers_part
 from ggslam.jobs.report.run_data import RunData, stage_seconds
 from ggslam.jobs.report.run_plots import (
@@ -21,10 +21,18 @@ from ggslam.reporting.page import Html
 from ggslam.runs.records.metrics import SETS, MetricsRecord, SegmentationRecord, SurfaceScoresRecord
 from ggslam.runs.records.record import Record
 from ggslam.runs.records.verdict import GRADES
+from ggslam.system.tuning import Tuning
 
 FOOTER = "Written by ggslam. The page needs nothing but itself: no network, no other files."
-_OPEN_VIEWS = 2
-"""Frames that are shown at once; the others are folded away."""
+
+
+class RunPageTuning(Tuning):
+    """What a report shows at once."""
+
+    open_views = 2
+    """Frames that are not folded away."""
+
+
 _NO_STEPS = "This run did not note its steps (it is of an older version, or was edited); there is no course over time."
 
 
@@ -163,9 +171,9 @@ def _views(run: RunData) -> Html:
         p.tag("div", p.tag("h3", f"frame {view.frame}"), p.cells(view.pictures.items()), class_="view")
         for view in run.views
     ]
-    more = shown[_OPEN_VIEWS:]
+    more = shown[RunPageTuning.open_views:]
     folded = [p.tag("details", p.tag("summary", f"{len(more)} more"), *more)] if more else []
-    return p.join([*shown[:_OPEN_VIEWS], *folded])
+    return p.join([*shown[:RunPageTuning.open_views], *folded])
 
 
 def _path(run: RunData) -> Html:

@@ -8,12 +8,19 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ggslam.jobs.report.run_data import RunData
-from ggslam.reporting.plots import COLORS, Band, Plot, Series
+from ggslam.reporting.plots import Band, Plot, PlotTuning, Series
+from ggslam.system.tuning import Tuning
 
 FRAME = "frame"
-_TRUTH = 7
-_SMOOTH = 9
-"""Losses are averaged over so many frames: each is of the few keyframes that happened to be drawn."""
+
+
+class RunPlotTuning(Tuning):
+    """How a run is plotted."""
+
+    truth_color = 7
+    """Number of the colour of the true trajectory."""
+    smoothed_frames = 9
+    """Frames over which losses are averaged: each loss is of the few keyframes that were drawn."""
 
 
 def trajectory_plots(runs: Sequence[RunData]) -> list[Plot]:
@@ -33,7 +40,9 @@ def _paths(runs: Sequence[RunData], project: Callable[[np.ndarray], tuple[np.nda
     series = []
     known = next((run.camera_path for run in runs if run.camera_path.truth is not None), None)
     if known is not None and known.truth is not None:
-        series.append(Series("truth", *project(known.in_order(known.truth)), color=_TRUTH, dashed=True))
+        series.append(
+            Series("truth", *project(known.in_order(known.truth)), color=RunPlotTuning.truth_color, dashed=True)
+        )
     for number, run in enumerate(runs):
         label = "estimate" if len(runs) == 1 else run.name
         path = run.camera_path
@@ -47,7 +56,7 @@ def _paths(runs: Sequence[RunData], project: Callable[[np.ndarray], tuple[np.nda
 
 def _curve(label: str, x: np.ndarray, y: np.ndarray, number: int) -> Series:
     """The curve of a run among several; after all colours they begin again, dashed."""
-    usual = COLORS - 1
+    usual = PlotTuning.colors - 1
     return Series(label, x, y, color=number % usual, dashed=number >= usual)
 
 
@@ -156,7 +165,7 @@ def map_plots(runs: Sequence[RunData]) -> list[Plot]:
 
 def loss_plots(runs: Sequence[RunData]) -> list[Plot]:
     """What the optimiser made small."""
-    note = f"Means over the iterations of {_SMOOTH} frames."
+    note = f"Means over the iterations of {RunPlotTuning.smoothed_frames} frames."
     plots = [
         Plot("loss", "Loss", FRAME, "loss", _steps(runs, [("loss_total", "loss")], _smooth), from_zero=True,
              note=note),
@@ -174,9 +183,13 @@ def _as_is(values: np.ndarray) -> np.ndarray:
 
 def _smooth(values: np.ndarray) -> np.ndarray:
     """Running mean of what is finite."""
-    known, window = np.isfinite(values), np.ones(_SMOOTH)
-    count = np.convolve(known, window, "same")[: len(values)] if len(values) >= _SMOOTH else known
-    total = np.convolve(np.where(known, values, 0), window, "same") if len(values) >= _SMOOTH else values
+    known, window = np.isfinite(values), np.ones(RunPlotTuning.smoothed_frames)
+    count = np.convolve(known, window, "same")[: len(values)] if len(values) >= RunPlotTuning.smoothed_frames else known
+    total = (
+        np.convolve(np.where(known, values, 0), window, "same")
+        if len(values) >= RunPlotTuning.smoothed_frames
+        else values
+    )
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(known & (count > 0), total / count, np.nan)
 

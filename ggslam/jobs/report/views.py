@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
@@ -21,13 +22,20 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences import Sequence
 from ggslam.system.images import read_picture
+from ggslam.system.tuning import Tuning
 
-VIEWS = 4
-"""Frames that a report shows, spread over the recording."""
-_WIDEST = 480
-"""Pixels that a picture of a report is wide at most."""
-_GAP = 4
-"""White pixels between the pictures of `reporting.pictures.compare`."""
+
+class ReportViewTuning(Tuning):
+    """The pictures of a report."""
+
+    views = 4
+    """Frames that are shown, spread over the recording."""
+    max_width = 480
+    """Largest width of a picture, in pixels."""
+
+
+_GAP: Final = 4
+"""White pixels between the parts of a picture that `reporting.pictures.compare` wrote."""
 TRUTH, RENDER, DIFFERENCE = "recorded", "rendered", "difference (white: 20 % and more)"
 TRUE_DEPTH, DEPTH, DEPTH_ERROR = "measured depth", "rendered depth", "difference of depth (white: 10 cm and more)"
 _CAPTIONS = (
@@ -39,7 +47,11 @@ _CAPTIONS = (
 def saved_views(folder: RunFolder) -> list[FrameView]:
     """The pictures that scoring left, cut apart."""
     files = sorted(folder.path.glob("renders/compare*.png"))
-    chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, VIEWS).round().astype(int))] if files else []
+    chosen = (
+        [files[i] for i in np.unique(np.linspace(0, len(files) - 1, ReportViewTuning.views).round().astype(int))]
+        if files
+        else []
+    )
     recording = folder.sequence() if chosen else None
     views = []
     for path in chosen:
@@ -66,9 +78,9 @@ def _cut(path: Path, height: int, width: int) -> dict[str, np.ndarray]:
 def small(picture: np.ndarray) -> np.ndarray:
     """A picture no wider than a report needs."""
     height, width = picture.shape[:2]
-    if width <= _WIDEST:
+    if width <= ReportViewTuning.max_width:
         return np.ascontiguousarray(picture)
-    size = (_WIDEST, round(height * _WIDEST / width))
+    size = (ReportViewTuning.max_width, round(height * ReportViewTuning.max_width / width))
     return cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_AREA)
 
 
@@ -120,7 +132,7 @@ def _beside(frame: Frame | None, color: np.ndarray, depth: np.ndarray) -> dict[s
     }  # fmt: skip
 
 
-def pick_frames(frames: Iterable[int], count: int = VIEWS) -> list[int]:
+def pick_frames(frames: Iterable[int], count: int = ReportViewTuning.views) -> list[int]:
     """Some of the frames, first and last among them."""
     known = sorted(frames)
     chosen = np.unique(np.linspace(0, len(known) - 1, min(count, len(known))).round().astype(int))

@@ -22,12 +22,18 @@ from ggslam.sequences import Sequence
 from ggslam.sequences.sequence import SkippedFrame
 from ggslam.slam.config import Config, config_to_dict
 from ggslam.slam.slam import Slam
+from ggslam.system.tuning import Tuning
 
-SHARE = 1 / 80
-"""Of the time that saving may take, if the settings leave it open."""
-_SOONEST_S = 3.0
-_BYTES_A_SECOND = 3e8
-"""Taken for the speed of saving until the first one has been timed."""
+
+class CheckpointTuning(Tuning):
+    """How often a run saves its state if the settings leave it open."""
+
+    share = 1 / 80
+    """Largest share of the run's time that saving takes."""
+    min_interval_s = 3.0
+    """Shortest time between two checkpoints, in seconds."""
+    bytes_per_s = 3e8
+    """Speed of saving that is assumed until the first checkpoint was timed, in bytes per second."""
 
 
 class Checkpointing:
@@ -35,8 +41,8 @@ class Checkpointing:
 
     Args:
         checkpoints: of the run.
-        every: frames from one to the next; None: as often as takes no more than `SHARE` of the time; 0: only when the
-            run ends early.
+        every: frames from one to the next; None: as often as takes no more than `CheckpointTuning.share` of the time;
+            0: only when the run ends early.
         sequence: the recording.
         observer: receives a note if a checkpoint cannot be saved; the run continues.
     """
@@ -45,7 +51,7 @@ class Checkpointing:
         self._checkpoints, self._every, self._sequence, self._observer = checkpoints, every, sequence, observer
         self._frames, self._told = 0, False
         self._last = time.perf_counter()
-        self._bytes_a_second = _BYTES_A_SECOND
+        self._bytes_a_second = CheckpointTuning.bytes_per_s
         self._sizes = _FileSizes(sequence)
         self._newest: Frame | None = None
 
@@ -60,7 +66,10 @@ class Checkpointing:
         if self._every is not None:
             return 0 < self._every <= self._frames
         passed = time.perf_counter() - self._last
-        return passed > _SOONEST_S and SHARE * passed > _size_of(slam) / self._bytes_a_second
+        return (
+            passed > CheckpointTuning.min_interval_s
+            and CheckpointTuning.share * passed > _size_of(slam) / self._bytes_a_second
+        )
 
     def save(self, slam: Slam) -> None:
         """Saves the state between two steps. If that fails it is said, once, and the run goes on."""

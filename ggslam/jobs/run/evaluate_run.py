@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ggslam.jobs.eval.run import score_run
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.run.run_verdict import judge_scores
-from ggslam.jobs.score.run import score_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.metrics import MetricsRecord

@@ -19,49 +19,77 @@ from ggslam.runs.records.verdict import AspectRecord, Grade, worst
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import LOST_SHARE
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 
-MOSTLY_LOST = 0.5
-"""Of the frames lost: the run is no result, and `ggslam run` ends with exit code 1."""
-BADLY_LOST = 0.3
-"""Of the frames lost or doubted. Hand-held walks that move half a metre a frame lose 15 % and are sound; images turned
-against their depth lose or doubt 60 to 75 %."""
-MUCH_SEARCHED = 0.5
-"""Of the frames located by another start than constant velocity: the motion is at the limit of what is followed."""
-JUMP_MEDIAN, JUMP_P90, JUMP_M = 15.0, 7.5, 0.05
-"""A change of step from frame to frame of so many usual ones, of so many 90th percentiles and of so many metres is a
-jump of the path: true paths of whole walks reach 12 medians and 6.2 percentiles (Kinect), 8.1 and 4.0 (HoloLens)."""
-BAD_STRUCTURE, DOUBTFUL_STRUCTURE = 0.9, 0.95
-"""SSIM at 160 pixels of width over what image noise allows there: sound runs have 0.93 to 1, the lowest of them an
-iPhone's with smoothed depth; depth one frame off has 0.87, of another kind or place 0.78 to 0.86, mirrored images 0.68.
-PSNR and SSIM at full size do not tell these apart: the iPhone's are 20 dB and 0.71."""
-OTHER_BRIGHTNESS, FAR_BRIGHTNESS = 1.5, 2.5
-"""Factors between the brightness of the map and that of the keyframes. A map that took the exposure of a first, dark
-frame looks right frame by frame and black as a whole: a factor of 6."""
-OVERFIT_DB = 8.0
-"""PSNR of keyframes over that of held-out frames, exposure forgiven: the map fits what it was trained on only. Whole
-recordings have 0 to 3, 16 frames of a rig 6, every 12th frame of a walk 11."""
-BAD_AGREEMENT, DOUBTFUL_AGREEMENT = 0.9, 0.95
-"""Share of the pixels at the measured depth. Sound runs reach 0.95 to 1, a HoloLens with ragged depth 0.93; depth that
-is not registered 0.90, with pixels at full scale 0.81. Depth of another kind bends the map as a whole and agrees with
-it (0.95 to 0.98): sharpness and movers tell that."""
-LOCATED_STRUCTURE, LOCATED_AGREEMENT = (0.87, 0.82), (0.85, 0.75)
-"""The same of frames that were only located in a map, doubtful and bad: Kinect and HoloLens have 0.95 and 0.91 of the
-structure and 0.94 and 0.91 of the depth, a generated room with five changes 0.97 and 0.99, one with exchanged colour
-channels 0.77, with other textures 0.80."""
-LARGEST_OBJECT, ONLY_OBJECT = 0.5, 0.9
-"""Share of the Gaussians that one object holds: it joins several things, or everything."""
-UNSURE_IDS, WRONG_IDS = 0.8, 0.5
-"""Share of the pixels whose object is the masks'."""
-MOVING_FRAMES = 0.5
-"""Of the frames show something moving before movers are doubted at all: a person in view does that, too..."""
-MANY_MOVERS, TOO_MANY_MOVERS = 0.25, 0.75
-"""...but is one mover. So many new movers a moving frame are noise: real ones reach 0.05, warped depth 0.4 to 0.5,
-full-scale pixels 1."""
-MOVING_PICTURE = 0.5
-"""Of the image moving on average where something moves: then the camera's pose or depth is wrong, not the world."""
-FEWEST_FRAMES = 3
-"""Frames of a run that show whether it is good: a first frame alone fits whatever comes."""
+
+class TrackingGradeTuning(Tuning):
+    """When tracking is doubtful or bad."""
+
+    max_lost = 0.5
+    """Share of frames lost above which the run is no result and `ggslam run` exits with code 1."""
+    bad_lost = 0.3
+    """Share of frames lost or doubted that is bad. Hand-held walks lose up to 15 % and are sound; images rotated
+    against their depth lose 60 to 75 %."""
+    max_searched = 0.5
+    """Share of frames located from another start than constant velocity, above which the motion is at the limit."""
+    jump_medians = 15.0
+    """The path jumps where its step changes by this many median changes..."""
+    jump_p90s = 7.5
+    """...by this many 90th percentiles of the changes..."""
+    jump_m = 0.05
+    """...and by this many metres. True paths reach 12 medians and 6.2 percentiles."""
+    min_frames = 3
+    """Fewest frames that show whether a run is good: a first frame alone fits anything."""
+
+
+class MapGradeTuning(Tuning):
+    """When a map is doubtful or bad."""
+
+    bad_structure = 0.9
+    """SSIM at 160 pixels of width, over what image noise allows, below which a map is bad. Depth that is one frame off
+    has 0.87, mirrored images 0.68."""
+    doubtful_structure = 0.95
+    """The same, below which it is doubtful. Sound runs have 0.93 to 1."""
+    doubtful_brightness = 1.5
+    """Ratio of brightness between map and keyframes that is doubtful."""
+    bad_brightness = 2.5
+    """The ratio that is bad. A map with the exposure of a dark first frame is off by a factor of 6."""
+    overfit_db = 8.0
+    """PSNR of keyframes over that of held-out frames, in dB, that shows overfitting. Whole recordings have 0 to 3, 16
+    frames of a rig 6."""
+    bad_depth_agreement = 0.9
+    """Share of pixels at the measured depth below which a map is bad. Unregistered depth has 0.90."""
+    doubtful_depth_agreement = 0.95
+    """The same, below which it is doubtful. Sound runs have 0.95 to 1."""
+    located_structure = (0.87, 0.82)
+    """Doubtful and bad structure of frames that were only located in a map. Kinect and HoloLens have 0.95 and 0.91,
+    exchanged colour channels 0.77."""
+    located_depth_agreement = (0.85, 0.75)
+    """Doubtful and bad depth agreement of such frames. Kinect and HoloLens have 0.94 and 0.91."""
+
+
+class ObjectGradeTuning(Tuning):
+    """When objects and movers are doubtful or bad."""
+
+    doubtful_object_share = 0.5
+    """Share of the Gaussians in one object that is doubtful: it joins several things."""
+    bad_object_share = 0.9
+    """The share that is bad: it joins everything."""
+    doubtful_id_accuracy = 0.8
+    """Share of pixels with the object of the masks below which ids are doubtful."""
+    bad_id_accuracy = 0.5
+    """The share below which they are bad."""
+    min_moving_frames = 0.5
+    """Share of frames with movers above which movers are judged; a person in view reaches it."""
+    doubtful_movers = 0.25
+    """New movers for each moving frame that are doubtful: noise. Real ones reach 0.05."""
+    bad_movers = 0.75
+    """The number that is bad. Warped depth has 0.4 to 0.5, depth of a wrong scale 1."""
+    bad_moving_share = 0.5
+    """Mean share of the image that moves, above which the pose or depth is wrong, not the world."""
+
+
 OF_RECORDING = {
     "color_noise": "the colour images show noise", "unrelated": "colour and depth do not belong together",
     "color_repeats": "colour repeats while depth moves on",
@@ -92,10 +120,14 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
     jumps, dropped = path_jumps(result), len(result.dropped_frames)
     codes = {verdict.code for verdict in found}
     grades: list[Grade] = [
-        _at_most((lost + doubted) / max(1, total), LOST_SHARE, BADLY_LOST),
-        "doubtful" if searched > MUCH_SEARCHED * total or len(jumps) or codes & {"degenerate", "dropped"} else "good",
+        _at_most((lost + doubted) / max(1, total), LOST_SHARE, TrackingGradeTuning.bad_lost),
+        "doubtful"
+        if searched > TrackingGradeTuning.max_searched * total or len(jumps) or codes & {"degenerate", "dropped"}
+        else "good",
         "bad" if codes & {"textureless", "depth_noise"} else "good",
-        "doubtful" if stopped or total < FEWEST_FRAMES or codes & {"no_motion", "both_repeat"} else "good",
+        "doubtful"
+        if stopped or total < TrackingGradeTuning.min_frames or codes & {"no_motion", "both_repeat"}
+        else "good",
     ]
     words = [f"{total - lost} of {total} frames located"]
     words += [f"{searched} of them by search"] if searched else []
@@ -106,8 +138,8 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
     words += [f"{dropped} frames dropped"] if dropped else []
     words += ["the depth images show noise"] if "depth_noise" in codes else []
     words += ["both streams hang"] if "both_repeat" in codes else []
-    one = ["too few to tell"] if total < FEWEST_FRAMES else ["one frame shows no motion"]
-    words += one if total < FEWEST_FRAMES or "no_motion" in codes else []
+    one = ["too few to tell"] if total < TrackingGradeTuning.min_frames else ["one frame shows no motion"]
+    words += one if total < TrackingGradeTuning.min_frames or "no_motion" in codes else []
     words += ["stopped before the end of the recording"] if stopped else []
     return _aspect(grades, 100 * (total - lost) / max(1, total), "%", words)
 
@@ -127,7 +159,11 @@ def jumps_of(places: np.ndarray, index: np.ndarray) -> list[int]:
     changes[(index[2:] - index[:-2]) != 2] = np.nan
     if not np.isfinite(changes).any():
         return []
-    limit = max(JUMP_MEDIAN * np.nanmedian(changes), JUMP_P90 * np.nanpercentile(changes, 90), JUMP_M)
+    limit = max(
+        TrackingGradeTuning.jump_medians * np.nanmedian(changes),
+        TrackingGradeTuning.jump_p90s * np.nanpercentile(changes, 90),
+        TrackingGradeTuning.jump_m,
+    )
     return [int(i) for i in index[2:][np.nan_to_num(changes) > limit]]
 
 
@@ -138,17 +174,22 @@ def grade_sharp(
     `unrefined`: the final refinement was cut short."""
     if fit is None:
         return AspectRecord(text="no keyframe of this run to compare with")
-    limits = LOCATED_STRUCTURE if fit.located else (DOUBTFUL_STRUCTURE, BAD_STRUCTURE)
+    limits = (
+        MapGradeTuning.located_structure
+        if fit.located
+        else (MapGradeTuning.doubtful_structure, MapGradeTuning.bad_structure)
+    )
     off = max(fit.brightness, 1 / max(fit.brightness, 1e-6))
-    overfit = scored.overfit_db is not None and scored.overfit_db > OVERFIT_DB
+    overfit = scored.overfit_db is not None and scored.overfit_db > MapGradeTuning.overfit_db
     grades: list[Grade] = [
-        _at_least(fit.structure, *limits), _at_most(off, OTHER_BRIGHTNESS, FAR_BRIGHTNESS),
+        _at_least(fit.structure, *limits),
+        _at_most(off, MapGradeTuning.doubtful_brightness, MapGradeTuning.bad_brightness),
         "doubtful" if overfit or unrefined else "good",
     ]  # fmt: skip
     codes = {verdict.code for verdict in found or []} & OF_RECORDING.keys()
     grades += ["doubtful" if codes == {"color_repeats"} else "bad"] if codes else []
     words = [f"{fit.psnr:.1f} dB, {fit.structure:.1%} of the structure that image noise leaves"]
-    if off > OTHER_BRIGHTNESS:
+    if off > MapGradeTuning.doubtful_brightness:
         words.append(f"the map is {fit.brightness:.2f} times as bright as they are")
     words += [f"held-out frames are {scored.overfit_db:.1f} dB worse"] if overfit else []
     words += ["the map looks otherwise than the frames"] if fit.located and fit.structure < limits[0] else []
@@ -164,7 +205,11 @@ def grade_geometry(fit: MapFit | None, found: list[Verdict]) -> AspectRecord:
     wrong = [v for v in found if v.severity == "wrong" and v.code in ("depth_scale", "intrinsics", "mirrored")]
     odd = [v for v in found if v.severity == "doubtful" and v.code in ("intrinsics", "depth_repeats")]
     doubts: list[Grade] = ["bad" if wrong else "doubtful" if odd else "good"]
-    limits = LOCATED_AGREEMENT if fit.located else (DOUBTFUL_AGREEMENT, BAD_AGREEMENT)
+    limits = (
+        MapGradeTuning.located_depth_agreement
+        if fit.located
+        else (MapGradeTuning.doubtful_depth_agreement, MapGradeTuning.bad_depth_agreement)
+    )
     grades = [_at_least(fit.agreeing, *limits), *doubts]
     words = [f"{fit.agreeing:.1%} of the pixels at the measured depth, half within {fit.depth_error:.2%}"]
     words += ["the world comes out in another size or shape"] if wrong else []
@@ -181,11 +226,13 @@ def grade_objects(table: ObjectTable | None, scored: ScoredFigures) -> AspectRec
     if not counts:
         return _aspect(["bad"], 0, "objects", ["none, though they were looked for"])
     share = max(counts) / (sum(counts) + table.unlabelled_gaussians)
-    grades = [_at_most(share, LARGEST_OBJECT, ONLY_OBJECT)]
+    grades = [_at_most(share, ObjectGradeTuning.doubtful_object_share, ObjectGradeTuning.bad_object_share)]
     number = "1 object" if len(counts) == 1 else f"{len(counts)} objects"
     words = [f"{number}, the largest has {share:.0%} of the Gaussians"]
     if scored.id_accuracy is not None:
-        grades.append(_at_least(scored.id_accuracy, UNSURE_IDS, WRONG_IDS))
+        grades.append(
+            _at_least(scored.id_accuracy, ObjectGradeTuning.doubtful_id_accuracy, ObjectGradeTuning.bad_id_accuracy)
+        )
         words.append(f"{scored.id_accuracy:.0%} of the pixels labelled as the masks are")
     return _aspect(grades, len(counts), "objects", words)
 
@@ -199,10 +246,10 @@ def grade_movers(result: SlamResult) -> AspectRecord:
     if not frames:
         return _aspect(["good"], 0, "%", ["nothing moves"])
     rate, picture = len(result.movers) / frames, float(np.mean(shares))
-    often = frames > MOVING_FRAMES * total
+    often = frames > ObjectGradeTuning.min_moving_frames * total
     grades: list[Grade] = [
-        _at_most(rate, MANY_MOVERS, TOO_MANY_MOVERS) if often else "good",
-        "bad" if often and picture > MOVING_PICTURE else "good",
+        _at_most(rate, ObjectGradeTuning.doubtful_movers, ObjectGradeTuning.bad_movers) if often else "good",
+        "bad" if often and picture > ObjectGradeTuning.bad_moving_share else "good",
     ]
     movers = "1 mover" if len(result.movers) == 1 else f"{len(result.movers)} movers"
     words = [f"{movers} in {frames} of {total} frames, {picture:.1%} of the image there"]

@@ -15,14 +15,20 @@ from ggslam.sequences.rig_inspection import inspect_rig
 from ggslam.sequences.verdicts import Verdict, judge_times
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import judge_path, judge_run
+from ggslam.system.tuning import Tuning
 
 MOVES = "something moves in"
 """What the note of a run that found movers says."""
 OTHER_CAUSES = {"intrinsics", "color_noise", "step", "alignment", "depth_scale"}
 """Codes of verdicts on a recording, besides those that doubt depth, for which a camera is lost."""
 _SEE = "; most likely for what is said of the recording above"
-FRAMES = 5
-"""Of the recording that are looked at."""
+
+
+class HealthTuning(Tuning):
+    """How a run's recording is inspected."""
+
+    frames = 5
+    """Frames that are inspected."""
 
 
 def judge(sequence: Sequence | LiveSequence, result: SlamResult, depth: list[Verdict] | None = None) -> list[Verdict]:
@@ -63,7 +69,7 @@ def _judge_recording(
         return [*judge_intrinsics(sequence.camera), *judge_times(result.timestamps())]
     try:
         if isinstance(sequence, RigSequence):
-            return inspect_rig(sequence, FRAMES, masks=False).verdicts
-        return inspect_sequence(sequence, FRAMES, masks=False, depth=depth).verdicts
+            return inspect_rig(sequence, HealthTuning.frames, masks=False).verdicts
+        return inspect_sequence(sequence, HealthTuning.frames, masks=False, depth=depth).verdicts
     except GgslamError:  # a recording that went away meanwhile; the run ends as it would have
         return []

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import cv2
 import numpy as np
@@ -20,25 +21,37 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence as Recording
 from ggslam.slam.result import SlamResult
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.settings import DepthNoise
 
-LOOKED_AT = 12
-"""Keyframes, spread over the run."""
-SAME_DEPTH, SIGMAS = 0.05, 3.0
-"""Depths agree within this share of the measured depth or so many standard deviations of its noise."""
-BRIGHT, DARKEST = 0.8, 0.02
-"""The 95th percentile of a keyframe's values is brought here; that of a darker image than this is taken for this."""
-COARSE = 160
-"""Pixels of width at which structure is compared: noise is averaged away there, what is misplaced stays."""
-FEWEST_PIXELS = 500
-"""With depth, or a keyframe tells nothing."""
-_OPAQUE = 0.5
+
+class MapFitTuning(Tuning):
+    """How a map is compared with its keyframes."""
+
+    keyframes = 12
+    """Keyframes that are compared, spread over the run."""
+    max_depth_error = 0.05
+    """Depths agree within this share of the measured depth..."""
+    max_depth_sigmas = 3.0
+    """...or within this many standard deviations of its noise."""
+    target_brightness = 0.8
+    """The 95th percentile of a keyframe's values is scaled to this, in [0, 1]."""
+    min_brightness = 0.02
+    """A smaller percentile is taken for this, in [0, 1]."""
+    structure_width = 160
+    """Image width at which structure is compared, in pixels: noise averages out, misplaced structure stays."""
+    min_pixels = 500
+    """Fewest pixels with depth that a keyframe is compared by."""
+    opaque_alpha = 0.5
+    """Alpha above which a pixel shows a surface."""
+
+
 _NOISE_KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-_C2 = 0.03**2
-"""Of SSIM: K2 squared, for a data range of 1."""
-_MEDIAN_OF_NORMAL = 0.6745
-"""Of |x| of a standard normal distribution."""
+_C2: Final = 0.03**2
+"""The constant C2 of SSIM for a data range of 1: 0.03 squared."""
+_MEDIAN_OF_NORMAL: Final = 0.6745
+"""The median of |x| of a standard normal distribution."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +61,11 @@ class MapFit:
     Attributes:
         views: keyframes that were compared.
         psnr: dB, in the keyframe's own exposure.
-        structure: SSIM of images reduced to `COARSE` pixels of width, over that of the keyframe without its noise.
+        structure: SSIM of images reduced to `MapFitTuning.structure_width` pixels of width, over that of the keyframe
+            without its noise.
         brightness: of the map against the keyframes: 1: as bright.
-        agreeing: share of the pixels with depth whose rendered depth is the measured one, see `SAME_DEPTH`.
+        agreeing: share of the pixels with depth whose rendered depth is the measured one, see
+            `MapFitTuning.max_depth_error`.
         covered: share of them that have a rendered depth.
         depth_error: median of |rendered - measured| / measured.
         located: whether the frames were only located in the map, which was not made of them.
@@ -83,7 +98,7 @@ def measure_fit(
             map_in_view(keyframe.camera, keyframe.T_camera_world), keyframe.camera, keyframe.T_camera_world,
             features=False,
         )  # fmt: skip
-        depth = np.where(view.alpha.numpy() > _OPAQUE, view.expected_depth.numpy(), 0)
+        depth = np.where(view.alpha.numpy() > MapFitTuning.opaque_alpha, view.expected_depth.numpy(), 0)
         image = view.image.numpy().transpose(1, 2, 0)
         if not exposed:
             keyframe = replace(keyframe, depth=np.where(depth > 0, keyframe.depth, np.uint16(0)))
@@ -98,7 +113,7 @@ def located_views(recording: Recording, result: SlamResult) -> list[Keyframe]:
     """Frames spread over a run that was located in a map that stays as it is, as the keyframes that it did not make."""
     poses = result.trajectory()
     known = [k for k in range(len(poses)) if np.isfinite(poses[k]).all()]
-    chosen = np.unique(np.linspace(0, len(known) - 1, min(LOOKED_AT, len(known))).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(known) - 1, min(MapFitTuning.keyframes, len(known))).round().astype(int))
     return [
         make_keyframe(number, recording.frame(result.frames[known[k]].frame_index, masks=False), poses[known[k]])
         for number, k in enumerate(chosen.tolist())
@@ -112,7 +127,7 @@ def _expose(image: np.ndarray, keyframe: Keyframe) -> np.ndarray:
 
 
 def _spread(keyframes: list[Keyframe]) -> Iterable[Keyframe]:
-    chosen = np.linspace(0, len(keyframes) - 1, min(LOOKED_AT, len(keyframes))).round().astype(int)
+    chosen = np.linspace(0, len(keyframes) - 1, min(MapFitTuning.keyframes, len(keyframes))).round().astype(int)
     return (keyframes[i] for i in chosen.tolist())
 
 
@@ -122,11 +137,11 @@ def _compare(keyframe: Keyframe, image: np.ndarray, rendered: np.ndarray) -> lis
     known = depth > 0
     if keyframe.moving is not None:
         known &= ~keyframe.moving
-    if known.sum() < FEWEST_PIXELS:
+    if known.sum() < MapFitTuning.min_pixels:
         return None
     gain, offset = keyframe.exposure.astype(np.float32).T
     own = np.clip(image * gain + offset, 0, 1)
-    level = BRIGHT / max(float(np.percentile(color[known], 95)), DARKEST)
+    level = MapFitTuning.target_brightness / max(float(np.percentile(color[known], 95)), MapFitTuning.min_brightness)
     square = float(np.square(own - color)[known].mean())
     brightness = float(np.clip(image, 0, 1)[known].mean() / max(float(color[known].mean()), 1e-3))
     return [
@@ -136,9 +151,9 @@ def _compare(keyframe: Keyframe, image: np.ndarray, rendered: np.ndarray) -> lis
 
 
 def _structure(own: np.ndarray, color: np.ndarray, known: np.ndarray) -> float:
-    """SSIM of two images [H, W, 3], reduced to `COARSE` pixels of width, over what noise allows; where all of a pixel
-    is known."""
-    factor = min(1.0, COARSE / color.shape[1])
+    """SSIM of two images [H, W, 3], reduced to `MapFitTuning.structure_width` pixels of width, over what noise allows;
+    where all of a pixel is known."""
+    factor = min(1.0, MapFitTuning.structure_width / color.shape[1])
     size = (max(16, round(factor * color.shape[1])), max(16, round(factor * color.shape[0])))
     images = (own, color, known.astype(np.float32))
     ours, seen, share = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in images)
@@ -167,8 +182,8 @@ def _compare_depth(
     if not both.any():
         return 0.0, 0.0, 1.0
     error = np.abs(rendered[known] - z)
-    within = SIGMAS * (noise.constant + noise.square * z * z)
-    agrees = both & (error <= np.maximum(SAME_DEPTH * z, within))
+    within = MapFitTuning.max_depth_sigmas * (noise.constant + noise.square * z * z)
+    agrees = both & (error <= np.maximum(MapFitTuning.max_depth_error * z, within))
     return float(agrees.mean()), float(both.mean()), float(np.median((error / z)[both]))
 
 

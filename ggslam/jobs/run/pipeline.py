@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError, SequenceError
+from ggslam.jobs.eval.run import score_run
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.checkpointing import Checkpointing, start_record
@@ -23,7 +24,6 @@ from ggslam.jobs.run.resuming import Resumption
 from ggslam.jobs.run.run_verdict import judge_result
 from ggslam.jobs.run.slam_loop import Follower, SlamLoop
 from ggslam.jobs.run.start_check import check_depth
-from ggslam.jobs.score.run import score_run
 from ggslam.runs.checkpoints import Checkpoints
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe, open_recording_of

@@ -8,10 +8,10 @@ from dataclasses import asdict
 import numpy as np
 
 from ggslam.jobs.run.grades import (
-    MOSTLY_LOST,
     OF_RECORDING,
-    OTHER_BRIGHTNESS,
+    MapGradeTuning,
     ScoredFigures,
+    TrackingGradeTuning,
     grade_geometry,
     grade_movers,
     grade_objects,
@@ -27,6 +27,7 @@ from ggslam.runs.records.verdict import AspectRecord, FitRecord, Grade, RunVerdi
 from ggslam.sequences.camera_doubts import doubt_centre
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 
 _CAUSES = (
@@ -35,7 +36,15 @@ _CAUSES = (
     "poses", "mirrored", "alignment", "step", "time", "textureless", "degenerate",
 )  # fmt: skip
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
-_SAME_GAIN = 1.3
+
+
+class VerdictTuning(Tuning):
+    """When a camera's gain changes."""
+
+    same_gain = 1.3
+    """Largest ratio of a gain to the median gain that is usual."""
+
+
 _GO_ON = "mend what stopped the run, or `skip_bad_frames`, and run it again"
 _REFINE, _WITH_MASKS = "`refine` 3000", "`masks` FOLDER, with masks of a segmenter"
 
@@ -121,7 +130,7 @@ def _figures_of_scores(metrics: MetricsRecord | None) -> ScoredFigures:
 def _failure(result: SlamResult) -> str:
     """That most of the frames have no pose; the scores are of the few others."""
     total, lost = len(result.frames), [f for f in result.frames if f.status == TrackingStatus.LOST.value]
-    if len(lost) <= MOSTLY_LOST * total:
+    if len(lost) <= TrackingGradeTuning.max_lost * total:
         return ""
     return f"the camera was lost in {len(lost)} of {total} frames (the first: {lost[0].frame_index})"
 
@@ -136,7 +145,10 @@ def _advice(
                 if (verdict.code, verdict.severity) == (code, severity) and "; " in verdict.text:
                     return verdict.text.rpartition("; ")[2].removeprefix("try ")
     look = f"ggslam inspect {recording}"
-    if fit is not None and not 1 / OTHER_BRIGHTNESS <= fit.brightness <= OTHER_BRIGHTNESS:
+    if (
+        fit is not None
+        and not 1 / MapGradeTuning.doubtful_brightness <= fit.brightness <= MapGradeTuning.doubtful_brightness
+    ):
         return _start_later(result) or "fix the camera's exposure"
     for grade in ("bad", "doubtful"):
         weak = [name for name, aspect in aspects.items() if aspect.grade == grade]
@@ -175,7 +187,7 @@ def _start_later(result: SlamResult) -> str:
     gains = np.array([change_of(k.exposure) for k in ours])
     if not len(gains):
         return ""
-    usual = np.abs(np.log(gains / np.median(gains))) < np.log(_SAME_GAIN)
+    usual = np.abs(np.log(gains / np.median(gains))) < np.log(VerdictTuning.same_gain)
     first = ours[int(usual.argmax())]
     source = {frame.frame_index: frame.source_index for frame in result.frames}.get(first.frame_index)
     return f"`start` {source}: the frames before have another exposure" if usual.any() and source else ""

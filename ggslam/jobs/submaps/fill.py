@@ -36,13 +36,19 @@ from ggslam.submaps.cell_records import CellChange
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.submaps.store_objects import ObjectEvent, StoreObjects, read_objects
+from ggslam.system.tuning import Tuning
 
 AddRun = Callable[[Path, GridStore, "str | None", "float | None"], object]
 """Writes a run (its folder) into a store that is open for writing, as a visit of a name at a time."""
-_MANY = 0.1
-"""A note where more than this share of a recording left nothing in the store."""
-_NEAR_IN_TIME = 0.02
-"""Seconds by which a pose of another file may differ from a frame."""
+
+
+class FillTuning(Tuning):
+    """What a recording must bring to a store."""
+
+    max_missed = 0.1
+    """Largest share of frames that leave nothing in the store without a note."""
+    max_time_gap_s = 0.02
+    """Largest difference between the times of a frame and of a pose from another file, in seconds."""
 
 
 @dataclass(frozen=True)
@@ -253,10 +259,10 @@ def _poses(
     before = after - 1
     last = np.minimum(after, len(times) - 1)
     nearest = np.where(np.abs(times[before] - timestamps) <= np.abs(times[last] - timestamps), before, last)
-    near = np.abs(times[nearest] - timestamps) <= _NEAR_IN_TIME
+    near = np.abs(times[nearest] - timestamps) <= FillTuning.max_time_gap_s
     poses[near] = found.T_world_camera[order][nearest[near]]
     if not near.any():
-        raise FormatError(f"{request.poses}: none of its times is within {_NEAR_IN_TIME} s of a frame")
+        raise FormatError(f"{request.poses}: none of its times is within {FillTuning.max_time_gap_s} s of a frame")
     return poses
 
 
@@ -264,7 +270,7 @@ def _words_of_missed(store: GridStore, poses: np.ndarray) -> str:
     """What to say of items, of poses [n, 4, 4], in cells that nothing is recorded of; empty if those are few."""
     known = poses[np.isfinite(poses).all((1, 2)), :3, 3]
     missed = sum(store.key_of(position) not in store for position in known)
-    if missed <= _MANY * len(known):
+    if missed <= FillTuning.max_missed * len(known):
         return ""
     s, grid = store.settings, store.grid
     enough = math.ceil(50 * s.spacing * math.sqrt(grid.spans.sum())) / 100

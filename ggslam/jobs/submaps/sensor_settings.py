@@ -19,30 +19,42 @@ import numpy as np
 from ggslam.jobs.submaps.stores import INDOORS
 from ggslam.localization.scans import ScanSequence
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.tuning import Tuning
 
-_SCANS = 5
-"""Scans that are looked at, over the whole recording."""
-_MOST, _ALMOST_ALL = 95, 99
-"""Percentiles of the ranges."""
-_SPARE = 1.2
-"""R' over the range that most points lie within."""
-_STEP = 5.0
-"""Metres that lengths are rounded up to."""
-_FARTHEST = 100.0
-_CELLS = 3
-"""R' over the edge of a scanner's cells."""
-_CUT_CELLS = 6
-"""R' over the edge of a cloud's cells."""
-_NEAR_CENTRE = 0.9
-"""R over the edge of a cell: from 0.87 on each place in a cube is within R of its centre."""
-_SHORT = replace(INDOORS, radius=_NEAR_CENTRE * INDOORS.spacing)
+
+class SensorTuning(Tuning):
+    """How settings of a store follow from its sensor."""
+
+    scans = 5
+    """Scans that are read, spread over the recording."""
+    reach_percentile = 95
+    """Percentile of the ranges that is taken for the reach."""
+    farthest_percentile = 99
+    """Percentile of the ranges that is taken for the farthest."""
+    reach_factor = 1.2
+    """R' over the reach."""
+    length_step_m = 5.0
+    """Lengths are rounded up to whole multiples of this, in metres."""
+    max_length_m = 100.0
+    """Largest radius and sensor range, in metres."""
+    cells_in_reach = 3
+    """R' over the edge of a cell, for scans."""
+    cells_in_cloud_reach = 6
+    """R' over the edge of a cell, for a cloud that is cut into cells."""
+    radius_in_cells = 0.9
+    """R over the edge of a cell: above 0.87 every place in a cube is within R of its centre."""
+    voxels_in_reach = 300
+    """R' over the edge of a voxel."""
+    min_outdoor_extent_m = 60.0
+    """A cloud longer than this along two axes is taken for an outdoor scene, in metres."""
+    outdoor_radius_m = 30.0
+    """R' of an outdoor cloud, in metres."""
+    samples = 200_000
+    """Points that the spacing of a cloud is measured from, about."""
+
+
+_SHORT = replace(INDOORS, radius=SensorTuning.radius_in_cells * INDOORS.spacing)
 """Of a scanner that sees no farther than rooms reach."""
-_VOXELS = 300
-"""R' over the edge of a voxel."""
-_OUTDOORS_M = 60.0
-"""A cloud that is longer than this along two axes is no room or flat."""
-_OUTDOORS_RADIUS = 30.0
-_SAMPLE = 200_000
 
 
 def settings_of_scans(scans: ScanSequence, cut: bool = False) -> SubmapSettings:
@@ -51,32 +63,32 @@ def settings_of_scans(scans: ScanSequence, cut: bool = False) -> SubmapSettings:
     Raises:
         FormatError: a scan is damaged.
     """
-    chosen = np.unique(np.linspace(0, len(scans) - 1, _SCANS).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(scans) - 1, SensorTuning.scans).round().astype(int))
     ranges = np.concatenate([np.linalg.norm(scans.scan(number).points, axis=1) for number in chosen.tolist()])
     ranges = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(ranges):
         return _SHORT
-    most, farthest = np.percentile(ranges, [_MOST, _ALMOST_ALL]).tolist()
-    return _of_reach(most * _SPARE, farthest, cut)
+    most, farthest = np.percentile(ranges, [SensorTuning.reach_percentile, SensorTuning.farthest_percentile]).tolist()
+    return _of_reach(most * SensorTuning.reach_factor, farthest, cut)
 
 
 def settings_of_cloud(points: np.ndarray) -> SubmapSettings:
     """What suits a cloud [n, 3] that is cut into cells, where no scanner is known: by its size."""
-    few = points[:: max(1, len(points) // _SAMPLE)]
+    few = points[:: max(1, len(points) // SensorTuning.samples)]
     few = few[np.isfinite(few).all(1)]
     if not len(few):
         return INDOORS
     low, high = np.percentile(few, [1, 99], axis=0)
-    if np.sort(high - low)[1] < _OUTDOORS_M:
+    if np.sort(high - low)[1] < SensorTuning.min_outdoor_extent_m:
         return INDOORS
-    return _of_reach(_OUTDOORS_RADIUS, _OUTDOORS_RADIUS, cut=True)
+    return _of_reach(SensorTuning.outdoor_radius_m, SensorTuning.outdoor_radius_m, cut=True)
 
 
 def with_chosen(settings: SubmapSettings, chosen: Mapping[str, Any]) -> SubmapSettings:
     """Settings with fields that were set on purpose; R goes with an edge of a cell that was."""
     edge = chosen.get("spacing")
     if edge is not None and "radius" not in chosen and settings.radius != INDOORS.radius:
-        settings = replace(settings, radius=_NEAR_CENTRE * edge)
+        settings = replace(settings, radius=SensorTuning.radius_in_cells * edge)
     return replace(settings, **chosen)
 
 
@@ -92,12 +104,16 @@ def in_words(settings: SubmapSettings) -> str:
 def _of_reach(reach: float, farthest: float, cut: bool) -> SubmapSettings:
     if reach <= INDOORS.partial_radius:
         return _SHORT
-    radius = min(_FARTHEST, _round_up(reach))
-    spacing = max(INDOORS.spacing, _handy(radius / (_CUT_CELLS if cut else _CELLS)))
+    radius = min(SensorTuning.max_length_m, _round_up(reach))
+    spacing = max(
+        INDOORS.spacing, _handy(radius / (SensorTuning.cells_in_cloud_reach if cut else SensorTuning.cells_in_reach))
+    )
     return replace(
-        INDOORS, partial_radius=radius, spacing=spacing, radius=_NEAR_CENTRE * spacing,
-        sensor_range=min(_FARTHEST, max(radius, _round_up(farthest))), voxel=_handy(radius / _VOXELS),
-        change_distance=max(INDOORS.change_distance, 2 * radius / _VOXELS), lookahead=max(INDOORS.lookahead, spacing),
+        INDOORS, partial_radius=radius, spacing=spacing, radius=SensorTuning.radius_in_cells * spacing,
+        sensor_range=min(SensorTuning.max_length_m, max(radius, _round_up(farthest))),
+        voxel=_handy(radius / SensorTuning.voxels_in_reach),
+        change_distance=max(INDOORS.change_distance, 2 * radius / SensorTuning.voxels_in_reach),
+        lookahead=max(INDOORS.lookahead, spacing),
     )  # fmt: skip
 
 
@@ -109,4 +125,4 @@ def _handy(metres: float) -> float:
 
 
 def _round_up(metres: float) -> float:
-    return _STEP * math.ceil(metres / _STEP - 1e-9)
+    return SensorTuning.length_step_m * math.ceil(metres / SensorTuning.length_step_m - 1e-9)

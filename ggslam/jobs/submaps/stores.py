@@ -32,14 +32,22 @@ from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import store_cloud
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.array_forms import PoseForm, check_arrays
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.surface import check_surface_arrays
 from ggslam.volumes.octomap_files import read_octomap
 
 INDOORS = SubmapSettings(voxel=0.02)
 """For maps of depth cameras."""
 OCTOMAP = ".bt"
-_MOST_VOXELS = 5e7
-_CELLS_AT_ONCE = 64
+
+
+class StoreMakingTuning(Tuning):
+    """How a store is filled."""
+
+    max_voxels = 5e7
+    """Most occupied voxels that are read from a file."""
+    cells_at_once = 64
+    """Cells that are written in one step."""
 
 
 def is_store(path: Path) -> bool:
@@ -111,8 +119,8 @@ def store_of_run(
     earlier = [key for key in store.cells() if store.cell(key).visit in replaced] if replaced else []
     others, kept = [write for write in others if due[write.key]], due.of(points)
     # The points come last: they make a cell new, and one that was cut off before is written again by the next attempt.
-    for begin in range(0, len(others), _CELLS_AT_ONCE):
-        _put(store, others[begin : begin + _CELLS_AT_ONCE])
+    for begin in range(0, len(others), StoreMakingTuning.cells_at_once):
+        _put(store, others[begin : begin + StoreMakingTuning.cells_at_once])
     store_cloud(store, points[kept], {name: values[kept] for name, values in attributes.items()}, time)
     if not earlier:
         return
@@ -203,8 +211,8 @@ def _octomap(path: Path) -> np.ndarray:
     edge = occupancy.resolution
     found = []
     voxels = float((np.rint(sizes.astype(np.float64) / edge) ** 3).sum())
-    if voxels > _MOST_VOXELS:
-        raise FormatError(f"{path}: {voxels:.3g} voxels are occupied, {_MOST_VOXELS:g} are taken")
+    if voxels > StoreMakingTuning.max_voxels:
+        raise FormatError(f"{path}: {voxels:.3g} voxels are occupied, {StoreMakingTuning.max_voxels:g} are taken")
     for size in np.unique(sizes):
         across = max(1, round(float(size) / edge))
         steps = (np.arange(across) - (across - 1) / 2) * edge

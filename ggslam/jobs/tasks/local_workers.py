@@ -13,7 +13,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic
 
-from ggslam.jobs.tasks.outcomes import TRIES, Failure, Result, Task, outcome_of, worker_died
+from ggslam.jobs.tasks.outcomes import Failure, Result, RetryTuning, Task, outcome_of, worker_died
 from ggslam.jobs.tasks.processors import shares
 
 
@@ -120,7 +120,7 @@ class _Pool(Generic[Task, Result]):
         except (EOFError, OSError):
             worker.end()
             self._workers[place] = None
-            if number < TRIES:
+            if number < RetryTuning.tries:
                 self._give(place, task, number + 1)
                 return
             found = worker_died()

@@ -8,12 +8,17 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from ggslam.errors import GgslamError, plain
+from ggslam.system.tuning import Tuning
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-TRIES = 4
-"""Workers that may die over a piece of work until it is given up."""
+
+class RetryTuning(Tuning):
+    """When a piece of work is given up."""
+
+    tries = 4
+    """Workers that may die over one piece of work."""
 
 
 @dataclass(frozen=True)
@@ -41,4 +46,4 @@ def outcome_of(work: Callable[[Task], Result], task: Task) -> Result | Failure:
 
 def worker_died(reason: str = "") -> Failure:
     """Of work whose workers die again and again."""
-    return Failure(f"the worker died {TRIES} times" + (f": {reason}" if reason else ""))
+    return Failure(f"the worker died {RetryTuning.tries} times" + (f": {reason}" if reason else ""))

@@ -7,9 +7,14 @@ import os
 
 from ggslam.errors import ConfigError
 from ggslam.native.loader import available_processors
+from ggslam.system.tuning import Tuning
 
-PROCESSORS = 2
-"""Of a worker, unless the number of workers is asked for: a run is hardly faster with more."""
+
+class ProcessorTuning(Tuning):
+    """How processors are shared out."""
+
+    per_worker = 2
+    """Processors of a worker unless the number of workers is asked for: a run gains little from more."""
 
 
 def shares(workers: int | None) -> list[tuple[int, ...]]:
@@ -19,7 +24,7 @@ def shares(workers: int | None) -> list[tuple[int, ...]]:
         ConfigError: no worker.
     """
     there = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    count = max(1, len(there) // PROCESSORS) if workers is None else workers
+    count = max(1, len(there) // ProcessorTuning.per_worker) if workers is None else workers
     if count < 1:
         raise ConfigError(f"`workers`: expected at least 1, found {workers}")
     each = max(1, len(there) // count)

@@ -9,10 +9,16 @@ from typing import Any
 
 from ggslam import __version__
 from ggslam.errors import GgslamError, MissingDependency
-from ggslam.jobs.tasks.outcomes import TRIES, Failure, outcome_of, worker_died
-from ggslam.jobs.tasks.processors import PROCESSORS
+from ggslam.jobs.tasks.outcomes import Failure, RetryTuning, outcome_of, worker_died
+from ggslam.jobs.tasks.processors import ProcessorTuning
+from ggslam.system.tuning import Tuning
 
-_WAIT_S = 0.2
+
+class RayTuning(Tuning):
+    """How Ray's tasks are waited for."""
+
+    wait_s = 0.2
+    """Seconds between two looks at the tasks."""
 
 
 class RayCluster:
@@ -59,14 +65,14 @@ class RayCluster:
             at_once: pieces of work that are handed to Ray at a time; None: all.
         """
         ray, waiting, pending = self.ray, iter(tasks), dict[Any, Any]()
-        remote = ray.remote(num_cpus=PROCESSORS, max_retries=TRIES - 1)(do_on_worker)
+        remote = ray.remote(num_cpus=ProcessorTuning.per_worker, max_retries=RetryTuning.tries - 1)(do_on_worker)
         try:
             while True:
                 for task in islice(waiting, None if at_once is None else max(0, at_once - len(pending))):
                     pending[remote.remote(work, task, __version__)] = task
                 if not pending:
                     return
-                done, _ = ray.wait(list(pending), timeout=_WAIT_S)
+                done, _ = ray.wait(list(pending), timeout=RayTuning.wait_s)
                 for reference in done:
                     take(pending.pop(reference), self._result(reference))
                 changed()
@@ -76,7 +82,7 @@ class RayCluster:
 
     def workers(self) -> int:
         """Pieces of work that the cluster has processors for at the same time, 1 at least."""
-        return max(1, int(self.ray.cluster_resources().get("CPU", 1)) // PROCESSORS)
+        return max(1, int(self.ray.cluster_resources().get("CPU", 1)) // ProcessorTuning.per_worker)
 
     def _result(self, reference: Any) -> Any:
         try:

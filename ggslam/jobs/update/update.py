@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ggslam.changes.renewal import NEW, OLD, Fate, Renewal
+from ggslam.changes.map_update import NEW, OLD, Fate, MapUpdate
 from ggslam.changes.settings import ChangeSettings
 from ggslam.jobs.changes.changes import ChangesOutcome, compare_placed, write_changes
 from ggslam.jobs.merge.clock import Clock
 from ggslam.jobs.merge.joint_folder import joint_folder
+from ggslam.jobs.merge.joint_poses import find_joint_poses, place_maps
 from ggslam.jobs.merge.merged_run import MergedRun
-from ggslam.jobs.merge.placing import find_joint_poses, place_maps
 from ggslam.jobs.merge.seams import train_seams
 from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.update.histories import history_after
 from ggslam.merging.coverage import Coverage, PlacedRun
 from ggslam.merging.joint_graph import JointPoses
-from ggslam.merging.moving import append_map
+from ggslam.merging.joint_map import append_map
 from ggslam.merging.objects import ToldIds, UnitedObjects
 from ggslam.merging.ownership import Ownership
 from ggslam.merging.settings import MergeSettings
@@ -32,9 +32,14 @@ from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.tuning import Tuning
 
-_FEW_POINTS = 20
-"""Points of what changed that a keyframe of the older visit may show and yet be trained on."""
+
+class UpdateTuning(Tuning):
+    """Which older keyframes are still trained on."""
+
+    max_changed_points = 20
+    """Points of changed surface that an older keyframe may show."""
 
 
 @dataclass
@@ -116,10 +121,10 @@ class _Update:
         changes = compare_placed(sources, placed, poses, self.settings, self.context, self.observer, self.ids)
         self.clock.lap("compare")
         outcome = UpdateOutcome(self.folder, poses, changes, seconds=self.clock.seconds)
-        renewal = Renewal(changes.detector, changes.table.found, self.settings)
-        seams = self._find_seams(placed, renewal)
+        map_update = MapUpdate(changes.detector, changes.table.found, self.settings)
+        seams = self._find_seams(placed, map_update)
         objects = UnitedObjects(self.merging.uniting)
-        gaussians = self._join(placed, objects, renewal, outcome)
+        gaussians = self._join(placed, objects, map_update, outcome)
         self.clock.lap("join")
         trained = train_seams(
             sources, placed, seams, gaussians, objects, self.merging.steps, self.context, self.observer
@@ -132,7 +137,7 @@ class _Update:
         left_out = [source.gaussian_count - kept for source, kept in zip(sources, outcome.kept, strict=True)]
         merged = MergedRun(
             sources, poses, trained.keyframes, gaussians, objects, left_out, outcome.steps,
-            {OLD: renewal.holds(self._measured_points(poses, OLD))}, past=1, history=history,
+            {OLD: map_update.holds(self._measured_points(poses, OLD))}, past=1, history=history,
         )  # fmt: skip
         with delay_interrupts():
             merged.save(self.folder, self.clock.seconds, lambda staged: self._write_changes(changes, staged))
@@ -154,54 +159,57 @@ class _Update:
     # --- one map -----------------------------------------------------------------------------------------------------
 
     def _join(
-        self, placed: list[PlacedRun], objects: UnitedObjects, renewal: Renewal, outcome: UpdateOutcome
+        self, placed: list[PlacedRun], objects: UnitedObjects, map_update: MapUpdate, outcome: UpdateOutcome
     ) -> GaussianMap:
         """What both maps hold of the latest state, with one set of objects."""
         new = placed[NEW].gaussians
         old = placed[OLD].gaussians.copy(new.device)  # pictures show it as it was
-        came, fate = renewal.came(new), renewal.renew(old)
+        came, fate = map_update.came(new), map_update.renew(old)
         base = GaussianMap(old.sh_degree, old.feature_channels)
         objects.add(base, old, self.sources[OLD].run_objects())
         append_map(base, old, self.sources[OLD].first_keyframe)
         known = base.copy(base.device)
         known.keep(torch.from_numpy(~fate.gone | fate.moved))
-        objects.add(known, new, self.sources[NEW].run_objects(), self._told_ids(renewal))
+        objects.add(known, new, self.sources[NEW].run_objects(), self._told_ids(map_update))
         append_map(base, new, self.sources[NEW].first_keyframe)
-        kept = self._choose(outcome.poses, (old, new), fate, came, renewal)
+        kept = self._choose(outcome.poses, (old, new), fate, came, map_update)
         outcome.gone, outcome.kept = int(fate.gone.sum()), (int(kept[OLD].sum()), int(kept[NEW].sum()))
         base.keep(torch.from_numpy(np.concatenate(kept)))
         return base
 
     def _choose(
-        self, poses: JointPoses, maps: tuple[GaussianMap, GaussianMap], fate: Fate, came: np.ndarray, renewal: Renewal
+        self, poses: JointPoses, maps: tuple[GaussianMap, GaussianMap], fate: Fate, came: np.ndarray,
+        map_update: MapUpdate,
     ) -> list[np.ndarray]:
         """Which Gaussians of both maps stay, bool [N] each."""
         known = [source.known for source in self.sources]
-        ownership = Ownership(known, poses.of(known), self.merging.seams.voxel * known[0].scale, renewal.weights)
+        ownership = Ownership(known, poses.of(known), self.merging.seams.voxel * known[0].scale, map_update.weights)
         owners = [ownership.of(gaussians.means.numpy()) for gaussians in maps]
         return [~fate.gone & ((owners[OLD] == OLD) | fate.moved), came | (owners[NEW] == NEW)]
 
-    def _told_ids(self, renewal: Renewal) -> ToldIds:
+    def _told_ids(self, map_update: MapUpdate) -> ToldIds:
         """What the changes tell of the newer run's ids."""
         objects = self.sources[OLD].objects
         history = None if objects is None else objects.table.history
         gone = frozenset() if history is None else frozenset(history.ids_gone())
-        if renewal.found.ids_believed:
+        if map_update.found.ids_believed:
             return ToldIds({}, all=True)
         pairs = {
-            i: change.old.ids[0] for change in renewal.found.changes if change.old and change.new and change.old.ids
+            i: change.old.ids[0] for change in map_update.found.changes if change.old and change.new and change.old.ids
             for i in change.new.ids
         }  # fmt: skip
-        added = {i for change in renewal.found.changes if change.new and change.old is None for i in change.new.ids}
-        lost = {i for change in renewal.found.changes if change.old and change.new is None for i in change.old.ids}
+        added = {i for change in map_update.found.changes if change.new and change.old is None for i in change.new.ids}
+        lost = {i for change in map_update.found.changes if change.old and change.new is None for i in change.old.ids}
         return ToldIds(pairs, frozenset(added), taken=gone | lost)
 
     # --- training ----------------------------------------------------------------------------------------------------
 
-    def _find_seams(self, placed: list[PlacedRun], renewal: Renewal) -> list[np.ndarray]:
+    def _find_seams(self, placed: list[PlacedRun], map_update: MapUpdate) -> list[np.ndarray]:
         """Which keyframes are trained on, bool [K] of each run: those of the newer one that see what the older map
         shows, or what changed; and those of the older one that see the newer map and nothing that changed."""
         coverage, share = Coverage(self.merging.seams, self.context), self.merging.seams.share
         shared = [coverage.shared_views(placed[1 - k].gaussians, run) >= share for k, run in enumerate(placed)]
-        changed = [renewal.shows_changes(run.cameras, run.T_world_camera, _FEW_POINTS) for run in placed]
+        changed = [
+            map_update.shows_changes(run.cameras, run.T_world_camera, UpdateTuning.max_changed_points) for run in placed
+        ]
         return [shared[OLD] & ~changed[OLD], shared[NEW] | changed[NEW]]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ggslam.jobs.view.pictures import CELL_WIDTH, table_of
+from ggslam.jobs.view.pictures import FramePictureTuning, table_of
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import GaussianTensors
@@ -20,25 +20,32 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
+from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import vertical_fov, view_from_behind
+from ggslam.viewer.safe_text import plain
 from ggslam.viewer.scene_nodes import SceneNodes
 from ggslam.viewer.server import keep_fitting
 from ggslam.viewer.splats import most_visible, splats_of
-from ggslam.viewer.words import plain
 
 if TYPE_CHECKING:
     import viser
 
-SHARE = 0.03
-"""Of one processor that showing the map may take: after each picture of it the viewer rests accordingly."""
-SHORTEST_REST_S = 1.0
-MAX_SPLATS = 150_000
-"""Shown while the map grows, at most: the most visible ones."""
-MAX_PATH = 2000
-"""Points of the camera's path, at most."""
-_SENDING = 2.0
-"""Processor time of a picture with sending it, by that without."""
-_MARK_M = 0.05
+
+class LiveViewTuning(Tuning):
+    """What a growing map's page costs and shows."""
+
+    processor_share = 0.03
+    """Share of one processor that showing the map may take; the viewer rests accordingly."""
+    min_rest_s = 1.0
+    """Shortest rest between two pictures, in seconds."""
+    max_splats = 150_000
+    """Most Gaussians that are shown: the most visible ones."""
+    max_path_points = 2000
+    """Most points of the camera's path."""
+    sending_factor = 2.0
+    """Processor time of a picture with sending it, over the time without."""
+    keyframe_size_m = 0.05
+    """Size of a keyframe's mark, in metres."""
 
 
 @dataclass
@@ -57,7 +64,8 @@ class LiveView:
     """Follows a run (its `follow` is a `Follower` of `ggslam.jobs.run.pipeline.execute`).
 
     Nothing is copied while no browser is connected. Otherwise the thread of the run copies the map now and then;
-    another thread makes pictures of the copy, and rests until it has used no more than `SHARE` of a processor.
+    another thread makes pictures of the copy, and rests until it has used no more than
+    `LiveViewTuning.processor_share` of a processor.
 
     Args:
         server: with an empty page.
@@ -65,7 +73,7 @@ class LiveView:
         max_splats: show no more.
     """
 
-    def __init__(self, server: viser.ViserServer, title: str, max_splats: int = MAX_SPLATS) -> None:
+    def __init__(self, server: viser.ViserServer, title: str, max_splats: int = LiveViewTuning.max_splats) -> None:
         self._server, self._title, self._max_splats = server, title, max_splats
         self._nodes = SceneNodes(server)
         self._text = server.gui.add_markdown(f"**{plain(title)}**  \nwaiting for the first frame")
@@ -110,7 +118,10 @@ class LiveView:
                     return
             began = time.thread_time()
             self._show(snapshot)
-            rest = max(SHORTEST_REST_S, _SENDING * (time.thread_time() - began) / SHARE)
+            rest = max(
+                LiveViewTuning.min_rest_s,
+                LiveViewTuning.sending_factor * (time.thread_time() - began) / LiveViewTuning.processor_share,
+            )
             with self._given:
                 self._given.wait_for(lambda: self._ended, timeout=rest)
             self._ready.set()
@@ -131,15 +142,20 @@ class LiveView:
         with self._server.atomic():
             self._nodes.set_splats({0: splats_of(snapshot.gaussians, rows)})
             self._nodes.set_path([snapshot.poses[:, :3, 3]])
-            self._nodes.set_keyframes(snapshot.keyframes, camera, _MARK_M)
+            self._nodes.set_keyframes(snapshot.keyframes, camera, LiveViewTuning.keyframe_size_m)
             if snapshot.T_world_camera is not None:
-                self._nodes.set_frame(snapshot.T_world_camera, camera, 2 * _MARK_M, snapshot.frame.color)
+                self._nodes.set_frame(
+                    snapshot.T_world_camera, camera, 2 * LiveViewTuning.keyframe_size_m, snapshot.frame.color
+                )
             self._text.content, self._image.image = snapshot.text, picture
         self.updates += 1
 
     def _compare(self, snapshot: _Snapshot, camera: Camera) -> np.ndarray:
         """The newest frame beside what the map shows there."""
-        frame, size = snapshot.frame, (CELL_WIDTH, round(camera.height * CELL_WIDTH / camera.width))
+        frame, size = (
+            snapshot.frame,
+            (FramePictureTuning.width, round(camera.height * FramePictureTuning.width / camera.width)),
+        )
         near, far = depth_range(frame.depth)
         cells = [("recorded", frame.color)]
         if snapshot.T_world_camera is not None:
@@ -164,7 +180,7 @@ def _snapshot(slam: Slam, frame: Frame, report: StepReport, title: str) -> _Snap
     with slam.mapper.in_turn():
         copies = GaussianTensors(*(view[:count].to("cpu", copy=True) for view in views))
     located = [f for f in slam.frames if f.status != "lost"]
-    located = located[:: max(1, len(located) // MAX_PATH)]
+    located = located[:: max(1, len(located) // LiveViewTuning.max_path_points)]
     poses = np.stack([slam.pose_of(f) for f in located])
     keyframes = np.stack([keyframe.T_world_camera for keyframe in slam.mapper.keyframes])
     pose = None if report.frame.status == "lost" else slam.pose_of(report.frame)

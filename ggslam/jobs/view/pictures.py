@@ -14,8 +14,8 @@ from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
 from ggslam.rendering.types import GaussianTensors
 from ggslam.reporting.pictures import (
-    FITTED,
     IdentityColors,
+    IdentityPictureTuning,
     color_of_depth,
     color_of_ids,
     color_to_uint8,
@@ -25,13 +25,21 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import pose_along
 
-CELL_WIDTH = 320
-"""Pixels of each picture in the comparison of a frame."""
-_GAP, _BAR = 6, 26
-_PATCH = 5
-"""Pixels that are rendered to find the object under the one in their middle."""
+
+class FramePictureTuning(Tuning):
+    """How recorded and rendered frames are laid out."""
+
+    width = 320
+    """Width of each picture, in pixels."""
+    gap = 6
+    """Pixels between pictures."""
+    bar_height = 26
+    """Height of the line of text above a picture, in pixels."""
+    patch = 5
+    """Width in pixels of the patch that is rendered to find the object at its middle."""
 
 
 class ViewPictures:
@@ -55,7 +63,7 @@ class ViewPictures:
     def compare(self, frame: int, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `ViewedMap.frame_picture`."""
         segmented, whole = self._segmented, self._camera_of(frame)
-        camera = whole.resize(CELL_WIDTH, round(whole.height * CELL_WIDTH / whole.width))
+        camera = whole.resize(FramePictureTuning.width, round(whole.height * FramePictureTuning.width / whole.width))
         view = self._rasterizer.forward(
             self._gaussians, camera, inverse(T_world_camera), features=segmented is not None
         )
@@ -76,11 +84,12 @@ class ViewPictures:
 
     def object_at(self, origin: np.ndarray, direction: np.ndarray, focal: float, hidden: set[int]) -> int:
         """See `ViewedMap.object_at`: of the Gaussians at that pixel, whose object has the largest rendering weight."""
-        middle = (_PATCH - 1) / 2
-        camera = Camera(_PATCH, _PATCH, focal, focal, middle, middle)
+        patch = FramePictureTuning.patch
+        middle = (patch - 1) / 2
+        camera = Camera(patch, patch, focal, focal, middle, middle)
         part, labels = self._visible(hidden)
         view = self._rasterizer.forward(part, camera, inverse(pose_along(origin, direction)), features=False)
-        return int(vote_label_image(self._rasterizer, view, labels)[_PATCH // 2, _PATCH // 2])
+        return int(vote_label_image(self._rasterizer, view, labels)[patch // 2, patch // 2])
 
     def picture(self, camera: Camera, T_world_camera: np.ndarray, hidden: set[int]) -> np.ndarray:
         """See `ViewedMap.picture`."""
@@ -105,14 +114,15 @@ def table_of(cells: list[tuple[str, np.ndarray]], size: tuple[int, int]) -> np.n
     """Pictures of one size (width, height), two a row, each with its name above; uint8 [H, W, 3] on dark grey."""
     width, height = size
     rows = -(-len(cells) // 2)
-    sheet = np.full((rows * (height + _BAR + _GAP) - _GAP, 2 * width + _GAP, 3), 36, np.uint8)
+    gap, bar = FramePictureTuning.gap, FramePictureTuning.bar_height
+    sheet = np.full((rows * (height + bar + gap) - gap, 2 * width + gap, 3), 36, np.uint8)
     for number, (name, picture) in enumerate(cells):
-        left, top = number % 2 * (width + _GAP), number // 2 * (height + _BAR + _GAP)
+        left, top = number % 2 * (width + gap), number // 2 * (height + bar + gap)
         cv2.putText(sheet, name, (left + 2, top + 18), cv2.FONT_HERSHEY_SIMPLEX, 0.62, (225, 225, 225), 1, cv2.LINE_AA)
         shown = picture
         if picture.shape[:2] != (height, width):
             shown = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
-        sheet[top + _BAR : top + _BAR + height, left : left + width] = shown
+        sheet[top + bar : top + bar + height, left : left + width] = shown
     return sheet
 
 
@@ -123,4 +133,6 @@ def _identity_colors(segmented: SegmentedMap) -> IdentityColors | None:
     labelled = np.flatnonzero(segmented.gaussians.object_id.numpy() > 0)
     if not len(labelled):
         return None
-    return IdentityColors(segmented.gaussians.features.numpy()[labelled[:: max(1, len(labelled) // FITTED)]])
+    return IdentityColors(
+        segmented.gaussians.features.numpy()[labelled[:: max(1, len(labelled) // IdentityPictureTuning.fitted)]]
+    )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ggslam.jobs.view.live import LiveView
-from ggslam.jobs.view.viewed_run import DEFAULT_SPLATS, ViewedRun
+from ggslam.jobs.view.viewed_run import ViewedRun, ViewedRunTuning
 from ggslam.runs.folder import RunFolder
 from ggslam.system.atomic import make_folder, write_bytes
 from ggslam.viewer.page import Page
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def serve_run(
-    folder: RunFolder, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, max_splats: int = DEFAULT_SPLATS,
+    folder: RunFolder, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, max_splats: int = ViewedRunTuning.max_splats,
     sequence: Path | None = None, changes: Path | None = None,
 ) -> tuple[viser.ViserServer, ViewedRun]:  # fmt: skip
     """Serves a run's page until `close_server`.
@@ -53,7 +53,7 @@ def show_run(server: viser.ViserServer, model: ViewedRun) -> None:
 
 
 def write_page(
-    folder: RunFolder, path: Path, max_splats: int = DEFAULT_SPLATS, sequence: Path | None = None
+    folder: RunFolder, path: Path, max_splats: int = ViewedRunTuning.max_splats, sequence: Path | None = None
 ) -> tuple[ViewedRun, int]:
     """Writes a run's page as one HTML file that opens without server and network; returns the run and the file's
     size in bytes.

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
-from ggslam.jobs.changes.shown import ChangesShown, changes_of, read_changes, sentence_of
+from ggslam.jobs.changes.saved_changes import ChangesShown, changes_of, read_changes, sentence_of
 from ggslam.jobs.edit.edited_file import edited_name
 from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.jobs.view.pictures import ViewPictures
-from ggslam.objects.editing import MAX_NAME
+from ggslam.objects.editing import EditingTuning
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectRecord
 from ggslam.reporting.pictures import color_of_depth, depth_range
@@ -33,18 +33,23 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.object_names import object_file_name
 from ggslam.sequences import Sequence
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted
 from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover
 from ggslam.viewer.splats import Splats, most_visible, splats_of
 from ggslam.viewer.static_page import static_page
 from ggslam.volumes.map_upright import upright_of
 
-DEFAULT_SPLATS = 400_000
-"""As many are shown, at most, unless asked otherwise."""
-_MANY = 1000
-"""Pictures of changes: one is shown at a time."""
-_DIGITS = 4
-"""Decimals of a shift in metres and a turn in degrees; what is shown is what is saved."""
+
+class ViewedRunTuning(Tuning):
+    """How much of a run is shown."""
+
+    max_splats = 400_000
+    """Most Gaussians that are shown unless asked otherwise."""
+    change_pictures = 1000
+    """Most pictures of changes: one is shown at a time."""
+    digits = 4
+    """Decimals of a shift in metres and a rotation in degrees, as shown and as saved."""
 
 
 class ViewedRun:
@@ -66,7 +71,7 @@ class ViewedRun:
     """
 
     def __init__(
-        self, folder: RunFolder, max_splats: int = DEFAULT_SPLATS, sequence: Path | None = None,
+        self, folder: RunFolder, max_splats: int = ViewedRunTuning.max_splats, sequence: Path | None = None,
         changes: Path | None = None,
     ) -> None:  # fmt: skip
         self.folder, self._max_splats, self._sequence_path = folder, max_splats, sequence
@@ -96,13 +101,13 @@ class ViewedRun:
 
     def _own_changes(self) -> ChangesShown | None:
         try:
-            return changes_of(self.folder, _MANY)
+            return changes_of(self.folder, ViewedRunTuning.change_pictures)
         except GgslamError as error:  # the map is there
             self.notes.append(f"shown without what changed: {error}")
             return None
 
     def _given_changes(self, place: Path) -> ChangesShown:
-        shown, own = read_changes(place, _MANY), self.folder.path.resolve()
+        shown, own = read_changes(place, ViewedRunTuning.change_pictures), self.folder.path.resolve()
         old, new = shown.record.old, shown.record.new
         if new and own == Path(new).resolve():
             raise ConfigError(f"{place}: lies in the world of the older run; view {old} with it")
@@ -261,7 +266,7 @@ class ViewedRun:
             center = np.array(self._scene().table.record(object_id).centroid)
         shift = T[:3, :3] @ center + T[:3, 3] - center
         turn = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)  # about fixed x, then y, then z
-        rotation = _numbers(turn) if np.abs(turn).max() > 10.0**-_DIGITS else ""
+        rotation = _numbers(turn) if np.abs(turn).max() > 10.0**-ViewedRunTuning.digits else ""
         return self._do(Edit("move", str(object_id), _numbers(shift), rotation))
 
     def _do(self, edit: Edit) -> str:
@@ -316,7 +321,11 @@ class ViewedRun:
         with self._lock:
             if not self._edits:
                 raise ConfigError("nothing was edited, so there is nothing to save")
-            if not is_plain_name(target.strip()) or not target.isprintable() or len(target) > MAX_NAME:
+            if (
+                not is_plain_name(target.strip())
+                or not target.isprintable()
+                or len(target) > EditingTuning.max_name_length
+            ):
                 raise ConfigError(f"a name is needed to save as, of a new folder in {self.save_folder()}")
             sequence = self._sequence_path if inpaint else None
             edits = list(self._edits)
@@ -348,4 +357,4 @@ def _box_of_side(side: ChangedSide | None) -> Box | None:
 
 
 def _numbers(values: np.ndarray) -> str:
-    return " ".join(f"{value:.{_DIGITS}f}" for value in values)
+    return " ".join(f"{value:.{ViewedRunTuning.digits}f}" for value in values)

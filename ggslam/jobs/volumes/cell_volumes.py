@@ -20,16 +20,21 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes
 from ggslam.scene.poses import inverse
 from ggslam.submaps.cell_keys import CellKey, Grid
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.esdf import DistanceField, FieldSettings
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import SIDE, TsdfMap
 from ggslam.volumes.tsdf_file import tsdf_of_arrays, tsdf_to_bytes
 
-_TILES = (6, 8)
-"""Rows and columns of parts of an image, each as deep as it saw there."""
-_FAR = 1 << 20
-"""Blocks from the origin, along axes that the grid does not span."""
+
+class CellVolumeTuning(Tuning):
+    """Which blocks of a cell a frame reaches."""
+
+    tiles = (6, 8)
+    """Rows and columns of image parts; each reaches as deep as it measured."""
+    far_blocks = 1 << 20
+    """Blocks from the origin, along axes that the grid does not span."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +50,8 @@ class CellBlocks:
         """Those whose middles lie in a cell."""
         edge = SIDE * voxel
         ends = [np.ceil((np.array(key) + side) * grid.spacing / edge - 0.5) for side in (-0.5, 0.5)]
-        low = np.where(grid.spans, ends[0], -_FAR).astype(int).tolist()
-        high = np.where(grid.spans, ends[1] - 1, _FAR).astype(int).tolist()
+        low = np.where(grid.spans, ends[0], -CellVolumeTuning.far_blocks).astype(int).tolist()
+        high = np.where(grid.spans, ends[1] - 1, CellVolumeTuning.far_blocks).astype(int).tolist()
         return CellBlocks((low[0], low[1], low[2]), (high[0], high[1], high[2]), edge)
 
     def around(self, blocks: int) -> tuple[np.ndarray, np.ndarray]:
@@ -132,7 +137,7 @@ def look_at_frames(task: LookTask) -> np.ndarray:
         depth = frame.depth_or_infinity()
         depth = np.where(depth >= s.min_depth, np.minimum(depth, s.max_depth), 0)
         if depth.any():
-            reach = depth_reach(depth, *_TILES) + s.truncation
+            reach = depth_reach(depth, *CellVolumeTuning.tiles) + s.truncation
             frustums = Frustums.of(frame.camera, inverse(T_world_camera)[None], reach[None])
             seen[row] = frustums.touch(task.low, task.high)[0]
     return seen

@@ -20,9 +20,16 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
+from ggslam.system.tuning import Tuning
 
-FAR_M, FAR_TIMES = 1000.0, 100.0
-"""A frame is far from the others at so many metres, and so many times their median distance, from their middle."""
+
+class FarFrameTuning(Tuning):
+    """When a frame is far from the others."""
+
+    min_distance_m = 1000.0
+    """Distance from the middle of all frames, in metres..."""
+    min_ratio = 100.0
+    """...which is also this many times the median distance."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +122,12 @@ def far_away(poses: Mapping[int, np.ndarray]) -> list[int]:
     """Frames at which the camera was much farther from the rest than anybody walks, of poses [4, 4] by frame."""
     frames, places = list(poses), np.array([T[:3, 3] for T in poses.values()], np.float64)
     off = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-    return [frames[k] for k in np.flatnonzero(off > max(FAR_M, FAR_TIMES * float(np.median(off))))]
+    return [
+        frames[k]
+        for k in np.flatnonzero(
+            off > max(FarFrameTuning.min_distance_m, FarFrameTuning.min_ratio * float(np.median(off)))
+        )
+    ]
 
 
 def frames_of_recording(request: SequenceRequest, objects: bool = True) -> FrameSource:

@@ -25,7 +25,7 @@ from ggslam.slam.config import Config, config_to_dict, load_config, settings_not
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.opencv import opencv_errors
-from ggslam.volumes.maps import WINDOW, VolumeMaps
+from ggslam.volumes.maps import VolumeMaps, VolumeTimesTuning
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.output_frame import OutputFrame, output_frame
 from ggslam.volumes.tsdf_file import load_tsdf
@@ -326,7 +326,8 @@ def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str,
         "source": fused.name, "live": request.live, "frames": len(fused.poses), "onto": request.onto,
         "settings": config_to_dict(replace(config, volumes=fused.maps.settings))["volumes"],
         "times": fused.maps.times.summary(),
-        "frames_a_window": WINDOW, "blocks_by_window": fused.maps.times.blocks[WINDOW - 1 :: WINDOW],
+        "frames_a_window": VolumeTimesTuning.window,
+        "blocks_by_window": fused.maps.times.blocks[VolumeTimesTuning.window - 1 :: VolumeTimesTuning.window],
         "rebuilds_s": fused.maps.times.rebuilds,
         "stopped_by": None if fused.error is None else repr(fused.error),
     }  # fmt: skip
@@ -335,6 +336,6 @@ def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str,
 def _outcome(out: Path, fused: _Fused, outputs: Outputs) -> VolumesOutcome:
     times = fused.maps.times
     return VolumesOutcome(
-        out, outputs.files, outputs.lines, times.summary(), WINDOW, fused.latency(),
+        out, outputs.files, outputs.lines, times.summary(), VolumeTimesTuning.window, fused.latency(),
         float(np.median(fused.depth_ranges)) if fused.depth_ranges else 0.0, fused.error,
     )  # fmt: skip

@@ -11,9 +11,14 @@ import numpy as np
 
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.frame import Frame
+from ggslam.system.tuning import Tuning
 
-_NEWEST = 64
-"""Frames that may still become keyframes."""
+
+class NoReturnTuning(Tuning):
+    """How long pixels without a return are kept."""
+
+    newest_frames = 64
+    """Latest frames that may still become keyframes."""
 
 
 class NoReturns:
@@ -21,7 +26,7 @@ class NoReturns:
 
     def __init__(self) -> None:
         self._packed: dict[int, bytes] = {}
-        self._most = 2 * _NEWEST
+        self._most = 2 * NoReturnTuning.newest_frames
 
     def note(self, frame: Frame, keyframes: Iterable[Keyframe]) -> None:
         """Keeps a frame's mask, if it has one, and now and then drops those of frames that are none of the keyframes
@@ -30,9 +35,11 @@ class NoReturns:
             return
         self._packed[frame.index] = zlib.compress(np.packbits(frame.no_return).tobytes(), 1)
         if len(self._packed) > self._most:
-            kept = {keyframe.frame_index for keyframe in keyframes} | set(list(self._packed)[-_NEWEST:])
+            kept = {keyframe.frame_index for keyframe in keyframes} | set(
+                list(self._packed)[-NoReturnTuning.newest_frames :]
+            )
             self._packed = {index: packed for index, packed in self._packed.items() if index in kept}
-            self._most = 2 * len(self._packed) + _NEWEST
+            self._most = 2 * len(self._packed) + NoReturnTuning.newest_frames
 
     def depth_of(self, keyframe: Keyframe) -> np.ndarray:
         """Depth float32 [H, W], metres; +inf where the sensor found nothing."""

@@ -38,15 +38,10 @@ from ggslam.scene.origin import moved_pose
 from ggslam.scene.poses import translation
 from ggslam.system.json_files import write_json
 from ggslam.system.staging import finish_saving, make_staging, publish
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name
 from ggslam.volumes.esdf import DistanceField
-from ggslam.volumes.floor_frame import (
-    BELOW_CAMERAS,
-    FLOOR_FILE,
-    floor_from_map,
-    floor_height,
-    write_floor_file,
-)
+from ggslam.volumes.floor_frame import FLOOR_FILE, FloorTuning, floor_from_map, floor_height, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh
 from ggslam.volumes.occupancy import OccupancyMap
@@ -63,10 +58,15 @@ _FILES = (
     "tsdf.npz", "mesh.ply", "mesh.png", "objects.png", "esdf.png", "map.pgm", "map.yaml", "occupancy.bt",
     "occupancy.ot", "occupancy.png", FLOOR_FILE,
 )  # fmt: skip
-MOST_CELLS = 20_000_000
-"""Of a slice."""
-SMALLEST_PIECE = 50
-"""Triangles; smaller pieces of the mesh, specks of noise in the air, are left out."""
+
+
+class VolumeOutputTuning(Tuning):
+    """Limits of files of volumes."""
+
+    max_slice_cells = 20_000_000
+    """Most cells of a slice."""
+    min_piece_triangles = 50
+    """Pieces of the mesh with fewer triangles are left out: specks of noise in the air."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Surface:
     @staticmethod
     def of(maps: VolumeMaps, poses: Sequence[np.ndarray]) -> Surface:
         """The surface of finished maps."""
-        mesh, stacked, origin = maps.mesh(SMALLEST_PIECE), np.array(poses), maps.tsdf.origin
+        mesh, stacked, origin = maps.mesh(VolumeOutputTuning.min_piece_triangles), np.array(poses), maps.tsdf.origin
         near = moved_pose(stacked, -origin)
         # Marching cubes' vertices are spread evenly enough over surfaces to stand for their area.
         upright = estimate_up(near, mesh.vertices - origin if origin.any() else mesh.vertices, mesh.normals)
@@ -222,7 +222,7 @@ class _Writer:
         lying = "all ROS files are in the floor's frame"
         if frame is OutputFrame.map:
             lying = "mesh and occupancy are in the map's frame, map.pgm is in the floor's"
-        guess = "" if seen else f" (z = 0 is {BELOW_CAMERAS:g} m below the lowest camera)"
+        guess = "" if seen else f" (z = 0 is {FloorTuning.below_cameras_m:g} m below the lowest camera)"
         self.tell(f"{lying}{guess}: {command}", frame=frame.value, T_floor_map=self.surface.T_floor_map)
 
     def field(self, field_: DistanceField, seconds: float) -> None:
@@ -283,7 +283,7 @@ def _slice(
     """A slice, coarser than `resolution` where that would be too many cells."""
     plane = plane_at_height(field_, up, height)
     area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
-    return slice_field(field_, plane, max(resolution, math.sqrt(area / MOST_CELLS)), band)
+    return slice_field(field_, plane, max(resolution, math.sqrt(area / VolumeOutputTuning.max_slice_cells)), band)
 
 
 def _full_scale(distances: np.ndarray) -> float:

@@ -13,12 +13,20 @@ from ggslam.reporting.cloud_pictures import CloudView, draw_cloud, view_along
 from ggslam.reporting.mesh_pictures import draw_mesh
 from ggslam.reporting.pictures import side_by_side
 from ggslam.scene.origin import moved_pose
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.mesh import Mesh
 from ggslam.volumes.occupancy import OccupancyMap
 
-_WIDTH, _HEIGHT = 800, 600
-_ELEVATION = math.radians(40)
-"""Angle at which one looks down."""
+
+class MeshPictureTuning(Tuning):
+    """From where meshes are drawn, and how large."""
+
+    width = 800
+    """Width of a picture, in pixels."""
+    height = 600
+    """Height of a picture, in pixels."""
+    elevation = math.radians(40)
+    """Angle at which the camera looks down, in radians."""
 
 
 def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> CloudView:
@@ -30,19 +38,21 @@ def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> CloudVi
     if np.linalg.norm(forward) < 0.05:  # they looked all around
         forward = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     forward /= np.linalg.norm(forward)
-    direction = math.cos(_ELEVATION) * forward - math.sin(_ELEVATION) * up
-    view = view_along(middle, direction, up, _WIDTH, _HEIGHT)
+    direction = math.cos(MeshPictureTuning.elevation) * forward - math.sin(MeshPictureTuning.elevation) * up
+    view = view_along(middle, direction, up, MeshPictureTuning.width, MeshPictureTuning.height)
     x, y, z = ((points[:: max(1, len(points) // 20_000)] - middle) @ view.T_world_camera[:3, :3]).T
     camera = view.camera
     tangents = 2 * np.maximum(np.abs(x) / camera.width, np.abs(y) / camera.height) * camera.fx
     back = float(np.percentile(tangents - z, 98))
-    return view_along(middle - back * direction, direction, up, _WIDTH, _HEIGHT)
+    return view_along(middle - back * direction, direction, up, MeshPictureTuning.width, MeshPictureTuning.height)
 
 
 def from_a_camera(poses: np.ndarray, up: np.ndarray) -> CloudView:
     """The view of the frame in the middle of the recording, from a step behind it."""
     pose = poses[len(poses) // 2]
-    return view_along(pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 2], up, _WIDTH, _HEIGHT)
+    return view_along(
+        pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 2], up, MeshPictureTuning.width, MeshPictureTuning.height
+    )
 
 
 def mesh_picture(mesh: Mesh, poses: np.ndarray, up: np.ndarray, by_object: bool = False) -> np.ndarray:
@@ -56,7 +66,7 @@ def occupancy_picture(occupancy: OccupancyMap, poses: np.ndarray, up: np.ndarray
     """The occupied voxels below the cameras' heads from above, coloured by height, uint8 [H, W, 3]."""
     centers = occupancy.occupied_centers()[0].astype(np.float64) - occupancy.origin
     if not len(centers):
-        return np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
+        return np.full((MeshPictureTuning.height, MeshPictureTuning.width, 3), 255, np.uint8)
     poses, heights = moved_pose(poses, -occupancy.origin), centers @ up
     head = float(np.percentile(poses[:, :3, 3] @ up, 90)) + 0.3
     shown = heights < head  # no ceiling

@@ -46,11 +46,12 @@ from ggslam.jobs.volumes.cell_volumes import (
     mesh_cell,
     mesh_from_bytes,
 )
-from ggslam.jobs.volumes.outputs import SMALLEST_PIECE
+from ggslam.jobs.volumes.outputs import VolumeOutputTuning
 from ggslam.runs.records.visit import VisitRecord
 from ggslam.scene.arrays import arrays_of, arrays_to_bytes
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import INDEX, GridStore
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.esdf import FieldSettings
 from ggslam.volumes.mesh import Mesh, join_meshes, without_small_pieces
 from ggslam.volumes.tsdf import MOST_VOXELS
@@ -59,16 +60,23 @@ from ggslam.volumes.volume_settings import VolumeSettings
 
 TSDF, MESH, ESDF = "tsdf.npz", "mesh.npz", "esdf.npz"
 WHOLE_MESH = "mesh.ply"
-_CELLS_IN_MEMORY = 32
-"""TSDFs of cells that are remembered: each is asked for by all its neighbours."""
+
+
+class StoreVolumeTuning(Tuning):
+    """Memory and limits of a store's volumes."""
+
+    cells_in_memory = 32
+    """TSDFs of cells that are kept in memory: all neighbours of a cell ask for it."""
+    frames_at_once = 16
+    """Frames that a worker looks through in one task."""
+    max_cells = 500_000
+    """Most cells in the box around cells and cameras, all of which are checked; 1 KB each."""
+    max_checks = 1_000_000_000
+    """Most checks of a cell in a frame; a byte each."""
+
+
 _FUSED = "fused"
 """A visit of the results, begun when all cells are fused."""
-_LOOKS = 16
-"""Frames that a worker looks through at a time."""
-MOST_CELLS = 500_000
-"""In the box around a store's cells and cameras, all of which are looked at; 1 KB each."""
-MOST_LOOKS = 1_000_000_000
-"""At so many cells, for all frames together; a byte each."""
 
 
 @dataclass
@@ -179,7 +187,7 @@ class _Work:
             raise ConfigError(f"{self.store.path}: has no cells, and no frame of its runs has a pose")
         low, high = np.min(there, axis=0) - grid.spans, np.max(there, axis=0) + grid.spans
         where = f"{self.store.path}: its cells reach from {low.tolist()} to {high.tolist()}"
-        most = min(MOST_CELLS, MOST_LOOKS // max(1, len(self.poses)))
+        most = min(StoreVolumeTuning.max_cells, StoreVolumeTuning.max_checks // max(1, len(self.poses)))
         if math.prod((high - low + 1).tolist()) > most:
             raise ConfigError(f"{where}; volumes are made of at most {most:,} cells together: is the index damaged?")
         if np.abs([low, high]).max() * grid.spacing > MOST_VOXELS * voxel:
@@ -192,8 +200,15 @@ class _Work:
         low = np.array([b.low for b in blocks], float) * blocks[0].edge
         high = (np.array([b.high for b in blocks], float) + 1) * blocks[0].edge
         return [
-            LookTask(first, self.texts, tuple(self.poses[first : first + _LOOKS]), low, high, self.settings.tsdf)
-            for first in range(0, len(self.poses), _LOOKS)
+            LookTask(
+                first,
+                self.texts,
+                tuple(self.poses[first : first + StoreVolumeTuning.frames_at_once]),
+                low,
+                high,
+                self.settings.tsdf,
+            )
+            for first in range(0, len(self.poses), StoreVolumeTuning.frames_at_once)
         ]
 
     def views(self, keys: list[CellKey]) -> dict[CellKey, tuple[tuple[int, int, np.ndarray], ...]]:
@@ -247,7 +262,7 @@ class _Volumes:
             if isinstance(found, Failure):
                 raise error_of(found, found.line)
             work.seen[task.key : task.key + len(found)] = found
-            self.observer.advance(task.key // _LOOKS + 1, len(looks))
+            self.observer.advance(task.key // StoreVolumeTuning.frames_at_once + 1, len(looks))
 
         self.engine.do(look_at_frames, looks, take)
         outcome.seconds["look"] = time.perf_counter() - start
@@ -263,7 +278,7 @@ class _Volumes:
         """The meshes of all cells as one: vertices on their seams are the same."""
         there = [key for key in keys if self._has(key, MESH)]
         parts = [mesh_from_bytes(self.results.get(key, MESH), f"{self.results.path}: cell {key}") for key in there]
-        return without_small_pieces(join_meshes(parts), SMALLEST_PIECE)
+        return without_small_pieces(join_meshes(parts), VolumeOutputTuning.min_piece_triangles)
 
     def _has(self, key: CellKey, part: str) -> bool:
         return key in self.results and part in self.results.cell(key).parts
@@ -292,7 +307,7 @@ class _Volumes:
         self, filled: set[CellKey], around: int, settings: FieldSettings | None
     ) -> Callable[[CellKey], BlocksTask]:
         """Makes tasks of cells with their blocks and so many around them; `filled`: cells with blocks."""
-        read, edge = lru_cache(_CELLS_IN_MEMORY)(self._tsdf), self.work.blocks(next(iter(filled))).edge
+        read, edge = lru_cache(StoreVolumeTuning.cells_in_memory)(self._tsdf), self.work.blocks(next(iter(filled))).edge
         steps = math.ceil(around * edge / self.work.store.grid.spacing + 0.5)
 
         def task_of(key: CellKey) -> BlocksTask:

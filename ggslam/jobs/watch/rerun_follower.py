@@ -10,13 +10,19 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.slam import Slam
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 
-MOST_POINTS = 30_000
-"""Gaussians that are sent at a time, evenly drawn from all."""
-MAP_EVERY = 5
-"""Keyframes from one sending of the map to the next."""
-_MOST_POSITIONS = 1000
+
+class RerunTuning(Tuning):
+    """How much is sent to rerun."""
+
+    max_points = 30_000
+    """Gaussians that are sent at a time, drawn evenly from all."""
+    keyframes_per_map = 5
+    """The map is sent every n-th keyframe."""
+    max_positions = 1000
+    """Most positions of the path."""
 
 
 class LiveLog:
@@ -50,7 +56,7 @@ class LiveLog:
         if report.is_keyframe:
             self._log.depth(frame.depth)
             self._send_path()
-            if self._keyframes % MAP_EVERY == 0:
+            if self._keyframes % RerunTuning.keyframes_per_map == 0:
                 self._send_map(slam.map)
             self._keyframes += 1
 
@@ -83,12 +89,12 @@ class LiveLog:
         self._moving = set(moving)
 
     def _send_path(self) -> None:
-        stride = max(1, len(self._positions) // _MOST_POSITIONS)
+        stride = max(1, len(self._positions) // RerunTuning.max_positions)
         self._log.path(np.array(self._positions[::stride] + self._positions[-1:]))
 
     def _send_map(self, gaussians: GaussianMap) -> None:
         """In a real-time run the mapper works on the map meanwhile: arrays are cut to one length."""
-        stride = max(1, -(-gaussians.count // MOST_POINTS))
+        stride = max(1, -(-gaussians.count // RerunTuning.max_points))
         arrays = [a[::stride].cpu().numpy().copy() for a in (gaussians.means, gaussians.rgb, gaussians.scales)]
         count = min(map(len, arrays))
         means, rgb, scales = (a[:count] for a in arrays)

@@ -2,12 +2,10 @@
 // Projection of Gaussians by elliptical weighted averaging (Zwicker et al. 2001, "EWA splatting"): the image of the
 // covariance Sigma = M M^T, M = R(q) diag(exp(log_scale)), under the linearised projection J W is V V^T + low_pass I
 // with V = J W M. Forward and backward share these terms, so that they can never disagree.
-//
-// Compiled for the CPU, where a Number is a vector of them, and for the GPU, where it is one: whoever includes this
-// defines Number, Verdict, the functions of them that are used, and GGSLAM_FORMULAS (the namespace),
-// GGSLAM_FORMULA and GGSLAM_HOST_FORMULA (how a function is declared).
+// Compiled for CPU and GPU: see formulas.hpp.
 #pragma once
 #include "abi/core/rendering.hpp"
+#include "native/formulas/formulas.hpp"
 #include "native/formulas/rendering_rules.hpp"
 
 namespace GGSLAM_FORMULAS {

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Real spherical harmonics up to degree 3 of a unit direction (x, y, z), in the order and with the signs of 3D Gaussian
-// Splatting (Kerbl et al. 2023): colour = 0.5 + sum_k basis_k(direction) sh_k. Compiled for CPU and GPU as projection.hpp.
+// Splatting (Kerbl et al. 2023): colour = 0.5 + sum_k basis_k(direction) sh_k. Compiled for CPU and GPU: see formulas.hpp.
 #pragma once
+#include "native/formulas/formulas.hpp"
 
 namespace GGSLAM_FORMULAS {
 

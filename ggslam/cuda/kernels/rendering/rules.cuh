@@ -3,11 +3,8 @@
 #pragma once
 #include "common/platform.cuh"
 #include "abi/cuda/rendering.hpp"
+#include "native/formulas/formulas.hpp"
 #include "native/formulas/rendering_rules.hpp"
-
-#define GGSLAM_FORMULAS ggslam::cuda
-#define GGSLAM_FORMULA __device__ inline
-#define GGSLAM_HOST_FORMULA inline
 
 namespace ggslam::cuda {
 

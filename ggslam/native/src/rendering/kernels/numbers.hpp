@@ -2,11 +2,8 @@
 // The formulas that CPU and GPU share, for a vector of Gaussians: see ggslam/native/formulas.
 #pragma once
 #include "common/kernels/columns.hpp"
+#include "native/formulas/formulas.hpp"
 #include "rendering/rasterizer.hpp"
-
-#define GGSLAM_FORMULAS ggslam::GGSLAM_ISA
-#define GGSLAM_FORMULA static inline
-#define GGSLAM_HOST_FORMULA static inline
 
 namespace ggslam::GGSLAM_ISA {
 

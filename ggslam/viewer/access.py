@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who may open the page: whoever has the address that was printed, from this machine's own names.
+
+A browser lets every page that is open in it send requests to localhost. So a request must name a host that is ours (a
+name of somebody else's that was bent to 127.0.0.1 is not), come from no other page, and carry the token of the printed
+address or the cookie that it was exchanged for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import ipaddress
+import logging
+import re
+import secrets
+import socket
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from ggslam.system.tuning import Tuning
+
+
+class AccessTuning(Tuning):
+    """Limits of what a page sends."""
+
+    max_message_bytes = 256 << 10
+    """Largest message, in bytes; clicks, poses and names take a few hundred."""
+
+
+_unheard = logging.getLogger(f"{__name__}.connections")
+_unheard.setLevel(logging.CRITICAL + 1)
+_ANYWHERE = ("0.0.0.0", "::", "")
+_REFUSAL = "403: open the address that ggslam printed; it ends with ?token=...\n"
+_MALFORMED = "400: the request cannot be read\n"
+_HOST = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]{2,45})\]|(?P<name>[A-Za-z0-9._-]{1,253}))(?::(?P<port>[0-9]{1,5}))?")
+_SCHEME = "http"
+"""Of all our pages. One that a proxy serves under another name or scheme is not ours."""
+
+
+class MalformedRequest(ValueError):
+    """A request that is no good HTTP."""
+
+
+@dataclass
+class Gate:
+    """Judges requests for the page.
+
+    Attributes:
+        host: that the server listens at.
+        token: of the printed address.
+    """
+
+    host: str
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
+
+    def reason_to_refuse(self, path: str, headers: Any) -> str | None:
+        """Why a request is refused; None: it is not.
+
+        Args:
+            path: of the request, with its query.
+            headers: mapping by name.
+
+        Raises:
+            MalformedRequest: they are not what HTTP allows: no address, or a header twice.
+        """
+        try:
+            return self._reason_to_refuse(path, headers)
+        except (ValueError, LookupError) as error:
+            raise MalformedRequest(str(error)) from None
+
+    def _reason_to_refuse(self, path: str, headers: Any) -> str | None:
+        host = headers.get("Host") or ""
+        if not self._is_own(_name_and_port(host)[0]):
+            return f"host {host[:80]!r} is none of this server's"
+        origin = headers.get("Origin")
+        if origin is not None and origin.lower() != f"{_SCHEME}://{host.lower()}":
+            return f"a page of {origin[:80]!r} may not use it"
+        if self._has_token(path):
+            return None
+        # A page of another port is of the same site: frames, images and links in it carry the cookie and no origin.
+        sender = headers.get("Sec-Fetch-Site")
+        if sender not in (None, "none", "same-origin"):
+            return f"a page of another origin ({sender[:20]!r}) may not use it"
+        if self._has_cookie(headers.get("Cookie") or "", host):
+            return None
+        return "without the token of the printed address"
+
+    def wants_cookie(self, path: str) -> bool:
+        """Whether a request brings the token, which a cookie takes the place of from then on."""
+        return self._has_token(path)
+
+    def cookie(self, host: str) -> str:
+        """Value of Set-Cookie for a host and port: scripts cannot read it, other pages' requests do not carry it."""
+        return f"{_cookie_name(host)}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def _has_token(self, path: str) -> bool:
+        given = parse_qs(urlsplit(path).query).get("token", [""])[0]
+        return hmac.compare_digest(given.encode(), self.token.encode())
+
+    def _has_cookie(self, text: str, host: str) -> bool:
+        try:
+            found = SimpleCookie(text).get(_cookie_name(host))
+        except CookieError:
+            return False
+        return found is not None and hmac.compare_digest(found.value.encode(), self.token.encode())
+
+    def _is_own(self, name: str | None) -> bool:
+        if not name:
+            return False
+        if name in ("localhost", "127.0.0.1", "::1", self.host):
+            return True
+        if self.host not in _ANYWHERE:
+            return False
+        if name == socket.gethostname().lower():
+            return True
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True  # an address cannot be bent to another machine as a name can
+
+
+def _name_and_port(host: str) -> tuple[str, int]:
+    """What a Host header says.
+
+    Raises:
+        ValueError: it is no host, with or without a port.
+    """
+    if not host:
+        return "", 80
+    match = _HOST.fullmatch(host)
+    if match is None or int(match["port"] or 80) > 0xFFFF:
+        raise ValueError("no host")
+    if match["six"]:
+        ipaddress.IPv6Address(match["six"])
+    return (match["six"] or match["name"]).lower(), int(match["port"] or 80)
+
+
+def _cookie_name(host: str) -> str:
+    """Cookies do not tell ports apart; two viewers on one machine must not share one."""
+    return f"ggslam-{_name_and_port(host)[1]}"
+
+
+@contextlib.contextmanager
+def guard(gate: Gate) -> Iterator[None]:
+    """Servers that are started in the block judge every request by `gate`; viser has no way to be told so."""
+    from websockets.asyncio import server as library
+
+    serve = library.serve
+
+    def guarded_serve(handler: Any, host: str, port: int, **options: Any) -> Any:
+        options["process_request"] = _process(gate, options.get("process_request"))
+        options["max_size"] = AccessTuning.max_message_bytes
+        options["logger"] = _unheard  # who sends what is no HTTP, as scanners of ports do, gets no traceback printed
+        return serve(handler, host, port, **options)
+
+    library.serve = guarded_serve  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        library.serve = serve  # type: ignore[misc]
+
+
+def _process(gate: Gate, inner: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
+    def process(connection: Any, request: Any) -> Any:
+        try:
+            reason = gate.reason_to_refuse(request.path, request.headers)
+        except MalformedRequest:
+            return connection.respond(400, _MALFORMED)
+        if reason is not None:
+            return connection.respond(403, _REFUSAL)
+        answer = None if inner is None else inner(connection, request)
+        if answer is not None and gate.wants_cookie(request.path):
+            answer.headers["Set-Cookie"] = gate.cookie(request.headers["Host"])
+            answer.headers["Referrer-Policy"] = "no-referrer"
+        return answer
+
+    return process
