@@ -53,8 +53,8 @@ from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.container import CONTAINER_FORMAT, CONTAINER_VERSION, ContainerRecord
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import FileRecord, RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
+from ggslam.runs.records.run_json import FileRecord, RunRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points

@@ -28,9 +28,9 @@ from ggslam.runs.map_container import is_container, read_contained_map
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoversRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.camera import Camera

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.runs.manifest import files_in, without
-from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.system.atomic import make_folder, reason_of, sync_folder, write_failure
 from ggslam.system.folder_lock import LockTuning, folder_lock
 from ggslam.system.links import refuse_links_below

@@ -39,7 +39,7 @@ from ggslam.jobs.submaps.cell_gaussians import (
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.runs.records.cells import CELLS_FORMAT, CELLS_VERSION, CellMember, CellsRecord
-from ggslam.runs.records.mark import FileRecord
+from ggslam.runs.records.run_json import FileRecord
 from ggslam.scene.packed_arrays import pack_bytes
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore

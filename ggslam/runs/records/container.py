@@ -7,8 +7,8 @@ from typing import Final
 
 import pydantic
 
-from ggslam.runs.records.mark import FileRecord
 from ggslam.runs.records.record import Record
+from ggslam.runs.records.run_json import FileRecord
 
 CONTAINER_FORMAT = "ggslam map"
 CONTAINER_VERSION: Final = 2
