@@ -15,6 +15,7 @@ import numpy as np
 
 from ggslam.coding.geometry_syntax import MAX_DEPTH
 from ggslam.coding.settings import CodecSettings
+from ggslam.system.plurals import agreeing, counted
 from ggslam.system.tuning import Tuning
 
 
@@ -77,18 +78,14 @@ class Reach:
         notes = []
         if self.left_out:
             notes.append(
-                f"left out {_number(self.left_out, what)} far outside the others ({at}; the others span {side:.4g}): "
+                f"left out {counted(self.left_out, what)} far outside the others ({at}; the others span {side:.4g}): "
                 "the grid does not reach so far"
             )
         if self.far > self.left_out:
-            lie = "lies" if self.far - self.left_out == 1 else "lie"
-            few = _number(self.far - self.left_out, what)
+            lie = agreeing(self.far - self.left_out, "lies", "lie")
+            few = counted(self.far - self.left_out, what)
             notes.append(f"{few} {lie} far outside the others ({at}); the voxels are those that suit the others")
         return notes
-
-
-def _number(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def reach_of(

@@ -26,6 +26,7 @@ from ggslam.formats.splat_levels import coarser
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.atomic import make_empty_folder, write_text
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 INDEX = "lod-meta.json"
@@ -237,8 +238,7 @@ def _write(path: Path, splats: Splats) -> str:
         folder, cells, splats.count, splats.names, lambda done: splats.done(done, len(cells))
     )  # fmt: skip
     levels = " + ".join(map(str, size.counts))
-    files = f"{size.chunks} SOG{'s' * (size.chunks != 1)}"
-    return f"wrote {folder / INDEX}: {levels} Gaussians in {files}, {size.bytes / 1e6:.1f} MB"
+    return f"wrote {folder / INDEX}: {levels} Gaussians in {counted(size.chunks, 'SOG')}, {size.bytes / 1e6:.1f} MB"
 
 
 WRITER = Writer(

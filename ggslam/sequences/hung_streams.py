@@ -13,6 +13,7 @@ from ggslam.sequences.glances import Glance, glance_of
 from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.verdicts import Verdict
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
@@ -66,7 +67,8 @@ def _judge(sequence: Sequence, glances: list[Glance], kind: str, spans: Spans) -
         return []
     frames = sum(one.last - one.first + 1 for one in found)
     where = numbers_of(sequence, found)
-    where += f" and in {len(found) - HungTuning.max_named} more places" if len(found) > HungTuning.max_named else ""
+    more = len(found) - HungTuning.max_named
+    where += f" and in {counted(more, 'more place')}" if more > 0 else ""
     same, other = ("colour", "depth") if kind == "color" else ("depth", "colour")
     told = f"{frames} of {len(sequence)} frames, {where},"
     if all(one.blank for one in found):

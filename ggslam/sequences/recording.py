@@ -15,6 +15,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.depth_kind import PLAIN, DepthKind
+from ggslam.system.plurals import agreeing
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted_text
 
@@ -283,7 +284,7 @@ class Recording:
         self.poses, self.pose_source = poses, source
         without = len(poses) - known
         if without or reasons:
-            have = "has" if without == 1 else "have"
+            have = agreeing(without, "has", "have")
             self.warnings.append(
                 f"{source}: {without} of {len(poses)} frames {have} no true pose; scores are over the other "
                 f"{known}{first}"

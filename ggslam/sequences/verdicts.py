@@ -11,6 +11,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from ggslam.system.plurals import agreeing, counted
 from ggslam.system.tuning import Tuning
 
 Severity = Literal["doubtful", "wrong"]
@@ -193,8 +194,11 @@ def judge_times(timestamps: np.ndarray, nominal: bool = False) -> list[Verdict]:
             VerdictTuning.missing_s, 6 * usual
         ):
             place = "numbers of the images" if nominal else "timestamps"
-            length = f"{round(intervals[longest] / usual) - 1} frames" if nominal else f"{intervals[longest]:.2f} s"
-            text = f"about {missing} frames are missing in {len(gaps)} gaps of the {place}"
+            length = (
+                counted(round(intervals[longest] / usual) - 1, "frame") if nominal else f"{intervals[longest]:.2f} s"
+            )
+            are = agreeing(missing, "is", "are")
+            text = f"about {counted(missing, 'frame')} {are} missing in {counted(len(gaps), 'gap')} of the {place}"
             text += f" (the longest: {length} before frame {longest + 1})"
             verdicts.append(Verdict("frames_missing", "doubtful", f"{text}; record to a faster disk, or fewer pixels"))
     return verdicts
