@@ -84,7 +84,7 @@ class CondensedGraph:
         lengths = [(2 * graph.at(odometry + k).error(found)) ** 0.5 for k in range(len(self.loops))]
         return np.asarray(optimiser.getWeights()).reshape(-1)[odometry:] > 0.5, limit, np.array(lengths)
 
-    def settle(self, gtsam: ModuleType, believed: np.ndarray) -> tuple[float, float]:
+    def optimize(self, gtsam: ModuleType, believed: np.ndarray) -> tuple[float, float]:
         """Moves the kept nodes to agree with the believed closures; returns the error before and after."""
         graph, values = self._problem(gtsam, believed)
         before = graph.error(values)

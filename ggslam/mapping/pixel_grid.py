@@ -64,12 +64,12 @@ class PixelGrid:
         return low_pass / self.stride**2
 
 
-WHOLE = PixelGrid()
+ALL_PIXELS = PixelGrid()
 
 
 def grid_of_turn(turn: int, camera: Camera) -> PixelGrid:
     """The grid of a view's next step, of which `turn` counts those before: every second pixel. In four turns each
     pixel comes once."""
     if min(camera.width, camera.height) < 2 * PixelGridTuning.min_size:
-        return WHOLE
+        return ALL_PIXELS
     return PixelGrid(2, *_ORDER[turn % 4])

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ggslam.movers.found import Kind
+from ggslam.movers.mover_table import Kind
 from ggslam.movers.patches import Patch
 from ggslam.movers.surface import MoverSurface, PatchFit
 from ggslam.scene.poses import inverse, orthonormalize, se3_exp, so3_log

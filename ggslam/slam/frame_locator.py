@@ -97,7 +97,7 @@ class FrameLocator:
                 result, early = self._try_new_part(frame, result, self._loops, takes_keyframes)
         if result.status is not TrackingStatus.LOST:
             self.part_start.forget()
-            self.left_parts.settle()
+            self.left_parts.forget_targets()
         result = self.color_poses.align(frame, result)
         return Located([frame], result, [result], early)
 

@@ -72,7 +72,7 @@ class LeftParts:
         if motion.reference_view is not None:
             self.parts = [*self.parts, LeftPart(keyframe, T_world_keyframe.copy(), motion)][-LeftPartTuning.max_parts:]
 
-    def settle(self) -> None:
+    def forget_targets(self) -> None:
         """The camera is located: what was gathered to find it is not needed."""
         for part in self.parts:
             part.target = None

@@ -179,7 +179,7 @@ class LoopCloser:
         """A keyframe was made of a frame, and its points are in the surface. Puts aside and takes back keyframes.
 
         Returns:
-            The correction if this closes a loop; `settle` it.
+            The correction if this closes a loop. `apply` it.
         """
         start = time.perf_counter()
         with self._lock:
@@ -203,8 +203,8 @@ class LoopCloser:
         self.seconds += time.perf_counter() - start
         return correction
 
-    def settle(self, correction: Correction) -> None:
-        """Takes over the poses of a correction; the surface is arranged accordingly."""
+    def apply(self, correction: Correction) -> None:
+        """Moves the tracked surface to the poses of a correction."""
         with self._lock:
             self._surface.arrange(correction.active, correction.T_world_camera)
             self._verified.clear()
@@ -383,8 +383,8 @@ class LoopCloser:
         Returns:
             As `add`; None if too few of the places agree.
         """
-        olds, news = self.parts.members(older), self.parts.members(younger)
-        agreeing = links_between(links, olds, news, self.poses, self.settings.graph)
+        old_members, new_members = self.parts.members(older), self.parts.members(younger)
+        agreeing = links_between(links, old_members, new_members, self.poses, self.settings.graph)
         if len(agreeing) < self.settings.confirmations:
             return None
         loops = [self.graph.add_loop(k.old, k.new, k.T_old_new, k.information) for k in agreeing]
@@ -393,7 +393,7 @@ class LoopCloser:
             return None
         self._note_joined(-1, agreeing[0].old, agreeing[0].new)
         T_new_old = result.poses @ inverse(self.poses.array())
-        return Correction(result.poses, T_new_old, olds, news, olds | news)
+        return Correction(result.poses, T_new_old, old_members, new_members, old_members | new_members)
 
     def begin_part(self, frame: Frame, first: int) -> None:
         """A lost frame, which will be added as a keyframe, begins a part; `first`: index of its first frame."""

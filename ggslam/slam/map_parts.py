@@ -19,7 +19,7 @@ from ggslam.loops.agreement import GroundLink
 from ggslam.loops.parts import KeyframeParts
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.mapper import Mapper
-from ggslam.movers.found import FoundMover
+from ggslam.movers.mover_table import FoundMover
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.slam.frame_poses import FramePoses
@@ -49,8 +49,8 @@ class MapParts:
     ) -> None:
         self._mapper, self._poses, self._corrections, self._loops = mapper, poses, corrections, loops
 
-    def settle(self) -> None:
-        """After the last frame; does nothing where there is one part."""
+    def join_parts(self) -> None:
+        """Joins the parts of the map after the last frame, where they have places in common."""
         loops = self._loops
         if loops is None or self._mapper.left_out or len(loops.parts.all()) < 2:
             return

@@ -13,7 +13,7 @@ import numpy as np
 from ggslam.errors import ConfigError
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import MapperTimes
-from ggslam.movers.found import FoundMover
+from ggslam.movers.mover_table import FoundMover
 from ggslam.objects.lookup import objects_at
 from ggslam.objects.table import ObjectTable, Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap

@@ -153,8 +153,8 @@ class GaussianCells:
             self._forget(key)
         return slice(begin, len(gaussians))
 
-    def settle(self) -> None:
-        """Removes what lies in the store of cells whose Gaussians are all in memory, or in other cells, now."""
+    def remove_emptied(self) -> None:
+        """Removes cells from the store whose Gaussians are now all in memory or in other cells."""
         for key in sorted(self._emptied):
             self.store.remove(key)
         self._emptied.clear()

@@ -15,7 +15,7 @@ from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.ply import read_ply
 from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.report.mover_pictures import draw_movers
-from ggslam.movers.found import FoundMover
+from ggslam.movers.mover_table import FoundMover
 from ggslam.movers.point_files import POINTS_FILE, points_from_arrays, points_to_arrays
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.movers import MoversRecord

@@ -141,7 +141,7 @@ def test_settled_store_holds_nothing_else(cells_for) -> None:
     cells.move_out(gaussians, cells.cells_of(gaussians))
     home = cells.sorted_keys()[:5]
     cells.move_in(gaussians, home)
-    cells.settle()
+    cells.remove_emptied()
     assert cells.store.cells() == cells.sorted_keys() and not set(home) & set(cells.store.cells())
 
 

@@ -72,7 +72,7 @@ class KeyframeExposures:
         if counts != [count] * 3:
             raise FormatError(f"exposures: expected those of {count} keyframes, found {counts}")
 
-    def adopt(self, count: int) -> None:
+    def load(self, count: int) -> None:
         """Starts with so many keyframes of an earlier run, whose exposures are what they are."""
         self.optimizers = [ExposureAdam(self.settings) for _ in range(count)]
         self.known, self.blind, self.found_lit = [True] * count, [False] * count, count > 0

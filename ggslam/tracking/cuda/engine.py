@@ -115,7 +115,7 @@ class CudaTrackingEngine:
         self.library.call("align", ctypes.byref(job))
         source.send()  # some hundred kilobytes, so that a keyframe has them without another wait
         found = self._results.wait()
-        source.settle(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
+        source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
         return cuda_alignment(found, matched, settings)
 
     def _aligning_memory(self, job: AlignJob) -> torch.Tensor:
