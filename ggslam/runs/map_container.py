@@ -24,6 +24,7 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -52,8 +53,8 @@ from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.container import CONTAINER_FORMAT, CONTAINER_VERSION, ContainerRecord
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import FileRecord, RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
+from ggslam.runs.records.run_json import FileRecord, RunRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points
@@ -76,7 +77,8 @@ _NEEDED = (
 )  # fmt: skip
 _PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, *MOVER_FILES, TABLE, _CLASSIFIER)
 _MEMBERS = frozenset((_HEAD, MAP, _PLACES, PLACES_FILE, *_NEEDED, *_PERHAPS))
-_MOST_KEYFRAMES = (1 << 16) - 2
+_MOST_KEYFRAMES: Final = (1 << 16) - 2
+"""Largest number of a keyframe: 16 bits hold it plus 1."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ggslam.submaps.visit_files import visit_file
 from ggslam.system.atomic import make_folder
 from ggslam.system.process_memory import most_memory_bytes
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, copy_untrusted
+from ggslam.system.untrusted_files import FileTuning, copy_untrusted
 
 
 class StoreCopyTuning(Tuning):
@@ -99,6 +99,6 @@ def _copy_beside(source: Path, target: Path, visits: Sequence[str]) -> list[Path
     for file, copy in known:
         if file.is_file():
             copy.parent.mkdir(exist_ok=True)
-            copy_untrusted(file, copy, MAX_TEXT_BYTES)
+            copy_untrusted(file, copy, FileTuning.max_text_bytes)
             written.append(copy)
     return written
