@@ -236,7 +236,7 @@ def full_memory(*_: object) -> None:
 
 def test_devices_that_cannot_be_had_are_said_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(ConfigError, match="device: cuda: .*NVIDIA GPU"):
+    with pytest.raises(ConfigError, match="device: cuda"):
         run_library(Config(device="cuda"))
     assert run_library(Config()) == (None, None)
     library, reason = run_library(Config(device="auto"))
