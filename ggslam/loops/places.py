@@ -107,9 +107,9 @@ class PlaceIndex:
         count, ferns = len(self._numbers), self.settings.ferns
         sized = len(self._places) == count <= len(self._codes) and self._codes.shape[1] == ferns
         if not sized or self._positions != {number: position for position, number in enumerate(self._numbers)}:
-            raise FormatError("places: not those of their keyframes")
+            raise FormatError("places do not match their keyframes")
         if any(len(place.codes) != ferns or len(place.words) for place in self._places):
-            raise FormatError("places: not of this program's features")
+            raise FormatError("places: their features are of another kind")
 
     def __contains__(self, number: int) -> bool:
         return number in self._positions
@@ -248,4 +248,4 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], ferns: int) -> None:
     if len(arrays["points"]) != landmarks:
         raise FormatError(f"places: 'points' has {len(arrays['points'])} rows, expected {landmarks}")
     if len(np.unique(arrays["numbers"])) != len(arrays["numbers"]):
-        raise FormatError("places: a keyframe has two")
+        raise FormatError("places: a keyframe has two places")

@@ -150,7 +150,7 @@ class LoopCloser:
         counts = [count, len(self.poses), len(self.graph), len(self.places), len(self.activity), len(self.revisits)]
         counts.append(len(self.parts.of))
         if len(set(counts)) > 1:
-            raise FormatError(f"loops: numbers of keyframes that do not agree: {counts}")
+            raise FormatError(f"loops: the parts of the state disagree about the number of keyframes: {counts}")
         named = [keyframe for found in self._verified for keyframe in (found.keyframe, found.old_keyframe)]
         named += [] if self._found_at is None else [self._found_at[1]]
         check_indices("loops", named, count)
@@ -494,7 +494,7 @@ class LoopCloser:
         places = {name.removeprefix("places_"): a for name, a in arrays.items() if name.startswith("places_")}
         self.places = PlaceIndex.from_arrays(self._camera, places, self.settings.places)
         if not np.array_equal(arrays["poses"], self.poses.array()):
-            raise FormatError("places and surfaces: not of the same keyframes")
+            raise FormatError("places and surfaces belong to different keyframes")
         for number, (T, depth) in enumerate(zip(self.poses, arrays["median_depths"], strict=True)):
             self.graph.add_node(T)
             T_before_this = inverse(self.poses[number - 1]) @ T if number else np.eye(4)
@@ -505,7 +505,7 @@ class LoopCloser:
             self._taken.append((None, 0))
             self.activity.add(T, float(depth))
         if not len(self) == len(self.places) == len(self._surface):
-            raise FormatError("places, poses and surfaces are not of the same keyframes")
+            raise FormatError("places, poses and surfaces belong to different keyframes")
         self.activity.active = set()
 
 

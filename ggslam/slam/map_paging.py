@@ -233,7 +233,7 @@ class MapPager:
         if excess > 0 and not self._told:
             self._told = True
             self.budget.notes.append(
-                f"the map's part of the memory limit holds {self._rows()} Gaussians, but {self._rows() + excess} are "
-                "in view of one keyframe: the limit will be exceeded (a larger memory_limit_mb, a smaller `scale` or "
-                "paging.view_range helps)"
+                f"the map's part of the memory limit holds {self._rows()} Gaussians, but one keyframe sees "
+                f"{self._rows() + excess}: the limit will be exceeded. Raise memory_limit_mb, or lower `scale` or "
+                "paging.view_range"
             )

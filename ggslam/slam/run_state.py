@@ -105,7 +105,7 @@ class RunState:
             ConfigError: memory is limited, and maps made before are taken whole.
         """
         if self.pager is not None:
-            raise ConfigError("memory_limit_mb: a run that starts in the map of another (`map`) has no limit of memory")
+            raise ConfigError("memory_limit_mb: cannot be combined with starting in the map of another run (`map`)")
         self.objects.learned, self.poses.keyframes_made = objects, len(keyframes)
         self.mapper.load_map(gaussians, keyframes)
         if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:

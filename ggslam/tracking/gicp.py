@@ -127,7 +127,7 @@ class GicpTarget:
         positions = np.ascontiguousarray(np.zeros((1, 3)) if camera_positions is None else camera_positions, np.float32)
         target.voxel = settings.voxel if voxel is None else voxel
         if base is not None and base.composed_with is not None:
-            raise ValueError("a target that was composed of parts grows by parts")
+            raise ValueError("a target composed of parts can only grow by parts")
         arrays = (means, quaternions, log_scales, opacity_logits)
         given = structures.TargetInput(
             *(address(a) for a in arrays), None if birth is None else address(birth),

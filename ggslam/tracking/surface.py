@@ -55,7 +55,7 @@ def check_surface_arrays(arrays: Mapping[str, np.ndarray]) -> None:
     if np.abs(arrays["reach"]).max(initial=0) > PoseForm.FARTHEST_M:
         raise FormatError(f"surface: 'reach': expected points within {PoseForm.FARTHEST_M:g} m of their keyframes")
     if arrays["counts"].astype(np.int64).sum() != len(arrays["points"]):
-        raise FormatError("surface: points do not fit their numbers")
+        raise FormatError("surface: the counts do not add up to the number of points")
 
 
 @savable(fixed="_arrays", check="check")

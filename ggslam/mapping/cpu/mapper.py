@@ -70,7 +70,7 @@ class CpuMapper(Mapper):
         if self.identity is not None:
             self.identity.check(self.keyframes)
         if not self._mean.fits(self.map):
-            raise FormatError("the mean of the map: not of its Gaussians")
+            raise FormatError("the mean of the map does not match its Gaussians")
         self.map.check(count)
 
     def __init__(
