@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of frames by colour against the map: at the end where depth is noisy, and all along where it errs more than its
-images show."""
+"""Photometric alignment of frames to the map: at the end of a run where depth is noisy, and throughout where depth is
+further off than its own noise shows."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where is the camera? It is aligned to the map; a lost one is looked up among known places, or begins a new part."""
+"""Locates frames by alignment to the map. A lost camera is located by known places or starts a new part."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 @dataclass(frozen=True)
 class Located:
-    """The frames of one instant, one of each camera: where they are.
+    """The poses of the frames of one instant, one frame of each camera.
 
     Attributes:
         frames: as they were located.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the camera was last known in the parts of the map that it left.
+"""The last known pose of the camera in each part of the map that it left.
 
 What made the camera lose its way may have been a thing that covered the view for a while, and that a part began with.
 Once it is gone, the camera is where it was lost, or near.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places, verification and pose graph at work in the loop: what `Slam` asks after each keyframe and when it is lost."""
+"""Loop closing: `Slam` calls it after each keyframe and when the camera is lost."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from ggslam.tracking.tracker import Tracker, TrackingResult
 @savable()
 @dataclass(frozen=True)
 class LoopEvent:
-    """What came of a candidate, or of a frame that was lost.
+    """The outcome for a candidate, or for a lost frame.
 
     Attributes:
         kind: "closed", "verified" (believed later or never), "refused", "found again"; "new part", "joined",
@@ -95,7 +95,7 @@ class _Found:
     not_saved="settings comparison _camera _surface _tracker _lock _helper _begun", growing="events", check="check"
 )
 class LoopCloser:
-    """Remembers every keyframe's place and odometry; finds loops, and lost frames.
+    """Stores the place and odometry of every keyframe, and finds loops and lost frames.
 
     All methods may be called from tracker and mapper thread.
 

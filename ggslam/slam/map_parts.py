@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a run when it ends: those that have places in common become one, of the others one is the result.
+"""Joins the parts of a run at its end. Parts with places in common become one; the result is the largest.
 
 Parts that nothing joins lie at arbitrary places. They must not be in one map, nor in one trajectory: the largest stays,
 in a world that begins with its first keyframe; the frames of the others count as lost.
@@ -35,7 +35,7 @@ PART_EVENTS = ("new part", "left out")
 
 @savable(not_saved="_mapper _poses _corrections _loops")
 class MapParts:
-    """Makes one part of those there are.
+    """Joins the parts of a run.
 
     Args:
         mapper: whose map they are in.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run gives: poses of its frames, keyframes, map, objects, times."""
+"""The result of a run: poses of its frames, keyframes, map, objects and times."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ggslam.tracking.tracker import TrackingStatus
 @savable()
 @dataclass(frozen=True)
 class TrackedFrame:
-    """What is remembered of every frame.
+    """The record of a frame.
 
     Attributes:
         frame_index, source_index, timestamp: of the `Frame`.
@@ -55,7 +55,7 @@ class TrackedFrame:
 
 @dataclass
 class StepReport:
-    """What one step did.
+    """The outcome of one step.
 
     Attributes:
         frame: how the frame was tracked.
@@ -150,7 +150,7 @@ class LostStretch:
 
 @dataclass
 class SlamResult:
-    """A run.
+    """The result of a run.
 
     Attributes:
         gaussians: the map.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run holds: its parts, wired together, and what there is so far."""
+"""The state of a run: its parts, wired together, and its results so far."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts on a run, from what it kept of its frames and keyframes: a fraction of a second at the end."""
+"""Judges a run by the records of its frames and keyframes. Takes a fraction of a second at the end of the run."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def _judge_dropped(result: SlamResult) -> list[Verdict]:
     dropped, total = result.dropped_frames, len(result.frames) + len(result.dropped_frames)
     if len(dropped) < max(VerdictTuning.min_frames, VerdictTuning.dropped_share * total):
         return []
-    text = f"{len(dropped)} of {total} frames were dropped (the first: {dropped[0]}): tracking was slower than the camera"
+    text = f"{len(dropped)} of {total} frames were dropped (the first: {dropped[0]}): tracking was too slow"
     return [Verdict("dropped", "doubtful", f"{text}; choose a lower rate, a smaller `scale` or a faster machine")]
 
 

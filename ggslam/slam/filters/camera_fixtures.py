@@ -61,7 +61,7 @@ class FixtureTuning(Tuning):
 @savable()
 @dataclass
 class CameraFixtures(FrameFilter):
-    """Looks at the first located frames that are apart from one another.
+    """Detects fixtures in the first located frames that are apart from one another.
 
     Attributes:
         mask: bool [H, W], what is fixed to the camera; None: nothing, as far as is known.
