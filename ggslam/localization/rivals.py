@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other places where a scan matches as well as where it was located.
+"""Finds other places where a scan matches as well as at its pose.
 
 Along a plain corridor any place matches, along one with niches a shifted place matches nearly as well as the right one,
 and between pillars at equal distances there are places that cannot be told apart. The information of the matches does

@@ -83,7 +83,7 @@ class SearchSettings(SearchTuning):
 
 @dataclass(frozen=True)
 class ScanMatch:
-    """How a scan lies in the map.
+    """A scan, aligned to the map.
 
     Attributes:
         found: the alignment of the points that the map can contain.

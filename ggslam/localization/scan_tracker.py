@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Locates laser scans in the surface that the map shows around the sensor."""
+"""Locates laser scans in the part of the map around the sensor."""
 
 from __future__ import annotations
 

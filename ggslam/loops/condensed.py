@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose graph cut down to the nodes that closures touch.
+"""The pose graph, reduced to the nodes that closures touch.
 
 Odometry alone is a chain without contradictions. Between the keyframes that closures touch it is taken as one factor,
 its covariance being the sum along the chain; what a correction does to the keyframes in between follows from the same

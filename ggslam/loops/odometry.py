@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry as dead reckoning, with the covariance that gathers along it."""
+"""Odometry as dead reckoning, with its growing covariance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ggslam.system.savable import savable
 @savable(growing="parents poses covariances steps", check="check")
 @dataclass
 class OdometryTree:
-    """Odometry as dead reckoning: every node hangs on an earlier one.
+    """Odometry as dead reckoning: every node is linked to an earlier one.
 
     `poses` are relative to the first node; `covariances` of their left twists in its frame; `steps` the covariance of
     the last motion alone, in the frame of the node it starts from.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which old keyframes see the same place: an index without vocabulary file and without training.
+"""Finds old keyframes that may show the same place. Needs no vocabulary file and no training.
 
 Words are bits sampled from ORB descriptors (locality-sensitive hashing: P. Indyk, R. Motwani, STOC 1998): descriptors
 alike share most of their bits and so some of their words. An inverted list per word (J. Sivic, A. Zisserman, ICCV
@@ -39,7 +39,7 @@ class FernTuning(Tuning):
 @savable()
 @dataclass(frozen=True)
 class Place:
-    """What a view is known by.
+    """The description of a view.
 
     Attributes:
         landmarks: its features with depth.
@@ -65,7 +65,7 @@ class PlaceMatch:
     after="list_again", check="check",
 )  # fmt: skip
 class PlaceIndex:
-    """Keyframes by what they look like.
+    """An index of keyframes by appearance.
 
     Args:
         camera: of all views.

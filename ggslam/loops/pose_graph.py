@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of keyframe poses: odometry, closures, and which of the closures to believe.
+"""The graph of keyframe poses: odometry, closures, and the selection of closures that agree.
 
 Two tests decide. Each closure alone must be reachable by drift: the correction it asks for is compared with the summed
 covariance of the odometry between its ends (a chi-square test; closures that err in unison do not pass either). Taken
@@ -64,7 +64,7 @@ def closure_covariance(T_i_j: np.ndarray, information: np.ndarray, settings: Gra
 
 @dataclass(frozen=True)
 class GraphResult:
-    """Poses that satisfy odometry and the believed closures.
+    """Poses that satisfy odometry and the accepted closures.
 
     Attributes:
         poses: float64 [n, 4, 4], T_world_camera of all nodes; the first stays where it was.

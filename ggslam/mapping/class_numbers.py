@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which class of the classifier each object id has, and what a new class begins with; the same on every device."""
+"""Maps object ids to classes of the classifier and initializes new classes, equally on every device."""
 
 from __future__ import annotations
 

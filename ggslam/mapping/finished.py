@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training of finished maps: of a run, of a store's cell, at the seams of merged and updated runs."""
+"""Training of finished maps: of a run, of a cell of a store, and at the seams of merged and updated runs."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def train_by_turns(
 
 
 class StillMapper(CpuMapper):
-    """Trains a finished map: poses and exposures stay as they are, nothing is inserted.
+    """Trains a finished map. Poses and exposures are fixed, and nothing is inserted.
 
     Args:
         gaussians: the map.

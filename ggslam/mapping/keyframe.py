@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame that the map is trained on."""
+"""Keyframes: frames that the map is trained on."""
 
 from __future__ import annotations
 

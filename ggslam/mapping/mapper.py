@@ -103,7 +103,7 @@ class LossSums:
 
 
 class TrainingRasterizer(Protocol):
-    """What the mapper needs of a rasterizer besides rendering: the backward pass with the optimizer in it."""
+    """The part of a rasterizer that training needs: a backward pass that includes the optimizer step."""
 
     def backward_step(
         self, map: GaussianMap, grad_image: torch.Tensor | None, grad_depth: torch.Tensor | None = None,

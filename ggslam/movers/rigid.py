@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a mover is, frame after frame, by the surface that it showed before; whether it is one rigid thing."""
+"""Tracks a rigid mover by its surface, and decides whether it is rigid."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells movers from one another, and follows each from before it began to move until it has come to rest."""
+"""Tracks movers, each from before it starts to move until it rests."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Named arrays and files in few bytes, without loss: LZMA (the .xz format), of arrays after what makes them alike.
+"""Packs named arrays and files without loss: LZMA (the .xz format) after transforms that make arrays more regular.
 
 An array is compressed as it lies, as planes (the first bytes of all numbers, then the second ones), or as planes of the
 differences from row to row, whichever is smallest.

@@ -171,7 +171,7 @@ def native_target_settings(settings: TargetSettings, voxel: float) -> structures
 
 
 class AlignmentStatus(enum.Enum):
-    """What an alignment is worth."""
+    """How reliable an alignment is."""
 
     OK = "ok"
     DEGENERATE = "degenerate"
@@ -206,7 +206,7 @@ class MatchSource(Protocol):
 
 @dataclass(frozen=True)
 class AlignmentResult:
-    """Where the frame is and how well that is known.
+    """The pose of a frame and its certainty.
 
     Attributes:
         T_world_camera: float64 [4, 4].
@@ -261,7 +261,7 @@ class GicpTuning(Tuning):
 
 @dataclass(frozen=True)
 class PhotometricPart:
-    """What grey values contribute to an alignment: points of the frame, what they are compared with, and how."""
+    """The photometric terms of an alignment: points of the frame, the image they are compared with, and settings."""
 
     points: PhotometricPoints
     reference: PhotometricReference

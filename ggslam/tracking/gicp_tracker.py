@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tracker that aligns frames by G-ICP, with the way back after it was lost."""
+"""The tracker that aligns frames by G-ICP and recovers when the camera is lost."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surface that the tracker aligns to: the Gaussians of the keyframes as they were measured.
+"""The surface that the tracker aligns to: points of the keyframes as they were measured.
 
 G-ICP models each measured point as a Gaussian on its surface; a keyframe's points are such Gaussians. Trained for
 looks, a map's Gaussians wander: blended along the ray they give the right colour and depth, while each of them alone

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every tracker promises: it locates frame after frame against a target that someone else keeps up to date."""
+"""The interface of trackers: they locate each frame against a target that the mapper keeps up to date."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TrackingStatus(enum.Enum):
 
 @dataclass(frozen=True)
 class TrackingResult:
-    """Where a frame is.
+    """The pose of a frame.
 
     Attributes:
         T_world_camera: float64 [4, 4]; when lost, the last known pose.
@@ -85,7 +85,7 @@ class TrackingResult:
 @savable(not_saved="camera context target")
 @dataclass
 class TrackerState:
-    """What trackers that work together share.
+    """State that cooperating trackers share.
 
     Attributes:
         camera: of all frames.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposures of the keyframes against the map's, and keyframes whose colours tell nothing."""
+"""Exposures of the keyframes relative to the map, and keyframes whose colours are not used."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class KeyframeExposureTuning(Tuning):
 
 @savable()
 class KeyframeExposures:
-    """What is known of the exposure of each keyframe of one mapper, by number.
+    """Exposures of the keyframes of one mapper, by number.
 
     Args:
         settings: see there.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mapper on an NVIDIA GPU: map, keyframes, losses, optimizers and identity learning are there, and the host only
-starts work.
+"""The mapper on an NVIDIA GPU: map, keyframes, losses, optimizers and identity learning are on the device, and the host
+only starts work.
 
 It waits at a new keyframe (once, for the number of Gaussians to insert and for what the map shows of objects), and when
 poses are read. The losses it reports are those that have arrived without waiting.

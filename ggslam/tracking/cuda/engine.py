@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tracker's work on an NVIDIA GPU: what `CpuTrackingEngine` does, by kernels, with one wait per alignment.
+"""Tracking on an NVIDIA GPU: the work of `CpuTrackingEngine` by kernels, with one wait per alignment.
 
 A frame's depth is sent once. Points, their number, the whole optimisation from the coarse voxels to the fine ones and
 its result stay on the device; the host gets the result in one copy, and waits for that alone. Sums have a fixed order:
