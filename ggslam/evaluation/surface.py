@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far points of a map lie from a surface, and how much of the surface they cover."""
+"""Distance of a map's points from a surface, and how much of the surface they cover."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.errors import InputError
-from ggslam.formats.cubes_to_come import CubesToCome
+from ggslam.formats.pending_cubes import CubesToCome
 from ggslam.formats.surface_discs import SurfaceDiscs, disc_samples
 from ggslam.formats.voxel_cloud import BITS, VoxelCloud, VoxelSums, cloud_of_sums, pack, unpack
 from ggslam.scene.gaussian_map import GaussianMap

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian maps as streamed SOG, version 1: what a viewer loads piece by piece, near places finely, far ones coarsely.
+"""Gaussian maps as streamed SOG, version 1: a viewer loads near places in fine and far ones in coarse levels.
 
 `lod-meta.json` holds a binary tree of boxes. Each leaf has its Gaussians at every level of detail as a run of rows of a
 SOG, `LEVEL_NUMBER/meta.json` and the images beside it (sog.py). Level 0 is the map itself, each coarser one has a

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints of a run, in the folder `checkpoints` of its folder: what it takes to go on after a crash.
+"""Checkpoints of a run, in its folder `checkpoints`: what it needs to continue after a crash.
 
     start.json         what the run was asked to do
     state-000012.bin   the state after some frame; the newest two are kept
@@ -25,8 +25,8 @@ from ggslam.runs.records.start import VERSION, StartRecord
 from ggslam.slam.saved_state import describe_state, restore_state
 from ggslam.slam.slam import Slam
 from ggslam.system.array_file import PendingFile, WrittenFile, read_array_file, write_array_file
+from ggslam.system.array_store import KeptArrays
 from ggslam.system.atomic import make_folder, sync_folder
-from ggslam.system.kept_arrays import KeptArrays
 from ggslam.system.links import refuse_link, refuse_links_below, remove_folder
 from ggslam.system.tuning import Tuning
 

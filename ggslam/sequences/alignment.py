@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether depth lies on colour: outlines of near things in the depth images are laid over the edges of the colour
-images, shifted and scaled, to see where they fit best."""
+"""Checks whether depth is registered to colour: the outlines of near things in depth images are compared with the
+edges of colour images at several displacements and scales."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether depth is what it is taken for: of this camera, this moment, this side, distance along the optical axis. Each
-doubt names its remedy. "wrong" is said only where the evidence is certain: a run refuses to begin then."""
+"""Checks what depth images hold: whether they belong to this camera, this moment and this orientation, and whether
+depth is measured along the optical axis. Each verdict names its remedy. A run refuses to start on "wrong", which
+needs certain evidence."""
 
 from __future__ import annotations
 
@@ -24,18 +25,18 @@ from ggslam.sequences.edge_evidence import (
     look_at_edges,
     stretches,
 )
-from ggslam.sequences.glances import Glance, look_over
 from ggslam.sequences.hung_pairs import judge_hung_pairs
 from ggslam.sequences.hung_streams import judge_hung, spans_of
+from ggslam.sequences.invalid_depth_codes import find_planted_code
 from ggslam.sequences.inverted_depth import Inversion, find_inversion
 from ggslam.sequences.noise_doubts import judge_noise, judge_views
 from ggslam.sequences.orientation import WORDS as ORIENTATIONS
 from ggslam.sequences.orientation import orientation_of
 from ggslam.sequences.plane_evidence import PlaneEvidence, look_at_planes
-from ggslam.sequences.planted_codes import find_planted_code
 from ggslam.sequences.pose_doubts import pairs_apart
 from ggslam.sequences.repeats import find_repeats
 from ggslam.sequences.sequence import Sequence
+from ggslam.sequences.thumbnails import Thumbnail, thumbnails_of
 from ggslam.sequences.triangulation import TruePoints, triangulate
 from ggslam.sequences.verdicts import Verdict, VerdictTuning, judge_inverse_scale
 from ggslam.system.tuning import Tuning
@@ -88,19 +89,19 @@ class DepthDoubts:
 
     def judge(self) -> list[Verdict]:
         """All doubts. One about units, place or kind of depth hides those that it may be the cause of."""
-        found = judge_noise(self._glances, self.sequence.selection)
+        found = judge_noise(self._thumbnails, self.sequence.selection)
         spans = spans_of(self.sequence)
-        hung = judge_hung(self.sequence, self._glances, spans)
+        hung = judge_hung(self.sequence, self._thumbnails, spans)
         found += self._judge_units() if not found else []
         found += self._judge_edges(bool(hung)) if not found else []
         found += self._judge_measure() if not found else []
-        still = judge_views(self.sequence, self._glances)
+        still = judge_views(self.sequence, self._thumbnails)
         pairs = judge_hung_pairs(self.sequence, spans)
         return [*found, *self._judge_repeats(hung), *pairs, *self._judge_codes(), *still]
 
     @cached_property
-    def _glances(self) -> list[Glance]:
-        return look_over(self.sequence)
+    def _thumbnails(self) -> list[Thumbnail]:
+        return thumbnails_of(self.sequence)
 
     @cached_property
     def spread(self) -> list[Frame]:

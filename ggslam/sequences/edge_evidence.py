@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How depth lies on colour, by outlines and edges over stretches of successive frames: as it stands, mirrored or
-turned, against the colour of other frames, and enlarged about the centre."""
+"""Compares outlines of depth with edges of colour over stretches of frames: as stored, mirrored or turned, against
+neighbouring frames, and enlarged."""
 
 from __future__ import annotations
 

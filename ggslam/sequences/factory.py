@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening a recording: recognising its format and selecting a part of it."""
+"""Opens a recording: recognises its format and selects a part of it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the focal length fits: two points of a rigid scene are as far apart in one view as in another, but only with
-the right one, once the camera has turned between the views."""
+"""Checks the focal length: the distance between two points of a rigid scene is the same in two views only if the
+focal length is right, once the camera has turned."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live cameras: what one has to offer, opening one by its name, and a run's view of one.
+"""Live cameras: their interface, how they are opened by name, and how a run reads one.
 
 Anything with a camera and an iterator of frames is a source:
 

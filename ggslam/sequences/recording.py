@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording format hands over: where the images of each frame are and how to read them."""
+"""What a recording format provides: where the images of each frame are and how to read them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images that a recording holds several times: the same depth beside new colour, or the same colour beside new
-depth."""
+"""Finds images that repeat: the same depth with new colour, or the same colour with new depth."""
 
 from __future__ import annotations
 

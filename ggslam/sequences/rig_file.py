@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""rig.yaml: cameras that are fixed to one another, and the recording that each of them made.
+"""rig.yaml: the cameras of a rig, their poses on it and their recordings.
 
     cameras:
       - name: front

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looking the recordings of a rig over before working with them: which images belong together, what seems wrong."""
+"""Inspects the recordings of a rig before they are used: which images belong together, what seems wrong."""
 
 from __future__ import annotations
 

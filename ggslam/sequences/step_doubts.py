@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether colour and depth are of the same moment: outlines of a depth image are laid on the edges of the colour image
-of its own frame and of those before and after."""
+"""Checks whether colour and depth are of the same moment: outlines of a depth image are compared with the colour
+edges of its own frame and of its neighbours."""
 
 from __future__ import annotations
 

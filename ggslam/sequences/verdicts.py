@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts on recordings and runs: what seems wrong, with the number that says so, and what to do about it.
+"""Verdicts on recordings and runs: what seems wrong, the number that shows it, and the remedy.
 
 Here are those that the numbers of a recording alone allow; `ggslam inspect` and runs tell them in the same words.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One room at two visits: things were moved, turned, taken away and put there in between."""
+"""One room at two visits: objects are moved, turned, taken away and added in between."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves while a generated recording is made, as the casting of rays and the truth need it."""
+"""Motion of objects in a generated recording, for the ray caster and the ground truth."""
 
 from __future__ import annotations
 

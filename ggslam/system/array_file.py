@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file of arrays and a tree of plain values beside them, with a checksum: written once, read whole, never executed.
+"""A file of arrays with a tree of plain values and a checksum. It is written once, read whole and never executed.
 
 Layout: magic, length of the header (uint64), header (JSON: table of the arrays, values), the arrays one after the other
 at multiples of 64 bytes, and the CRC-32 of everything before it (uint32). Numbers are little-endian.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How settings are declared: once, with range, unit, level and text, and checked whenever a value is given.
+"""Declares settings with their range, unit, level and text, and checks every value.
 
     @tuning_class(frozen=True)
     class PhotometricTuning:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether what a file put into an object is what its class declares there, or what its constructor put there."""
+"""Checks values from a file against the types that the class declares, or that its constructor set."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ggslam.formats.cubes_to_come import CubesToCome
+from ggslam.formats.pending_cubes import CubesToCome
 from ggslam.formats.voxel_cloud import VoxelCloud, VoxelSums, cloud_of_sums, pack
 from ggslam.geometry.scene_size import surface_reach
 from ggslam.geometry.voxels import neighbour_step, voxel_keys

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""verdict.json: how good a run is, told by its own figures."""
+"""verdict.json: the quality of a run, judged by its own figures."""
 
 from __future__ import annotations
 

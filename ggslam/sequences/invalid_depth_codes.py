@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers in depth images that are no distance: one that many pixels of all images hold, beyond all that is
-measured."""
+"""Detects numbers in depth images that mean "not measured": one number, beyond all real depth, in many pixels of all
+images."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What never changes, written once: arrays and parts of growing lists, gathered into files by number, to which trees of
-objects (`object_tree`) refer."""
+"""Stores arrays and parts of growing lists once, in numbered files, to which trees of objects (`object_tree`) refer."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cubes of space a sweep is done with, when what comes is cut in sections."""
+"""Tells which cubes of space are finished while a map is processed section by section."""
 
 from __future__ import annotations
 
