@@ -59,7 +59,7 @@ from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
-from ggslam.scene.arrays import MAX_EXPANDED_BYTES, MAX_RATIO, arrays_of, arrays_to_bytes, read_all_arrays
+from ggslam.scene.arrays import ArrayLimits, arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.packed_arrays import pack_arrays, pack_bytes, unpack_arrays, unpack_bytes
@@ -270,7 +270,7 @@ def open_container(path: Path) -> Container:
         told = head.files.get(name)
         if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
             raise FormatError(f"{path}: {name} is damaged: not the content that {_HEAD} tells the checksum of")
-    left = max(MAX_EXPANDED_BYTES, MAX_RATIO * sum(sizes.values()))
+    left = max(ArrayLimits.max_bytes, ArrayLimits.max_ratio * sum(sizes.values()))
     expanded = dict[str, bytes]()
     for member, content in members.items():
         name, inner = _expand(path, member, content, left)
@@ -288,7 +288,7 @@ def _expand(path: Path, name: str, content: bytes, left: int) -> tuple[str, byte
     if not name.endswith(_XZ):
         return name, content
     try:
-        return name.removesuffix(_XZ), unpack_bytes(content, min(MAX_EXPANDED_BYTES, left))
+        return name.removesuffix(_XZ), unpack_bytes(content, min(ArrayLimits.max_bytes, left))
     except FormatError as error:
         raise FormatError(f"{path}: {name}: {error}") from None
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, field
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import pydantic
@@ -26,7 +26,8 @@ from ggslam.system.atomic import write_bytes
 from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
 OBJECTS_FILE = "objects.json"
-VERSION = 1
+VERSION: Final = 1
+"""Version of the file's format."""
 Kind = Literal["added", "removed", "moved", "look", "unseen"]
 _Coordinate = Annotated[int, pydantic.Field(ge=-LIMIT, le=LIMIT)]
 _Cell = tuple[_Coordinate, _Coordinate, _Coordinate]
