@@ -21,7 +21,7 @@ class SurfaceScoreTuning(Tuning):
 
 @dataclass(frozen=True)
 class SurfaceScores:
-    """Points against a surface.
+    """Scores of points against a surface.
 
     Attributes:
         median_m, p95_m: distance of the points from the surface, metres: half of them, 95 % of them are nearer.

@@ -85,7 +85,7 @@ class GaussianRows:
 
 
 class GaussiansInMemory(GaussianRows):
-    """A map that is in memory, as if it were a file.
+    """A map in memory with the interface of a file.
 
     Args:
         path: of the file that it came from.

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 
-class CubesToCome:
-    """Tells which cubes no section to come reaches.
+class PendingCubes:
+    """Tells which cubes no later section reaches.
 
     Args:
         of_section: the cubes that each reaches into: keys int64, each once; None: into any.

@@ -53,7 +53,7 @@ class StreamedSogTuning(Tuning):
 
 @dataclass(frozen=True)
 class StreamedSize:
-    """What was written: Gaussians of each level, files of SOG, bytes."""
+    """Gaussians of each level, SOG files and bytes that were written."""
 
     counts: tuple[int, ...]
     chunks: int
@@ -102,7 +102,7 @@ def write_streamed_sog(
 
 @dataclass
 class _Level:
-    """What there is of a level: rows of the SOG that is being gathered, its number in `filenames`, those before it."""
+    """The state of a level: rows of the current SOG, its number in `filenames`, and the files before it."""
 
     file: int = -1
     chunks: int = 0

@@ -29,7 +29,7 @@ MADE_LATER = ("metrics.json", "frames.csv", "verdict.json", "report.html", "grou
 
 @dataclass(frozen=True)
 class Problem:
-    """Something in a run's folder that is not as the manifest says.
+    """A difference between a run's folder and its manifest.
 
     Attributes:
         name: of the file.

@@ -56,7 +56,7 @@ _log = logging.getLogger(__name__)
 
 
 class MapFile(RunFolder):
-    """A run of which there is only a map, in a file.
+    """A run that consists of a map in a file and nothing else.
 
     Args:
         path: of the file.

@@ -20,7 +20,7 @@ NO_RECORDING = "python:frames"
 
 @dataclass
 class _Frames:
-    """Frames that came from a program, described like a recording."""
+    """Frames given by a program, described like a recording."""
 
     camera: Camera
     count: int

@@ -17,7 +17,7 @@ from ggslam.system.staging import finish_saving
 
 @dataclass
 class Verification:
-    """What was found.
+    """The result of a check.
 
     Attributes:
         path: of the run.

@@ -38,7 +38,7 @@ class AlignmentTuning(Tuning):
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where the outlines of depth fit the edges of colour best.
+    """The displacement and scale at which outlines of depth fit the edges of colour best.
 
     Attributes:
         shift: (columns, rows) that depth lies to the left of and above its place in colour, in shares of the width.

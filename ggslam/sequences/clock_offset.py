@@ -42,7 +42,7 @@ class ClockTuning(Tuning):
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """How depth lies to colour in time.
+    """The time by which depth is later than colour.
 
     Attributes:
         seconds: depth was taken so much later than colour of the same frame; negative: earlier.

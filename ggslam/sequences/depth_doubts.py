@@ -15,8 +15,8 @@ from ggslam.scene.frame import Frame
 from ggslam.sequences.alignment import measure_alignment
 from ggslam.sequences.depth_kind import DepthKind
 from ggslam.sequences.edge_evidence import (
-    Better,
-    BetterPlace,
+    BetterFit,
+    BetterPlacement,
     EdgeImages,
     find_place,
     find_step,
@@ -27,7 +27,7 @@ from ggslam.sequences.edge_evidence import (
 )
 from ggslam.sequences.hung_pairs import judge_hung_pairs
 from ggslam.sequences.hung_streams import judge_hung, spans_of
-from ggslam.sequences.invalid_depth_codes import find_planted_code
+from ggslam.sequences.invalid_depth_codes import find_invalid_depth_code
 from ggslam.sequences.inverted_depth import Inversion, find_inversion
 from ggslam.sequences.noise_doubts import judge_noise, judge_views
 from ggslam.sequences.orientation import WORDS as ORIENTATIONS
@@ -77,7 +77,7 @@ COLOR_AT_FAULT = {
 
 @dataclass
 class DepthDoubts:
-    """Looks at a recording for what is wrong with its depth; what was read is kept for other checks.
+    """Checks the depth of a recording; frames that were read are kept for other checks.
 
     Attributes:
         sequence: the recording.
@@ -155,7 +155,7 @@ class DepthDoubts:
         )
         return Verdict("unrelated", "doubtful", text)
 
-    def _side_verdict(self, name: str, better: Better) -> Verdict:
+    def _side_verdict(self, name: str, better: BetterFit) -> Verdict:
         strength = f"(strength {better.best:.2f}, as it is {better.strength:.2f})"
         how = f"outlines of depth fit the edges of colour then {strength}"
         tag = 1 if self.sequence.upright else orientation_of(self.sequence.files(0).color)
@@ -226,7 +226,7 @@ class DepthDoubts:
             units = VerdictTuning.usual_median_m * float(np.median(depths)) * self.sequence.depth_scale
         return float(f"{units:.2g}")
 
-    def _step_verdict(self, frames: int, better: Better) -> Verdict:
+    def _step_verdict(self, frames: int, better: BetterFit) -> Verdict:
         side = "after" if frames > 0 else "before"
         text = (
             f"depth is 1 frame off: it was taken 1 frame {side} the colour beside it (its outlines fit the edges of "
@@ -236,7 +236,7 @@ class DepthDoubts:
         remedy = f"; try `depth_delay` {frames}f" if told is None else f"; `depth_delay` {told} is 1 frame off"
         return Verdict("depth_delay", "wrong", text + remedy)
 
-    def _place_verdict(self, place: BetterPlace) -> Verdict:
+    def _place_verdict(self, place: BetterPlacement) -> Verdict:
         camera, stored = self.sequence.camera, self.sequence.depth_size
         right, down = (share * camera.width for share in place.shift)
         known = np.concatenate([frame.depth[frame.depth > 0] for frame in self.spread])
@@ -279,7 +279,7 @@ class DepthDoubts:
         return verdicts
 
     def _judge_codes(self) -> list[Verdict]:
-        found = find_planted_code(self.sequence)
+        found = find_invalid_depth_code(self.sequence)
         if found is None:
             return []
         remedy = self._kind.with_words(f"none:{found.code:g}")

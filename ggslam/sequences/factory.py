@@ -74,7 +74,7 @@ class DepthScaleTuning(Tuning):
 
 @dataclasses.dataclass(frozen=True)
 class Stored:
-    """How images are stored, as a user says; see the arguments of `open_sequence` of these names."""
+    """How images are stored, as given by the user; see the arguments of `open_sequence` of these names."""
 
     depth_kind: DepthKind = PLAIN
     depth_delay: str | None = None

@@ -54,7 +54,7 @@ class FocalTuning(Tuning):
 
 @dataclass(frozen=True)
 class FocalDoubt:
-    """How rigid the scene looks.
+    """How well distances agree between views, for the given focal length and for the best one.
 
     Attributes:
         error: median relative difference of distances with the focal length as it stands.

@@ -61,7 +61,7 @@ class Motion:
 
 @dataclass
 class SequenceReport:
-    """What `inspect_sequence` found.
+    """The result of `inspect_sequence`.
 
     Attributes:
         name, format, frames: of the sequence.

@@ -29,8 +29,8 @@ class InversionTuning(Tuning):
 
 @dataclass(frozen=True)
 class Inversion:
-    """Depth is `constant` minus what is stored, metres as stored; median relative residuals of planes then, and as
-    inverse depth."""
+    """Depth is `constant` minus what is stored, in stored units; median relative residuals of planes read so, and read
+    as inverse depth."""
 
     constant: float
     residual: float

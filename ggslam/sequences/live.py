@@ -98,7 +98,7 @@ def _call(place: str, name: str) -> LiveSource:
 
 
 class LiveSequence:
-    """A live source as a run sees it: a sequence that ends on request, with Ctrl-C or after `stop` frames.
+    """A live source with the interface of a sequence. It ends on request, with Ctrl-C or after `stop` frames.
 
     Args:
         source: the camera.

@@ -30,7 +30,7 @@ MOVERS_FILE = "movers.npz"
 @savable(fixed="masks")
 @dataclass
 class MovingPixels:
-    """Masks by frame, a bit for each pixel.
+    """Masks by frame, one bit per pixel.
 
     Attributes:
         frames: their indices (`Frame.index`), in the order in which they came.

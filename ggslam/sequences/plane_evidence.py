@@ -42,7 +42,7 @@ class PlaneTuning(Tuning):
 
 @dataclass(frozen=True)
 class PlaneEvidence:
-    """How flat planes are with depth read in each way of `MEASURES`.
+    """Flatness of planes for each way of reading depth in `MEASURES`.
 
     Attributes:
         windows: places that show a plane; frames: how many they are in.

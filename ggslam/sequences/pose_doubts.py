@@ -52,7 +52,7 @@ READINGS = {**CONVENTIONS, **SIDES}
 
 @dataclass(frozen=True)
 class PoseDoubt:
-    """How well neighbouring depth images agree by the poses.
+    """How well neighbouring depth images agree under the poses.
 
     Attributes:
         error: median relative difference of depth as it stands.

@@ -31,7 +31,7 @@ class RepeatTuning(Tuning):
 
 @dataclass(frozen=True)
 class Repeats:
-    """Neighbouring frames of which one image is the same and the other is not.
+    """Counts of neighbouring frames in which one image repeats and the other does not.
 
     Attributes:
         pairs: neighbours that were compared.

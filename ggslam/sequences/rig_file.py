@@ -82,7 +82,7 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class RigFile:
-    """What a file rig.yaml says: its cameras, and how many seconds apart images are that count as taken together."""
+    """The content of rig.yaml: its cameras, and the tolerance in seconds for images of one instant."""
 
     path: Path
     cameras: tuple[RigCamera, ...]

@@ -29,7 +29,7 @@ class RigInspectionTuning(Tuning):
 
 @dataclass
 class RigCameraReport:
-    """What was found of a camera of a rig.
+    """The findings for one camera of a rig.
 
     Attributes:
         name: of the camera.
@@ -53,7 +53,7 @@ class RigCameraReport:
 
 @dataclass
 class RigReport:
-    """What `inspect_rig` found.
+    """The result of `inspect_rig`.
 
     Attributes:
         name: of the rig.

@@ -32,7 +32,7 @@ class StepTuning(Tuning):
 
 @dataclass(frozen=True)
 class StepDoubt:
-    """Where depth fits colour in time.
+    """The frame offset at which depth fits colour best.
 
     Attributes:
         behind: frames that depth is behind colour; negative: ahead of it. Either may be the largest looked at.

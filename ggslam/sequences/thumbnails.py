@@ -58,7 +58,7 @@ class ThumbnailTuning(Tuning):
 
 @dataclass(frozen=True)
 class Thumbnail:
-    """A frame in small.
+    """A small version of a frame.
 
     Attributes:
         index: of the frame.

@@ -43,7 +43,7 @@ class TriangulationTuning(Tuning):
 
 @dataclass(frozen=True)
 class TruePoints:
-    """Points whose distance true poses tell.
+    """Points with a distance triangulated from true poses.
 
     Attributes:
         depth: as measured, float64 [n], metres if the depth scale is right and depth is z.

@@ -114,7 +114,7 @@ def judge_inverse_scale(scale: float, median_m: float) -> list[Verdict]:
 
 @dataclass(frozen=True)
 class ScaleSigns:
-    """What tells how large the world of a recording is, in metres of its depth scale.
+    """Signs of the size of a recording's world, in metres at its depth scale.
 
     Attributes:
         near, median, far: 1st, 50th and 99th percentile of depth.

@@ -43,7 +43,7 @@ _AWAY = np.array([0.0, 0.0, -60.0])
 
 @dataclass(frozen=True)
 class MadeChange:
-    """What was done to an instance between the visits.
+    """A change made to an instance between the visits.
 
     Attributes:
         kind: what.

@@ -91,7 +91,7 @@ class PoseForm(Form):
 
 
 class NotFinite:
-    """Beside a float: it may be NaN or infinite."""
+    """Marks a float that may be NaN or infinite."""
 
 
 class Between:

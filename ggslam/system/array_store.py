@@ -18,8 +18,8 @@ def kept_name(number: int) -> str:
     return f"kept-{number:06d}.bin"
 
 
-class KeptArrays:
-    """Files of what is kept, of which one is being gathered. See `object_tree.Keeper` and `object_tree.Kept`.
+class ArrayStore:
+    """The numbered files, one of which is being filled. See `object_tree.Keeper` and `object_tree.Kept`.
 
     Args:
         folder: of the files.

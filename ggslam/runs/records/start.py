@@ -16,7 +16,7 @@ VERSION: Final = 3
 
 
 class StartRecord(RecordFile):
-    """What a run was asked to do.
+    """The arguments of a run.
 
     Attributes:
         version: of the format.
