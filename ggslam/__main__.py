@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from ggslam.system.whole_program import run_program
+from ggslam.system.exit_signals import run_program
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ MAX_GOLOMB_PREFIX: Final = 32
 
 
 class BitWriter:
-    """Fields are appended, most significant bit first."""
+    """Appends fields, most significant bit first."""
 
     def __init__(self) -> None:
         self._value = 0
@@ -59,7 +59,7 @@ class BitWriter:
 
 
 class BitReader:
-    """Fields are taken off `data`.
+    """Reads fields of `data`, most significant bit first.
 
     Args:
         data: the bytes.

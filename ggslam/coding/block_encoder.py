@@ -24,9 +24,9 @@ from ggslam.coding.cloud import CodingReport
 from ggslam.coding.encoder import checked_points, encode_cloud, parameter_units, sequence_parameters
 from ggslam.coding.geometry_syntax import GeometryParameters
 from ggslam.coding.geometry_tools import GeometrySample, geometry_parameters
+from ggslam.coding.parallel_slices import in_order
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.settings import CodecSettings
-from ggslam.coding.side_by_side import in_order
 from ggslam.coding.slice_encoder import CloudToCode, CodedSlice, encode_slice
 from ggslam.coding.slices import PlaneCuts, Points, slices_wanted
 from ggslam.errors import FormatError

@@ -55,7 +55,7 @@ class SliceReport:
 
 @dataclass(frozen=True)
 class CodingReport:
-    """What became of a cloud: `input_points` came in, `points` were coded (fewer if duplicates were merged)."""
+    """Sizes of a coded cloud: `input_points` were given, `points` were coded (fewer if duplicates were merged)."""
 
     input_points: int
     points: int
@@ -81,7 +81,7 @@ class CodingReport:
 
 @dataclass(frozen=True)
 class EncodedCloud:
-    """A stream; `reconstruction`, if it was asked for, is what every decoder makes of it."""
+    """A stream; `reconstruction`, if requested, is the cloud that every decoder gets from it."""
 
     data: bytes
     report: CodingReport

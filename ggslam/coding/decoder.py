@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ggslam.coding.cloud import PointCloud
-from ggslam.coding.side_by_side import in_order
+from ggslam.coding.parallel_slices import in_order
 from ggslam.coding.slice_coder import SliceCoder
 from ggslam.coding.stream import CodedSliceUnits, CodedStream, read_stream
 from ggslam.errors import FormatError

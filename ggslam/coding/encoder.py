@@ -13,10 +13,10 @@ from ggslam.coding.attribute_values import CodedAttribute, plan_attributes
 from ggslam.coding.cloud import CodingReport, EncodedCloud, PointCloud
 from ggslam.coding.container import UnitType, unit_bytes
 from ggslam.coding.geometry_tools import GeometrySample, geometry_parameters
+from ggslam.coding.parallel_slices import in_order
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.coding.settings import CodecSettings
-from ggslam.coding.side_by_side import in_order
 from ggslam.coding.slice_encoder import CloudToCode, CodedSlice, encode_slice
 from ggslam.coding.slices import assign_slices
 from ggslam.coding.user_data import write_user_data

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which tools of geometry coding a cloud gets: one parameter set for all slices, chosen before the first is coded.
+"""Chooses the tools of geometry coding for a cloud: one parameter set for all slices, chosen before the first is coded.
 
 The reference decoder takes the first set of a stream for all slices, so there is only one.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How parameter sets and headers fill the structures that the compiled core takes."""
+"""Fills the compiled core's structures from parameter sets and headers."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A few points far outside a cloud must not cost the others their precision.
+"""Finds a few points far outside a cloud, which would cost the others their precision.
 
 Without a voxel size the encoder divides a cloud's longest side into 2^bits voxels; a single point at 5 km would make
 those of a room 5 m wide. So the side of the cloud's bulk counts, which hardly any point lies outside of. Points beyond

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every choice of the encoder, documented. A decoder needs none of them."""
+"""Settings of the encoder. A decoder needs none of them."""
 
 from __future__ import annotations
 

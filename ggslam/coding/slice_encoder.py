@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coding of one slice: its geometry unit, its attribute units, and what must be said beside them."""
+"""Codes one slice: its geometry unit, its attribute units and its side information."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A coded stream taken apart: parameter sets, slices and what was said beside them. Payloads are not decoded."""
+"""A coded stream taken apart into parameter sets, slices and side information. Payloads are not decoded."""
 
 from __future__ import annotations
 

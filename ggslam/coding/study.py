@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweeps over the quantisers: what a cloud costs and how good it stays, at each setting.
+"""Sweeps over quantisers: the size and quality of a cloud at each setting.
 
 Two sweeps, as codec papers report them: the quantiser parameter of the colours at lossless geometry, and the scale of
 the geometry at the finest colours that the transform has (quantiser parameter 4 without conversion to Y, Cb, Cr: about

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the standard has no field for, in user data units: names of attributes, the exact scale, tables of ids.
+"""User data units, for what the standard has no field for: names of attributes, the exact scale, tables of ids.
 
 A unit is a signature with the version of the stream, then deflated JSON. Decoders that do not know the signature skip
 the unit. Streams of version 1 have square roots of their own for weights above 65,536 (see fixed_point.hpp).

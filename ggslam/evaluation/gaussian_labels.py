@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""True object ids of the Gaussians themselves, from true masks, and how many labels agree with them."""
+"""True object ids of Gaussians, taken from true masks, and the share of labels that agree with them."""
 
 from __future__ import annotations
 

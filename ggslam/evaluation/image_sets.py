@@ -16,7 +16,7 @@ from ggslam.scene.frame import Frame
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What a map shows of a frame's view.
+    """The rendering of a frame's view.
 
     Attributes:
         color: [H, W, 3], see `score_image`.

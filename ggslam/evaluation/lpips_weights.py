@@ -78,7 +78,7 @@ def load_arrays(data: bytes) -> Any:
 
 
 class _ArrayUnpickler(pickle.Unpickler):
-    """Pickles may call any function; this one knows three."""
+    """An unpickler that calls three known functions and no others."""
 
     def find_class(self, module: str, name: str) -> Any:
         if name == "_reconstruct" and module in ("numpy.core.multiarray", "numpy._core.multiarray"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far points of a map lie from a surface, and how much of the surface they cover."""
+"""Distance of a map's points from a surface, and how much of the surface they cover."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SurfaceScoreTuning(Tuning):
 
 @dataclass(frozen=True)
 class SurfaceScores:
-    """Points against a surface.
+    """Scores of points against a surface.
 
     Attributes:
         median_m, p95_m: distance of the points from the surface, metres: half of them, 95 % of them are nearer.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays that never change (images, points) in files, the last used ones in memory within a bound of bytes."""
+"""Arrays that never change (images, points), stored in files; the last used ones are kept in memory up to a limit."""
 
 from __future__ import annotations
 

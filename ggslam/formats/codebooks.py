@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Codebooks: numbers, and rows of numbers, as indices into short tables, by k-means; the same every time."""
+"""Codebooks by k-means: numbers, or rows of numbers, become indices into short tables. Repeats exactly."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ _PASSED_OVER = {"nx", "ny", "nz", *_BYTES, "alpha"}
 
 @dataclass(frozen=True)
 class SplatLayout:
-    """Which properties of a file say what.
+    """The meaning of a file's properties.
 
     Attributes:
         base: of the base colour; empty: there is none, and Gaussians are grey.
@@ -160,8 +160,8 @@ def apply_filter(
 
 
 class PlyGaussianRows(GaussianRows):
-    """The Gaussians of others' PLY files by row, without those that cannot be drawn; what is not read from the file
-    again is one number for each of these.
+    """The Gaussians of other programs' PLY files by row, without those that cannot be drawn. Memory holds one number
+    per Gaussian that is left out.
 
     Args:
         path: the file.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""3DGS PLY files of which some Gaussians are in memory at a time."""
+"""3DGS PLY files read in parts, with some Gaussians in memory at a time."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class GaussianRows:
 
 
 class GaussiansInMemory(GaussianRows):
-    """A map that is in memory, as if it were a file.
+    """A map in memory with the interface of a file.
 
     Args:
         path: of the file that it came from.

@@ -35,7 +35,7 @@ _SIZES = {"I": (1, 2, 4, 8), "U": (1, 2, 4, 8), "F": (4, 8)}
 
 @dataclass(frozen=True)
 class _Header:
-    """`stored` is the type of one point as it lies in the file; fields named '_' (padding) have running numbers."""
+    """The header of a file. `stored` is the dtype of a point in the file; fields named '_' (padding) are numbered."""
 
     stored: np.dtype
     points: int

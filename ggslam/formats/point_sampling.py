@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.errors import InputError
-from ggslam.formats.cubes_to_come import CubesToCome
+from ggslam.formats.pending_cubes import PendingCubes
 from ggslam.formats.surface_discs import SurfaceDiscs, disc_samples
 from ggslam.formats.voxel_cloud import BITS, VoxelCloud, VoxelSums, cloud_of_sums, pack, unpack
 from ggslam.scene.gaussian_map import GaussianMap
@@ -103,7 +103,7 @@ def sample_parts(
     for number in order:
         whole = SurfaceDiscs.of(parts[number].load(), minimum_opacity)
         sections += [_cubes(discs, voxel_size) for discs in whole.cut(axis)]
-    to_come, done = CubesToCome(sections), 0
+    to_come, done = PendingCubes(sections), 0
     waiting, pending, sampled = VoxelSums.empty(), [], 0
     for number in order:
         part = parts[number].load()

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points without a position: sensors write NaN where they saw nothing, and every reader of clouds leaves these out.
-And positions that a file in single precision has rounded, as UTM coordinates to half a metre."""
+"""Leaves out points without a position (sensors write NaN) and reports positions that single precision has rounded,
+such as UTM coordinates."""
 
 from __future__ import annotations
 

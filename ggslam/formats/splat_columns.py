@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of a map as splat formats want them: checked, quaternions of unit length, turned where y is upwards."""
+"""The numbers of a map as splat formats store them: checked, with unit quaternions, turned where y points up."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of Gaussians in files: read and written as `formats.table` says, in whichever of its formats."""
+"""Reads and writes maps of Gaussians in any format of `formats.table`."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a format that maps of Gaussians are read from says of itself: which files are of it, and how they are opened.
+"""What a format declares to be read: which files are of it, and how they are opened.
 
 All readers give maps in the axes that 3DGS files of cameras have, y down and z forward; formats whose descriptions put
 y upwards are turned. Gaussians that cannot be drawn are left out, with a note; see `splat_repair`.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians of others' files: bad ones are left out or bounded, and counted; they are no reason to refuse a file."""
+"""Repairs Gaussians of other programs' files: bad ones are left out or bounded, and counted."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian maps as streamed SOG, version 1: what a viewer loads piece by piece, near places finely, far ones coarsely.
+"""Gaussian maps as streamed SOG, version 1: a viewer loads near places in fine and far ones in coarse levels.
 
 `lod-meta.json` holds a binary tree of boxes. Each leaf has its Gaussians at every level of detail as a run of rows of a
 SOG, `LEVEL_NUMBER/meta.json` and the images beside it (sog.py). Level 0 is the map itself, each coarser one has a
@@ -53,7 +53,7 @@ class StreamedSogTuning(Tuning):
 
 @dataclass(frozen=True)
 class StreamedSize:
-    """What was written: Gaussians of each level, files of SOG, bytes."""
+    """Gaussians of each level, SOG files and bytes that were written."""
 
     counts: tuple[int, ...]
     chunks: int
@@ -102,7 +102,7 @@ def write_streamed_sog(
 
 @dataclass
 class _Level:
-    """What there is of a level: rows of the SOG that is being gathered, its number in `filenames`, those before it."""
+    """The state of a level: rows of the current SOG, its number in `filenames`, and the files before it."""
 
     file: int = -1
     chunks: int = 0

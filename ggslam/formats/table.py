@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of the formats that maps are exported to and read from, and who writes a file of which name."""
+"""The table of formats that maps are exported to and read from, and the choice of one by a file's name."""
 
 from __future__ import annotations
 

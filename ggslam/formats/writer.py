@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a format of `ggslam export` says of itself: its name, how its files are called, what it takes and how it writes.
+"""What a format declares to be written: its name, its suffixes, what it takes and how it writes.
 
     WRITER = Writer(
         "splat", (".splat",), Takes.GAUSSIANS, "the same in 32 bytes a Gaussian", _write

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints of a run, in the folder `checkpoints` of its folder: what it takes to go on after a crash.
+"""Checkpoints of a run, in its folder `checkpoints`: what it needs to continue after a crash.
 
     start.json         what the run was asked to do
     state-000012.bin   the state after some frame; the newest two are kept
@@ -25,8 +25,8 @@ from ggslam.runs.records.start import VERSION, StartRecord
 from ggslam.slam.saved_state import describe_state, restore_state
 from ggslam.slam.slam import Slam
 from ggslam.system.array_file import PendingFile, WrittenFile, read_array_file, write_array_file
+from ggslam.system.array_store import ArrayStore
 from ggslam.system.atomic import make_folder, sync_folder
-from ggslam.system.kept_arrays import KeptArrays
 from ggslam.system.links import refuse_link, refuse_links_below, remove_folder
 from ggslam.system.tuning import Tuning
 
@@ -49,12 +49,12 @@ def has_checkpoints(run: Path) -> bool:
 
 @dataclass(frozen=True)
 class _State:
-    """A state as it was read."""
+    """A state read from disk."""
 
     number: int
     values: dict[str, Any]
     arrays: list[np.ndarray]
-    kept: KeptArrays
+    kept: ArrayStore
 
 
 class Checkpoints:
@@ -70,7 +70,7 @@ class Checkpoints:
     def __init__(self, run: Path) -> None:
         self.folder = run / FOLDER
         refuse_links_below(self.folder)
-        self._kept = KeptArrays(self.folder)
+        self._kept = ArrayStore(self.folder)
         self._number = 0
         self._states: list[int] = []
         """Numbers of the states that are there, rising."""
@@ -146,7 +146,7 @@ class Checkpoints:
             finishing.result()
         except BaseException:
             # What the state's file of kept arrays was to hold is written again with the next state.
-            self._kept = KeptArrays(self.folder)
+            self._kept = ArrayStore(self.folder)
             raise
 
     def close(self) -> None:
@@ -211,7 +211,7 @@ class Checkpoints:
     def _newest(self, tell: Callable[[str], None]) -> Iterator[_State]:
         """States that are whole, the newest first; of others it is told what is wrong."""
         for number in sorted(self._numbers(_STATE), reverse=True):
-            kept = KeptArrays(self.folder)
+            kept = ArrayStore(self.folder)
             try:
                 values, arrays = read_array_file(self._path(number))
                 if values["version"] != VERSION:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a run that stay as they are in one made of it: copied within limits, for a run may be from elsewhere."""
+"""Copies unchanged files of a run into a run made from it, within limits, because a run may come from elsewhere."""
 
 from __future__ import annotations
 

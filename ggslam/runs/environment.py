@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Versions of what a run was made with, and on which machine."""
+"""Versions and machine that a run was made with."""
 
 from __future__ import annotations
 

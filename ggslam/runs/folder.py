@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run leaves on disk. Every file is written to a temporary name and renamed: none is ever half there.
+"""The files of a run. Each is written to a temporary name and renamed, so none is ever half there.
 
     loops.json       closures and what became of other candidates, stretches in which the camera was lost
     trajectory.txt   TUM: timestamp tx ty tz qx qy qz qw, camera to world, the world being the first camera

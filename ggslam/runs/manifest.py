@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The manifest of a run: which files are its own, how large they are, what their sums are. It is part of run.json, so
-that it changes in one step with what run.json says of the run."""
+"""The manifest of a run: its files with their sizes and checksums. It is part of run.json, so that both change in
+one step."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MADE_LATER = ("metrics.json", "frames.csv", "verdict.json", "report.html", "grou
 
 @dataclass(frozen=True)
 class Problem:
-    """Something in a run's folder that is not as the manifest says.
+    """A difference between a run's folder and its manifest.
 
     Attributes:
         name: of the file.

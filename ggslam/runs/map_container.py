@@ -82,7 +82,7 @@ _MOST_KEYFRAMES: Final = (1 << 16) - 2
 
 
 @dataclass(frozen=True)
-class Contained:
+class WrittenContainer:
     """A written container.
 
     Attributes:
@@ -105,7 +105,7 @@ def is_container(path: str | Path) -> bool:
     return Path(path).suffix.lower() == SUFFIX
 
 
-def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSettings) -> Contained:
+def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSettings) -> WrittenContainer:
     """Puts a run's map into a file.
 
     Args:
@@ -146,7 +146,7 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
                 archive.writestr(zipfile.ZipInfo(member), content)
     sizes = {n: len(b) for n, b in members.items()}
     plain = sum((folder.path / n).stat().st_size for n in (*names, PLACES_FILE, "map.ply"))
-    return Contained(out, count, sizes, plain, notes)
+    return WrittenContainer(out, count, sizes, plain, notes)
 
 
 def _smallest(name: str, content: bytes) -> tuple[str, bytes]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file of Gaussians where a run is expected: its map is the run's map, and cameras on a circle stand for the frames.
+"""Treats a file of Gaussians as a run: its map is the run's map, and cameras on a circle stand for the frames.
 
 `open_map` is the one place where commands that need no more than a map open what they were given.
 """
@@ -56,7 +56,7 @@ _log = logging.getLogger(__name__)
 
 
 class MapFile(RunFolder):
-    """A run of which there is only a map, in a file.
+    """A run that consists of a map in a file and nothing else.
 
     Args:
         path: of the file.

@@ -97,7 +97,7 @@ class MapIndex:
 
 
 class MapInParts:
-    """A map on disk, of which what a view needs is read.
+    """A map on disk of which only what a view needs is read.
 
     Args:
         ply: the file of the map, or its rows.

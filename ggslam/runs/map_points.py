@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The coloured points of a run's map: what points.ply, exports and comparisons have."""
+"""The coloured points of a run's map, for points.ply, exports and comparisons."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's map with its objects, of which no more is in memory than a view or a block of rows."""
+"""A run's map with its objects, read in parts: a view or a block of rows is in memory at a time."""
 
 from __future__ import annotations
 

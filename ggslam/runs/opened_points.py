@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The coloured points of a run, or of a file of Gaussians, that was opened."""
+"""The coloured points of an opened run or file of Gaussians."""
 
 from __future__ import annotations
 

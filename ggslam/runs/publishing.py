@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Putting a run that was written to a hidden folder into its place, all files at once, run.json with the manifest last.
-"""
+"""Moves a run from a hidden folder into its place, all files at once, run.json with the manifest last."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which recording a run reads, and how to open it again later."""
+"""The recording of a run, and how to open it again later."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class RenderedViewTuning(Tuning):
 
 @dataclass
 class RenderedViews:
-    """The map from the places of the keyframes.
+    """The map rendered from the poses of the keyframes.
 
     Attributes:
         cameras, poses: of each keyframe: its camera, and T_world_camera float64 [4, 4].

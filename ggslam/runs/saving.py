@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run that was made from Python, frame by frame, as a run folder."""
+"""Saves a run made frame by frame from Python as a run folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NO_RECORDING = "python:frames"
 
 @dataclass
 class _Frames:
-    """Frames that came from a program, described like a recording."""
+    """Frames given by a program, described like a recording."""
 
     camera: Camera
     count: int

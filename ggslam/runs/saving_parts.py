@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a run that are written in parts: of a map on disk cell by cell, so that memory is as bounded as it was
-during the run."""
+"""Writes files of a run in parts, a map on disk cell by cell, so that memory stays as bounded as during the run."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starting in the map of an earlier run instead of an empty one."""
+"""Starts a run in the map of an earlier run instead of an empty one."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a run's folder is whole, and all of it of one run."""
+"""Checks whether a run's folder is complete and all its files are of one run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ggslam.system.staging import finish_saving
 
 @dataclass
 class Verification:
-    """What was found.
+    """The result of a check.
 
     Attributes:
         path: of the run.

@@ -55,7 +55,7 @@ RUN_FILES = (
 
 @dataclass
 class RunToWrite:
-    """A run, as `RunFolder.save` is given it.
+    """The arguments of `RunFolder.save`.
 
     Attributes:
         wanted: names of files that are to be made yet.

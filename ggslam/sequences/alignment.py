@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether depth lies on colour: outlines of near things in the depth images are laid over the edges of the colour
-images, shifted and scaled, to see where they fit best."""
+"""Checks whether depth is registered to colour: the outlines of near things in depth images are compared with the
+edges of colour images at several displacements and scales."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class AlignmentTuning(Tuning):
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where the outlines of depth fit the edges of colour best.
+    """The displacement and scale at which outlines of depth fit the edges of colour best.
 
     Attributes:
         shift: (columns, rows) that depth lies to the left of and above its place in colour, in shares of the width.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images inside a zip archive, read where they are asked for."""
+"""Images inside a zip archive, read on demand."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether intrinsics can be those of the images, by their own numbers: angle of view, shape of pixels, and principal
-point, which tells the size of the images that they were made for."""
+"""Checks intrinsics against the images by themselves: angle of view, shape of pixels, and the principal point, which
+shows what image size they are for."""
 
 from __future__ import annotations
 

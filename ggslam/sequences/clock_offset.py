@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""By how much time depth and colour are apart, measured from the images.
+"""Measures the time between depth and colour images.
 
 While the camera moves, an image that is taken later shows everything a little farther on. The outlines of depth are
 moved back along the motion of colour, by so many milliseconds as lay them best on the edges of colour.
@@ -42,7 +42,7 @@ class ClockTuning(Tuning):
 
 @dataclass(frozen=True)
 class ClockOffset:
-    """How depth lies to colour in time.
+    """The time by which depth is later than colour.
 
     Attributes:
         seconds: depth was taken so much later than colour of the same frame; negative: earlier.

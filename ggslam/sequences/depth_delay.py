@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairing colour with depth that was taken earlier or later than the recording's names and lists say."""
+"""Pairs colour with depth that was taken earlier or later than names and lists say (`depth_delay`)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether depth is what it is taken for: of this camera, this moment, this side, distance along the optical axis. Each
-doubt names its remedy. "wrong" is said only where the evidence is certain: a run refuses to begin then."""
+"""Checks what depth images hold: whether they belong to this camera, this moment and this orientation, and whether
+depth is measured along the optical axis. Each verdict names its remedy. A run refuses to start on "wrong", which
+needs certain evidence."""
 
 from __future__ import annotations
 
@@ -14,8 +15,8 @@ from ggslam.scene.frame import Frame
 from ggslam.sequences.alignment import measure_alignment
 from ggslam.sequences.depth_kind import DepthKind
 from ggslam.sequences.edge_evidence import (
-    Better,
-    BetterPlace,
+    BetterFit,
+    BetterPlacement,
     EdgeImages,
     find_place,
     find_step,
@@ -24,18 +25,18 @@ from ggslam.sequences.edge_evidence import (
     look_at_edges,
     stretches,
 )
-from ggslam.sequences.glances import Glance, look_over
 from ggslam.sequences.hung_pairs import judge_hung_pairs
 from ggslam.sequences.hung_streams import judge_hung, spans_of
+from ggslam.sequences.invalid_depth_codes import find_invalid_depth_code
 from ggslam.sequences.inverted_depth import Inversion, find_inversion
 from ggslam.sequences.noise_doubts import judge_noise, judge_views
 from ggslam.sequences.orientation import WORDS as ORIENTATIONS
 from ggslam.sequences.orientation import orientation_of
 from ggslam.sequences.plane_evidence import PlaneEvidence, look_at_planes
-from ggslam.sequences.planted_codes import find_planted_code
 from ggslam.sequences.pose_doubts import pairs_apart
 from ggslam.sequences.repeats import find_repeats
 from ggslam.sequences.sequence import Sequence
+from ggslam.sequences.thumbnails import Thumbnail, thumbnails_of
 from ggslam.sequences.triangulation import TruePoints, triangulate
 from ggslam.sequences.verdicts import Verdict, VerdictTuning, judge_inverse_scale
 from ggslam.system.tuning import Tuning
@@ -76,7 +77,7 @@ COLOR_AT_FAULT = {
 
 @dataclass
 class DepthDoubts:
-    """Looks at a recording for what is wrong with its depth; what was read is kept for other checks.
+    """Checks the depth of a recording; frames that were read are kept for other checks.
 
     Attributes:
         sequence: the recording.
@@ -88,19 +89,19 @@ class DepthDoubts:
 
     def judge(self) -> list[Verdict]:
         """All doubts. One about units, place or kind of depth hides those that it may be the cause of."""
-        found = judge_noise(self._glances, self.sequence.selection)
+        found = judge_noise(self._thumbnails, self.sequence.selection)
         spans = spans_of(self.sequence)
-        hung = judge_hung(self.sequence, self._glances, spans)
+        hung = judge_hung(self.sequence, self._thumbnails, spans)
         found += self._judge_units() if not found else []
         found += self._judge_edges(bool(hung)) if not found else []
         found += self._judge_measure() if not found else []
-        still = judge_views(self.sequence, self._glances)
+        still = judge_views(self.sequence, self._thumbnails)
         pairs = judge_hung_pairs(self.sequence, spans)
         return [*found, *self._judge_repeats(hung), *pairs, *self._judge_codes(), *still]
 
     @cached_property
-    def _glances(self) -> list[Glance]:
-        return look_over(self.sequence)
+    def _thumbnails(self) -> list[Thumbnail]:
+        return thumbnails_of(self.sequence)
 
     @cached_property
     def spread(self) -> list[Frame]:
@@ -154,7 +155,7 @@ class DepthDoubts:
         )
         return Verdict("unrelated", "doubtful", text)
 
-    def _side_verdict(self, name: str, better: Better) -> Verdict:
+    def _side_verdict(self, name: str, better: BetterFit) -> Verdict:
         strength = f"(strength {better.best:.2f}, as it is {better.strength:.2f})"
         how = f"outlines of depth fit the edges of colour then {strength}"
         tag = 1 if self.sequence.upright else orientation_of(self.sequence.files(0).color)
@@ -225,7 +226,7 @@ class DepthDoubts:
             units = VerdictTuning.usual_median_m * float(np.median(depths)) * self.sequence.depth_scale
         return float(f"{units:.2g}")
 
-    def _step_verdict(self, frames: int, better: Better) -> Verdict:
+    def _step_verdict(self, frames: int, better: BetterFit) -> Verdict:
         side = "after" if frames > 0 else "before"
         text = (
             f"depth is 1 frame off: it was taken 1 frame {side} the colour beside it (its outlines fit the edges of "
@@ -235,7 +236,7 @@ class DepthDoubts:
         remedy = f"; try `depth_delay` {frames}f" if told is None else f"; `depth_delay` {told} is 1 frame off"
         return Verdict("depth_delay", "wrong", text + remedy)
 
-    def _place_verdict(self, place: BetterPlace) -> Verdict:
+    def _place_verdict(self, place: BetterPlacement) -> Verdict:
         camera, stored = self.sequence.camera, self.sequence.depth_size
         right, down = (share * camera.width for share in place.shift)
         known = np.concatenate([frame.depth[frame.depth > 0] for frame in self.spread])
@@ -278,7 +279,7 @@ class DepthDoubts:
         return verdicts
 
     def _judge_codes(self) -> list[Verdict]:
-        found = find_planted_code(self.sequence)
+        found = find_invalid_depth_code(self.sequence)
         if found is None:
             return []
         remedy = self._kind.with_words(f"none:{found.code:g}")

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the numbers of depth images mean, if not distance along the optical axis with 0 for "nothing measured"."""
+"""What the numbers in depth images mean: distance along the optical axis or the ray, inverse depth, and which number
+means "not measured"."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How depth lies on colour, by outlines and edges over stretches of successive frames: as it stands, mirrored or
-turned, against the colour of other frames, and enlarged about the centre."""
+"""Compares outlines of depth with edges of colour over stretches of frames: as stored, mirrored or turned, against
+neighbouring frames, and enlarged."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ TURNS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass
 class EdgeImages:
-    """Outlines of depth and edges of colour of frames, by their number; of each stretch."""
+    """Outlines of depth and edges of colour, by frame number."""
 
     outlines: dict[int, np.ndarray] = field(default_factory=dict)
     edges: dict[int, np.ndarray] = field(default_factory=dict)
@@ -94,7 +94,7 @@ class EdgeImages:
 
 
 @dataclass(frozen=True)
-class Better:
+class BetterFit:
     """Another way of laying depth on colour that fits clearly better.
 
     Attributes:
@@ -107,7 +107,7 @@ class Better:
 
 
 @dataclass(frozen=True)
-class BetterPlace(Better):
+class BetterPlacement(BetterFit):
     """Depth fits when enlarged `scale` times about the centre and moved by `shift`, shares of the width."""
 
     scale: float
@@ -137,7 +137,7 @@ def stretches(
     return frames
 
 
-def find_turn(seen: EdgeImages) -> tuple[str, Better] | None:
+def find_turn(seen: EdgeImages) -> tuple[str, BetterFit] | None:
     """The name of `TURNS` that lays depth on colour; None if as it stands, or nothing can be told."""
     found = None
     for name, turn in TURNS.items():
@@ -167,7 +167,7 @@ def find_unrelated(seen: EdgeImages) -> float | None:
     return strength if strength < EdgeTuning.unrelated and strength + 2 * error < EdgeTuning.surely_unrelated else None
 
 
-def find_step(seen: EdgeImages) -> tuple[int, Better] | None:
+def find_step(seen: EdgeImages) -> tuple[int, BetterFit] | None:
     """Frames by which depth was taken after the colour beside it (negative: before); None if at the same time, or
     nothing can be told."""
     hits = _Hits()
@@ -189,7 +189,7 @@ def find_step(seen: EdgeImages) -> tuple[int, Better] | None:
     return None if better is None else (best - EdgeTuning.reach, better)
 
 
-def find_place(seen: EdgeImages) -> BetterPlace | None:
+def find_place(seen: EdgeImages) -> BetterPlacement | None:
     """Where depth lies on colour if it has to be enlarged and moved; None if as it stands, or nothing can be told."""
     pairs = seen.pairs()
     pairs = pairs[:: -(-len(pairs) // EdgeTuning.max_searched)] if pairs else []
@@ -215,12 +215,12 @@ def find_place(seen: EdgeImages) -> BetterPlace | None:
     ):
         return None
     better = _compare_place(pairs, place[0], place[1], place[2])
-    return None if better is None else BetterPlace(better.strength, better.best, place[0], (place[1], place[2]))
+    return None if better is None else BetterPlacement(better.strength, better.best, place[0], (place[1], place[2]))
 
 
 def _compare_place(
     pairs: list[tuple[np.ndarray, np.ndarray]], scale: float, right: float, down: float
-) -> Better | None:
+) -> BetterFit | None:
     """Outlines enlarged and moved against outlines as they stand, of those that stay in the image."""
     hits = _Hits()
     for outlines, edges in pairs:
@@ -249,8 +249,9 @@ def _weights(outlines: list[np.ndarray]) -> np.ndarray:
 
 
 class _Hits:
-    """Strengths of edges under outlines, laid on several images, summed by frame and by part of the image: both tell
-    how sure a difference is. Neighbouring frames show the same edges, so frames alone would make it look too sure."""
+    """Sums of edge strength under outlines, by frame and by part of the image, for several edge images. Both give a
+    standard error: neighbouring frames show the same edges, so that frames alone would make a difference look too
+    certain."""
 
     def __init__(self) -> None:
         self._sums: list[np.ndarray] = []
@@ -272,14 +273,14 @@ class _Hits:
         """Number of the image that fits best; -1: nothing can be told."""
         return int(np.sum(self._sums, axis=(0, 2))[1:].argmax()) if _enough(self._outlines) else -1
 
-    def compare(self, plain: int, other: int, sure_by_part: float = EdgeTuning.errors_by_part) -> Better | None:
+    def compare(self, plain: int, other: int, sure_by_part: float = EdgeTuning.errors_by_part) -> BetterFit | None:
         """Another image against that of the frame itself, if it fits clearly better."""
         if not _enough(self._outlines):
             return None
         sums = np.stack(self._sums)[:, [0, 1 + plain, 1 + other]]
         by_part, by_frame = sums.sum(0), sums.sum(2).T
         count, strength, best = by_part.sum(1)
-        found = Better(float(strength / count), float(best / count))
+        found = BetterFit(float(strength / count), float(best / count))
         gain = found.best - found.strength
         sure = gain > sure_by_part * _error(by_part) and gain > EdgeTuning.errors_by_frame * _error(by_frame)
         return found if sure and gain > EdgeTuning.min_gain and found.best > EdgeTuning.min_strength else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames at the start of an MP4 that its edit list hides from players (ISO/IEC 14496-12).
+"""Counts the frames at the start of an MP4 that its edit list hides from players (ISO/IEC 14496-12).
 
 A writer that is told to begin later than its first frame keeps that frame in the file, and lets the edit list begin
 after it: the file counts one frame more than anybody who plays it gets.

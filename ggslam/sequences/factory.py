@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opening a recording: recognising its format and selecting a part of it."""
+"""Opens a recording: recognises its format and selects a part of it."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class DepthScaleTuning(Tuning):
 
 @dataclasses.dataclass(frozen=True)
 class Stored:
-    """How images are stored, as a user says; see the arguments of `open_sequence` of these names."""
+    """How images are stored, as given by the user; see the arguments of `open_sequence` of these names."""
 
     depth_kind: DepthKind = PLAIN
     depth_delay: str | None = None

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the focal length fits: two points of a rigid scene are as far apart in one view as in another, but only with
-the right one, once the camera has turned between the views."""
+"""Checks the focal length: the distance between two points of a rigid scene is the same in two views only if the
+focal length is right, once the camera has turned."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class FocalTuning(Tuning):
 
 @dataclass(frozen=True)
 class FocalDoubt:
-    """How rigid the scene looks.
+    """How well distances agree between views, for the given focal length and for the best one.
 
     Attributes:
         error: median relative difference of distances with the focal length as it stands.

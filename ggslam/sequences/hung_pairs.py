@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings whose two streams hang at once: for some frames colour and depth are both those of one frame. A camera at
-rest records that only without noise, so that noise in the repeated depth, or a jump where images go on, has to tell."""
+"""Finds frames in which colour and depth both repeat an earlier frame. A camera at rest also repeats, but with fresh
+noise; repeated noise, or a jump where images continue, tells the two apart."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.glances import Glance, glance_of
 from ggslam.sequences.hung_streams import HungTuning, Spans, Stretch, numbers_of, remedy_for, spans_of
 from ggslam.sequences.sequence import Sequence
+from ggslam.sequences.thumbnails import Thumbnail, thumbnail_of
 from ggslam.sequences.verdicts import Verdict
 from ggslam.system.tuning import Tuning
 
@@ -74,8 +74,8 @@ def _shows_noise(sequence: Sequence, index: int) -> bool:
 
 def _jumps(sequence: Sequence, first: int, last: int) -> bool:
     """Whether images go on after a stretch as if the camera had moved on meanwhile."""
-    before = [glance_of(sequence, k) for k in range(max(first - HungPairTuning.around, 0), first + 1)]
-    after = [glance_of(sequence, k) for k in range(last + 1, min(last + 2 + HungPairTuning.around, len(sequence)))]
+    before = [thumbnail_of(sequence, k) for k in range(max(first - HungPairTuning.around, 0), first + 1)]
+    after = [thumbnail_of(sequence, k) for k in range(last + 1, min(last + 2 + HungPairTuning.around, len(sequence)))]
     usual = [c for views in (before, after) for a, b in zip(views, views[1:], strict=False) if (c := _change(a, b))]
     jump = _change(before[-1], after[0]) if after else None
     return (
@@ -85,5 +85,5 @@ def _jumps(sequence: Sequence, first: int, last: int) -> bool:
     )
 
 
-def _change(a: Glance | None, b: Glance | None) -> float | None:
+def _change(a: Thumbnail | None, b: Thumbnail | None) -> float | None:
     return None if a is None or b is None else float(np.abs(a.grey - b.grey).mean())

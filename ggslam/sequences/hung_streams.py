@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Streams that hang: for some frames colour or depth is that of one frame, while the other goes on. Files that are the
-same are found by their sizes and bytes in all frames, images that were compressed again by small views of some."""
+"""Finds streams that hang: colour or depth repeats an earlier frame while the other continues. Equal files are found
+by size and content in all frames, recompressed images by thumbnails of some frames."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.glances import Glance, glance_of
 from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
+from ggslam.sequences.thumbnails import Thumbnail, thumbnail_of
 from ggslam.sequences.verdicts import Verdict
 from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
@@ -33,7 +33,7 @@ class HungTuning(Tuning):
     """Most stretches that a sentence names."""
 
 
-Test = Callable[[Glance, Glance], bool]
+Test = Callable[[Thumbnail, Thumbnail], bool]
 """Whether two views are the same, or are not."""
 
 Spans = dict[str, list[tuple[int, int]]]
@@ -55,14 +55,14 @@ def spans_of(sequence: Sequence) -> Spans:
     return {kind: _same_files([getattr(one, kind) for one in files]) for kind in ("color", "depth")}
 
 
-def judge_hung(sequence: Sequence, glances: list[Glance], spans: Spans | None = None) -> list[Verdict]:
+def judge_hung(sequence: Sequence, thumbnails: list[Thumbnail], spans: Spans | None = None) -> list[Verdict]:
     """Whether colour hangs while depth moves on, or depth while colour does; `spans`: see `spans_of`."""
     known = spans_of(sequence) if spans is None else spans
-    return [verdict for kind in ("color", "depth") for verdict in _judge(sequence, glances, kind, known)]
+    return [verdict for kind in ("color", "depth") for verdict in _judge(sequence, thumbnails, kind, known)]
 
 
-def _judge(sequence: Sequence, glances: list[Glance], kind: str, spans: Spans) -> list[Verdict]:
-    found = find_hung(sequence, glances, kind, spans)
+def _judge(sequence: Sequence, thumbnails: list[Thumbnail], kind: str, spans: Spans) -> list[Verdict]:
+    found = find_hung(sequence, thumbnails, kind, spans)
     if not found:
         return []
     frames = sum(one.last - one.first + 1 for one in found)
@@ -94,16 +94,16 @@ def remedy_for(sequence: Sequence, found: list[Stretch]) -> str:
     return "record again: check the cable, the disk and what else the computer does"
 
 
-def find_hung(sequence: Sequence, glances: list[Glance], kind: str, spans: Spans | None = None) -> list[Stretch]:
+def find_hung(sequence: Sequence, thumbnails: list[Thumbnail], kind: str, spans: Spans | None = None) -> list[Stretch]:
     """Stretches in which "color" or "depth" (`kind`) hangs, in order; `spans`: see `spans_of`."""
     same, moved = _tests(kind)
     files = (spans_of(sequence) if spans is None else spans)[kind]
     found = [one for span in files[: HungTuning.max_stretches] if (one := _confirm(sequence, *span, same, moved))]
-    for first, last in _same_views(sequence, glances, same, moved):
+    for first, last in _same_views(sequence, thumbnails, same, moved):
         if not any(one.first <= last and first <= one.last for one in found):
             found.append(Stretch(first, last))
     found.sort(key=lambda one: one.first)
-    return _merge(sequence, found, Glance.like_color if kind == "color" else Glance.same_depth)
+    return _merge(sequence, found, Thumbnail.like_color if kind == "color" else Thumbnail.same_depth)
 
 
 def _merge(sequence: Sequence, found: list[Stretch], like: Test) -> list[Stretch]:
@@ -123,21 +123,21 @@ def _merge(sequence: Sequence, found: list[Stretch], like: Test) -> list[Stretch
 
 
 def _are_alike(sequence: Sequence, first: int, second: int, like: Test) -> bool:
-    a, b = glance_of(sequence, first), glance_of(sequence, second)
+    a, b = thumbnail_of(sequence, first), thumbnail_of(sequence, second)
     return a is not None and b is not None and like(a, b)
 
 
-def _same_views(sequence: Sequence, glances: list[Glance], same: Test, moved: Test) -> list[tuple[int, int]]:
+def _same_views(sequence: Sequence, thumbnails: list[Thumbnail], same: Test, moved: Test) -> list[tuple[int, int]]:
     """First and last of the frames whose small views are the same while the other stream moves on."""
     spans, begin = [], 0
-    while begin < len(glances):
-        a, end = glances[begin], begin + 1
-        while end < len(glances) and same(a, glances[end]):
+    while begin < len(thumbnails):
+        a, end = thumbnails[begin], begin + 1
+        while end < len(thumbnails) and same(a, thumbnails[end]):
             end += 1
-        if any(moved(a, view) for view in glances[begin + 1 : end]):
-            before = glances[begin - 1].index + 1 if begin else 0
-            after = glances[end].index - 1 if end < len(glances) else len(sequence) - 1
-            span = _edge(sequence, a, a.index, before, same), _edge(sequence, a, glances[end - 1].index, after, same)
+        if any(moved(a, view) for view in thumbnails[begin + 1 : end]):
+            before = thumbnails[begin - 1].index + 1 if begin else 0
+            after = thumbnails[end].index - 1 if end < len(thumbnails) else len(sequence) - 1
+            span = _edge(sequence, a, a.index, before, same), _edge(sequence, a, thumbnails[end - 1].index, after, same)
             spans += [span] if span[1] - span[0] + 1 >= HungTuning.min_frames else []
         begin = end
     return spans
@@ -146,23 +146,23 @@ def _same_views(sequence: Sequence, glances: list[Glance], same: Test, moved: Te
 def _tests(kind: str) -> tuple[Test, Test]:
     """That images of the kind are the same, and that those of the other kind are not."""
     if kind == "color":
-        return Glance.same_color, Glance.depth_moved
-    return Glance.same_depth, Glance.color_moved_on
+        return Thumbnail.same_color, Thumbnail.depth_moved
+    return Thumbnail.same_depth, Thumbnail.color_moved_on
 
 
 def _confirm(sequence: Sequence, first: int, last: int, same: Test, moved: Test) -> Stretch | None:
     """A stretch of equal files, if the other stream moves on meanwhile: a camera at rest records the same for long."""
-    a, *others = (glance_of(sequence, k) for k in (first, (first + last) // 2, last))
+    a, *others = (thumbnail_of(sequence, k) for k in (first, (first + last) // 2, last))
     if a is None or not any(b is not None and moved(a, b) for b in others):
         return None
-    return Stretch(first, last, moved is Glance.depth_moved and a.blank)
+    return Stretch(first, last, moved is Thumbnail.depth_moved and a.blank)
 
 
-def _edge(sequence: Sequence, a: Glance, near: int, far: int, same: Test) -> int:
+def _edge(sequence: Sequence, a: Thumbnail, near: int, far: int, same: Test) -> int:
     """The last frame from `near`, which holds the image of `a`, towards `far` that does, by halving."""
     while near != far:
         middle = (near + far + (far > near)) // 2
-        view = glance_of(sequence, middle)
+        view = thumbnail_of(sequence, middle)
         if view is not None and same(a, view):
             near = middle
         else:

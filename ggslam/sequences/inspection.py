@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looking a recording over before working with it: sizes, ranges, motion, and what seems wrong."""
+"""Inspects a recording before it is used: sizes, ranges, motion, and what seems wrong."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Motion:
 
 @dataclass
 class SequenceReport:
-    """What `inspect_sequence` found.
+    """The result of `inspect_sequence`.
 
     Attributes:
         name, format, frames: of the sequence.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth that was subtracted from a constant, as pictures of depth show near things bright: at first sight it is inverse
-depth, and inverse depth is what it comes to with a large constant. Walls and floors tell a small one."""
+"""Detects depth that was subtracted from a constant, so that near things look bright. It resembles inverse depth;
+walls and floors tell the two apart if the constant is small."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class InversionTuning(Tuning):
 
 @dataclass(frozen=True)
 class Inversion:
-    """Depth is `constant` minus what is stored, metres as stored; median relative residuals of planes then, and as
-    inverse depth."""
+    """Depth is `constant` minus what is stored, in stored units; median relative residuals of planes read so, and read
+    as inverse depth."""
 
     constant: float
     residual: float

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several recordings behind one another, read as one."""
+"""Reads several recordings one after the other as one."""
 
 from __future__ import annotations
 

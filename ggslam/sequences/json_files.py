@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading descriptions written as JSON, with what is wrong told in one line."""
+"""Reads descriptions in JSON and reports errors in one line."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Live cameras: what one has to offer, opening one by its name, and a run's view of one.
+"""Live cameras: their interface, how they are opened by name, and how a run reads one.
 
 Anything with a camera and an iterator of frames is a source:
 
@@ -98,7 +98,7 @@ def _call(place: str, name: str) -> LiveSource:
 
 
 class LiveSequence:
-    """A live source as a run sees it: a sequence that ends on request, with Ctrl-C or after `stop` frames.
+    """A live source with the interface of a sequence. It ends on request, with Ctrl-C or after `stop` frames.
 
     Args:
         source: the camera.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much an LZFSE stream holds, by the headers of its blocks (lzfse_internal.h of Apple's reference): the
-decompressor makes whatever comes out."""
+"""Computes the size that an LZFSE stream expands to from its block headers (lzfse_internal.h of Apple's reference),
+because the decompressor has no limit."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class InstanceCodes:
-    """Every code that means an instance.
+    """All codes that stand for an instance.
 
     If all of them fit in uint16 they are the ids; else the ids are 1, 2, ... in the order of the codes.
 

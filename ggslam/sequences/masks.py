@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Instance masks: finding the file of each frame, and reading ids that mean the same in every frame."""
+"""Instance masks: finds the file of each frame and reads ids that mean the same in every frame."""
 
 from __future__ import annotations
 

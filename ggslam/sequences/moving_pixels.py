@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels of a recording's frames show something that moves, as a run found them: frames that are read again later
-come without it.
+"""Pixels that show something moving, as a run found them; frames that are read again later leave them out.
 
 In a file: NumPy's npz with `frames` int32 [n], `size` int32 [2] (rows, columns), `data` uint8 and `offsets` int64
 [n + 1]: bytes offsets[i] to offsets[i + 1] are zlib's of the mask of frame i, a bit for each pixel row by row, in a
@@ -31,7 +30,7 @@ MOVERS_FILE = "movers.npz"
 @savable(fixed="masks")
 @dataclass
 class MovingPixels:
-    """Masks by frame, a bit for each pixel.
+    """Masks by frame, one bit per pixel.
 
     Attributes:
         frames: their indices (`Frame.index`), in the order in which they came.

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether images show a scene at all: neighbouring pixels of noise have nothing to do with one another; and whether a
-recording shows more than one view of it."""
+"""Checks whether images show a scene, not noise, and whether a recording has more than one view of it."""
 
 from __future__ import annotations
 
@@ -8,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ggslam.sequences.glances import Glance
 from ggslam.sequences.sequence import Sequence
+from ggslam.sequences.thumbnails import Thumbnail
 from ggslam.sequences.verdicts import Verdict
 from ggslam.system.tuning import Tuning
 
@@ -34,38 +33,40 @@ class NoiseTuning(Tuning):
 REMEDY = "look how the images were written: order of bytes, 8 or 16 bits, compression, a loose cable"
 
 
-def judge_noise(glances: list[Glance], numbers: range) -> list[Verdict]:
+def judge_noise(thumbnails: list[Thumbnail], numbers: range) -> list[Verdict]:
     """Whether colour or depth is noise; `numbers`: of the frames, by their index."""
-    color = [view for view in glances if view.grain < NoiseTuning.min_grain]
-    depth = [view for view in glances if view.surface < NoiseTuning.min_surface]
+    color = [view for view in thumbnails if view.grain < NoiseTuning.min_grain]
+    depth = [view for view in thumbnails if view.surface < NoiseTuning.min_surface]
     found = []
-    if _many(color, glances):
+    if _many(color, thumbnails):
         value = max(0.0, float(np.median([view.grain for view in color])))
         how = f"neighbouring pixels have a correlation of {value:.2f}, those of scenes more than 0.8"
-        text = f"colour images show noise {_where(color, glances, numbers)}: {how}"
+        text = f"colour images show noise {_where(color, thumbnails, numbers)}: {how}"
         found.append(Verdict("color_noise", "doubtful", text))
-    if _many(depth, glances):
+    if _many(depth, thumbnails):
         value = float(np.median([view.surface for view in depth]))
         how = f"{value:.0%} of neighbouring pixels are about equally far, of scenes more than 90%"
-        text = f"depth images show noise {_where(depth, glances, numbers)}: {how}"
-        certain = len(depth) >= NoiseTuning.all_share * len(glances)
+        text = f"depth images show noise {_where(depth, thumbnails, numbers)}: {how}"
+        certain = len(depth) >= NoiseTuning.all_share * len(thumbnails)
         text += ", and nothing can be tracked by them" if certain else ""
         found.append(Verdict("depth_noise", "wrong" if certain else "doubtful", text))
     return [replace(verdict, text=f"{verdict.text}; {REMEDY}") for verdict in found]
 
 
-def _many(noisy: list[Glance], glances: list[Glance]) -> bool:
-    return len(noisy) >= min(NoiseTuning.min_frames, len(glances)) and len(noisy) > NoiseTuning.min_share * len(glances)
+def _many(noisy: list[Thumbnail], thumbnails: list[Thumbnail]) -> bool:
+    return len(noisy) >= min(NoiseTuning.min_frames, len(thumbnails)) and len(noisy) > NoiseTuning.min_share * len(
+        thumbnails
+    )
 
 
-def _where(noisy: list[Glance], glances: list[Glance], numbers: range) -> str:
-    if len(noisy) >= NoiseTuning.all_share * len(glances):
+def _where(noisy: list[Thumbnail], thumbnails: list[Thumbnail], numbers: range) -> str:
+    if len(noisy) >= NoiseTuning.all_share * len(thumbnails):
         return "in all frames"
     first, last = numbers[noisy[0].index], numbers[noisy[-1].index]
-    return f"in {len(noisy)} of {len(glances)} frames that were looked at, from {first} to {last}"
+    return f"in {len(noisy)} of {len(thumbnails)} frames that were looked at, from {first} to {last}"
 
 
-def judge_views(sequence: Sequence, glances: list[Glance]) -> list[Verdict]:
+def judge_views(sequence: Sequence, thumbnails: list[Thumbnail]) -> list[Verdict]:
     """Whether there is but one view, once or again and again: then no motion is seen."""
     if len(sequence) < NoiseTuning.min_tracked:
         number = "one frame shows" if len(sequence) == 1 else f"{len(sequence)} frames show"
@@ -76,10 +77,10 @@ def judge_views(sequence: Sequence, glances: list[Glance]) -> list[Verdict]:
         return [Verdict("no_motion", "doubtful", text)]
     same = all(
         np.array_equal(a.grey, b.grey) and np.array_equal(a.depth, b.depth)
-        for a, b in zip(glances, glances[1:], strict=False)
+        for a, b in zip(thumbnails, thumbnails[1:], strict=False)
     )
     if (
-        not same or len(glances) < NoiseTuning.min_tracked or glances[0].blank
+        not same or len(thumbnails) < NoiseTuning.min_tracked or thumbnails[0].blank
     ):  # along a bare wall, all images are alike
         return []
     text = f"all {len(sequence)} frames hold the same images: one frame, repeated, shows no motion"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The orientation tag of photographs: by which quarter turns, and mirrored or not, the camera held them."""
+"""The orientation tag of photographs: quarter turns and mirroring."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intrinsics that a user gives, instead of those that a recording or its format tells."""
+"""Intrinsics given by the user instead of the recording's own."""
 
 from __future__ import annotations
 

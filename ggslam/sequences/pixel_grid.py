@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bringing the colour, depth and mask image of a frame onto one pixel grid of one undistorted pinhole camera."""
+"""Brings the colour, depth and mask image of a frame to the pixel grid of one undistorted pinhole camera."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What walls, floors and tables say of depth: over the image of a plane 1/z changes linearly. So does what is stored if
-depth is inverse, and 1/d times the length of the ray if d was measured along it."""
+"""Tells from walls, floors and tables how depth was measured. Over a plane, 1/z is linear in the image; so are
+stored inverse depths, and 1/d times the length of the ray if d was measured along the ray."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PlaneTuning(Tuning):
 
 @dataclass(frozen=True)
 class PlaneEvidence:
-    """How flat planes are with depth read in each way of `MEASURES`.
+    """Flatness of planes for each way of reading depth in `MEASURES`.
 
     Attributes:
         windows: places that show a plane; frames: how many they are in.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways in which poses are often written, and how to turn them into ours: camera to world with OpenCV axes."""
+"""Common conventions of poses and how to convert them to ours: camera to world with OpenCV axes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether poses and depth belong together: pairs of depth images are laid over each other by the poses, read as they
-stand and as they are often written, with depth as it stands and in other units."""
+"""Checks poses against depth: pairs of depth images are overlaid by the poses, in several conventions of poses and
+units of depth."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ READINGS = {**CONVENTIONS, **SIDES}
 
 @dataclass(frozen=True)
 class PoseDoubt:
-    """How well neighbouring depth images agree by the poses.
+    """How well neighbouring depth images agree under the poses.
 
     Attributes:
         error: median relative difference of depth as it stands.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading camera poses and calibration matrices from the text files that recordings carry."""
+"""Reads camera poses and calibration matrices from the text files of recordings."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording format hands over: where the images of each frame are and how to read them."""
+"""What a recording format provides: where the images of each frame are and how to read them."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class OwnCamera:
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a user says about a recording that it does not say itself.
+    """Properties of a recording that the user gives.
 
     Attributes:
         depth_camera: YAML file with intrinsics of a depth camera that is not the colour camera, see `calibration`.
@@ -297,7 +297,7 @@ class Recording:
 
 
 class RecordingFormat(Protocol):
-    """One way of laying a recording out on disk, in a folder or in one file. Implementations hold no state."""
+    """A layout of recordings on disk, in a folder or in one file. Implementations hold no state."""
 
     name: str
     """Name for `open_sequence(format=...)`."""

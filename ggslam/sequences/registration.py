@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Registering the images of a depth camera to another camera beside it: every depth pixel is moved in space and drawn
-as a small square, the nearest surface wins."""
+"""Registers depth images to another camera: every depth pixel is moved in space and drawn as a small square, and the
+nearest surface wins."""
 
 from __future__ import annotations
 

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images that a recording holds several times: the same depth beside new colour, or the same colour beside new
-depth."""
+"""Finds images that repeat: the same depth with new colour, or the same colour with new depth."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ class RepeatTuning(Tuning):
 
 @dataclass(frozen=True)
 class Repeats:
-    """Neighbouring frames of which one image is the same and the other is not.
+    """Counts of neighbouring frames in which one image repeats and the other does not.
 
     Attributes:
         pairs: neighbours that were compared.

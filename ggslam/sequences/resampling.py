@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Making colour, depth and mask images smaller, each in the way its meaning allows."""
+"""Scales colour, depth and mask images down, each as its meaning allows."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of the cameras of a rig, read as one: instant after instant, and at each the frames of its cameras."""
+"""Reads the recordings of a rig's cameras as one: instant by instant, and at each instant the frames of its cameras."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""rig.yaml: cameras that are fixed to one another, and the recording that each of them made.
+"""rig.yaml: the cameras of a rig, their poses on it and their recordings.
 
     cameras:
       - name: front
@@ -82,7 +82,7 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class RigFile:
-    """What a file rig.yaml says: its cameras, and how many seconds apart images are that count as taken together."""
+    """The content of rig.yaml: its cameras, and the tolerance in seconds for images of one instant."""
 
     path: Path
     cameras: tuple[RigCamera, ...]

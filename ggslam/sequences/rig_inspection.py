@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looking the recordings of a rig over before working with them: which images belong together, what seems wrong."""
+"""Inspects the recordings of a rig before they are used: which images belong together, what seems wrong."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class RigInspectionTuning(Tuning):
 
 @dataclass
 class RigCameraReport:
-    """What was found of a camera of a rig.
+    """The findings for one camera of a rig.
 
     Attributes:
         name: of the camera.
@@ -53,7 +53,7 @@ class RigCameraReport:
 
 @dataclass
 class RigReport:
-    """What `inspect_rig` found.
+    """The result of `inspect_rig`.
 
     Attributes:
         name: of the rig.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which images of the cameras of a rig were taken together."""
+"""Groups images of a rig's cameras by time."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording without poses says of its depth scale: how far things lie, how high the camera is carried above the
-floor, how fast it moves between colour images. Nothing here is exact; together they tell a room from a doll's house."""
+"""Estimates whether the depth scale is plausible in a recording without poses: by the distance of things, the
+camera's height above the floor and its speed. None of these is exact; together they tell a room from a doll's house."""
 
 from __future__ import annotations
 

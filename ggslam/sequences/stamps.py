@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Times as names of images and as first numbers of lines: in seconds, or in a thousandth, millionth or billionth."""
+"""Times in names of images and at the start of lines: tells whether they are in s, ms, us or ns."""
 
 from __future__ import annotations
 

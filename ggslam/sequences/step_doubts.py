@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether colour and depth are of the same moment: outlines of a depth image are laid on the edges of the colour image
-of its own frame and of those before and after."""
+"""Checks whether colour and depth are of the same moment: outlines of a depth image are compared with the colour
+edges of its own frame and of its neighbours."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class StepTuning(Tuning):
 
 @dataclass(frozen=True)
 class StepDoubt:
-    """Where depth fits colour in time.
+    """The frame offset at which depth fits colour best.
 
     Attributes:
         behind: frames that depth is behind colour; negative: ahead of it. Either may be the largest looked at.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames read ahead of their use by one background thread, never more than a few at a time."""
+"""Reads frames ahead in one background thread, a few at a time."""
 
 from __future__ import annotations
 

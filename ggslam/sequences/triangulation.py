@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far points really are by the true poses: points matched in two colour images are triangulated, and what depth
-says of them is held against that. It tells the unit of depth, and what its numbers mean."""
+"""Triangulates points matched in two colour images from true poses and compares their distance with depth. This
+gives the unit of depth and shows how it was measured."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class TriangulationTuning(Tuning):
 
 @dataclass(frozen=True)
 class TruePoints:
-    """Points whose distance true poses tell.
+    """Points with a distance triangulated from true poses.
 
     Attributes:
         depth: as measured, float64 [n], metres if the depth scale is right and depth is z.

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of a recording that show nothing: beyond the border of an image whose lens distortion was undone, here or by
-whoever stored it."""
+"""Pixels that show nothing: fill beyond the border of an undistorted image."""
 
 from __future__ import annotations
 

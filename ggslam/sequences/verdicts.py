@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts on recordings and runs: what seems wrong, with the number that says so, and what to do about it.
+"""Verdicts on recordings and runs: what seems wrong, the number that shows it, and the remedy.
 
 Here are those that the numbers of a recording alone allow; `ggslam inspect` and runs tell them in the same words.
 """
@@ -114,7 +114,7 @@ def judge_inverse_scale(scale: float, median_m: float) -> list[Verdict]:
 
 @dataclass(frozen=True)
 class ScaleSigns:
-    """What tells how large the world of a recording is, in metres of its depth scale.
+    """Signs of the size of a recording's world, in metres at its depth scale.
 
     Attributes:
         near, median, far: 1st, 50th and 99th percentile of depth.

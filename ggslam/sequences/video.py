@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames inside a video file, decoded where they are asked for: the next one is quick, jumps seek."""
+"""Frames of a video file, decoded on demand; the next frame is fast, a jump seeks."""
 
 from __future__ import annotations
 

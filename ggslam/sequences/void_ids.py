@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The id 255 of masks, which VOC, DAVIS and their like give to pixels that nobody decided about."""
+"""Detects masks in which id 255 means "no label", as in VOC and DAVIS."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mug of the room that is lifted, carried in an arc and put down elsewhere."""
+"""A mug that is lifted, carried in an arc and put down elsewhere."""
 
 from __future__ import annotations
 

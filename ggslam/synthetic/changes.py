@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One room at two visits: things were moved, turned, taken away and put there in between."""
+"""One room at two visits: objects are moved, turned, taken away and added in between."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _AWAY = np.array([0.0, 0.0, -60.0])
 
 @dataclass(frozen=True)
 class MadeChange:
-    """What was done to an instance between the visits.
+    """A change made to an instance between the visits.
 
     Attributes:
         kind: what.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drawer that opens: where one is painted on the front of a chest, it comes out."""
+"""A drawer that opens, where one is painted on the front of a chest."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ View = Callable[[Camera, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Shutter:
-    """How the images of a frame lie in time. All are shares of the time between two frames.
+    """Exposure and read-out of a frame's images, as shares of the time between two frames.
 
     Attributes:
         blur: for which colour is exposed, 0 to 1.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moves while a generated recording is made, as the casting of rays and the truth need it."""
+"""Motion of objects in a generated recording, for the ray caster and the ground truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ggslam.synthetic.scene import Scene, Shape
 
 @dataclass(frozen=True)
 class Mover:
-    """One thing that moves.
+    """An object that moves.
 
     Attributes:
         name: of its instance; `what`: for people to read.
@@ -63,7 +63,7 @@ class Mover:
 
 @dataclass(frozen=True)
 class Views:
-    """What a camera sees of the scene at rest in some of a recording's frames, small.
+    """Small images that a camera takes of the scene at rest in some of a recording's frames.
 
     Attributes:
         camera: of the small images.
@@ -103,7 +103,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Setting:
-    """What a mover is fitted into.
+    """The scene, camera and frames that a mover is made for.
 
     Attributes:
         scene: at rest, with the names of all movers so far.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Things that move while the furnished room is recorded, with the truth about them."""
+"""Objects that move in the generated room, with the ground truth about them."""
 
 from __future__ import annotations
 

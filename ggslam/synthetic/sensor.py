@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A structured-light depth camera: what it does to perfect depth."""
+"""A model of a structured-light depth camera: turns exact depth into measured depth."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A file of arrays and a tree of plain values beside them, with a checksum: written once, read whole, never executed.
+"""A file of arrays with a tree of plain values and a checksum. It is written once, read whole and never executed.
 
 Layout: magic, length of the header (uint64), header (JSON: table of the arrays, values), the arrays one after the other
 at multiples of 64 bytes, and the CRC-32 of everything before it (uint32). Numbers are little-endian.
@@ -35,7 +35,7 @@ _WIDEST: Final = 32
 
 @dataclass(frozen=True)
 class WrittenFile:
-    """What tells a file from a damaged one: its name, number of bytes, CRC-32."""
+    """Name, size and CRC-32 of a file, which show whether it is damaged."""
 
     name: str
     size: int
@@ -44,7 +44,7 @@ class WrittenFile:
 
 @dataclass(frozen=True)
 class PendingFile:
-    """A file that is written, but under a temporary name and perhaps not on the disk yet.
+    """A file written under a temporary name, perhaps not on the disk yet.
 
     Attributes:
         path: what it is to be called.
@@ -96,7 +96,7 @@ def write_array_file(path: Path, values: Any, arrays: Sequence[np.ndarray]) -> P
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with new_file(temporary) as file:
-            out = _Summed(file)
+            out = _ChecksummedFile(file)
             out.write(_MAGIC + struct.pack("<Q", len(header)) + header)
             for array in arrays:
                 out.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
@@ -110,8 +110,8 @@ def write_array_file(path: Path, values: Any, arrays: Sequence[np.ndarray]) -> P
     return PendingFile(path, temporary, WrittenFile(path.name, out.size, crc))
 
 
-class _Summed:
-    """Counts and sums up what is written."""
+class _ChecksummedFile:
+    """Counts bytes and computes the checksum of what is written."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file, self.size, self.crc = file, 0, 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What arrays and numbers an attribute may hold, written where it is declared, and checked when a file fills it.
+"""Declares the dtype and shape of arrays beside the attribute that holds them, and checks them when a file is read.
 
     T_world_camera: Pose
     depth: Annotated[np.ndarray, Form("f4", "h", "w")]
@@ -91,7 +91,7 @@ class PoseForm(Form):
 
 
 class NotFinite:
-    """Beside a float: it may be NaN or infinite."""
+    """Marks a float that may be NaN or infinite."""
 
 
 class Between:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables as CSV that a spreadsheet shows and does not compute.
+"""Tables as CSV in which no spreadsheet takes text for a formula.
 
 A cell that begins with `=`, `+`, `-` or `@` is a formula to Excel, LibreOffice and Google Sheets, and names of
 recordings and objects come from anywhere. Source: OWASP, "CSV Injection".

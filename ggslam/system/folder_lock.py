@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One writer at a time in a folder, or of one output: a file that is locked while it writes, and that says who it is.
+"""Lets one process at a time write to a folder or an output: a lock file that names its owner.
 
 The system lets go of the lock when the process ends, however it ends: nothing is left that somebody has to remove.
 """

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Forked processes (`multiprocessing` with "fork", `os.fork`): the threads that OpenMP, and with it PyTorch, keeps for
-the next loop stay in the parent, and GNU's OpenMP would wait for them in the child forever.
+"""Forked processes (`multiprocessing` with "fork", `os.fork`): OpenMP's threads stay in the parent, and GNU's OpenMP
+would wait for them in the child forever.
 
 So `rest_before_forks` lets the forking thread's helpers end before a fork; both processes start new ones when they need
 some. Where that came too late, because ggslam was imported after the fork, `refuse_lost_threads` finds out.

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hidden folders beside what is being made, which nobody has to tidy up after: the next program that makes the same
-deletes what killed ones left."""
+"""Hidden folders for unfinished output. The next program that makes the same output deletes what killed ones left."""
 
 from __future__ import annotations
 
@@ -12,8 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ggslam.system.child_processes import is_running
 from ggslam.system.links import remove_folder
-from ggslam.system.process_tie import is_running
 
 
 @contextmanager

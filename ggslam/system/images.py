@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one decoder of pictures from files: damage is found, and memory counted, before anything is decoded.
+"""The one decoder of image files: damage is found and memory counted before anything is decoded.
 
 OpenCV returns a half-grey picture for many truncated files and only prints a warning, so the containers are checked
 first: every PNG chunk by its length and checksum, a JPEG by its end marker. How many pixels a decoder would make is

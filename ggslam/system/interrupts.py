@@ -29,7 +29,7 @@ class InterruptTuning(Tuning):
 
 
 class Interrupted(KeyboardInterrupt):
-    """As Ctrl-C, by another signal.
+    """Raised for other signals as KeyboardInterrupt is for Ctrl-C.
 
     Args:
         number: of the signal.
@@ -51,7 +51,7 @@ def interrupt_of(number: int) -> KeyboardInterrupt:
 
 
 class StopRequest:
-    """Whether somebody wants the work to end after the step it is at.
+    """A request to end the work after the current step.
 
     Attributes:
         number: of the signal that said so; None: nobody did.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Links where ggslam keeps files of its own: it makes none, so one that is there was planted or is a user's mistake.
-That goes for hard links, too, of files that are written in place: the same bytes may be somebody's file elsewhere.
+"""Refuses links where ggslam keeps its own files: it makes none, so one was planted or is a mistake. The same holds for
+hard links of files that are written in place.
 
 Whoever moves, replaces or deletes by name in such a folder asks here first. A folder that the user names may itself be
 a link: that is the user's choice.

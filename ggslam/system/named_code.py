@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Functions and classes of the user's own, by name: `module:function` or `path/to/file.py:function`."""
+"""Loads functions and classes of the user by name: `module:function` or `path/to/file.py:function`."""
 
 from __future__ import annotations
 

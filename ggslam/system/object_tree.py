@@ -28,7 +28,7 @@ from ggslam.system.typed_values import Example, declared_types, problem
 
 
 class Keeper(Protocol):
-    """Writes what never changes once, somewhere else."""
+    """Writes arrays that never change to another place, once."""
 
     def place(self, array: np.ndarray) -> list[int]:
         """Where an array is kept: numbers of file and array."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCV's exception as one of ours."""
+"""Turns OpenCV's exceptions into ours."""
 
 from __future__ import annotations
 

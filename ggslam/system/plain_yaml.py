@@ -30,11 +30,11 @@ class YamlTuning(Tuning):
 
 
 class PlainYamlError(ValueError):
-    """The text is no YAML, or no plain one; says what and where."""
+    """The text is not YAML, or uses more of YAML than is allowed; says what and where."""
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader without all that is not plain."""
+    """PyYAML's safe loader, restricted to plain YAML."""
 
     yaml_implicit_resolvers: dict[str, list[Any]] = {}
     depth = 0

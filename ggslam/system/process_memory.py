@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much memory this process takes, and giving back what it does not use."""
+"""Measures the memory of this process and gives back what it does not use."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each class says itself what of its objects is saved; objects of other classes are never made from a file.
+"""Each class declares what of its objects is saved; objects of other classes are never made from a file.
 
     @savable(not_saved="settings _helper", growing="events", check="check")
     class LoopCloser:

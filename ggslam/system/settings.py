@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How settings are declared: once, with range, unit, level and text, and checked whenever a value is given.
+"""Declares settings with their range, unit, level and text, and checks every value.
 
     @tuning_class(frozen=True)
     class PhotometricTuning:
@@ -52,7 +52,7 @@ _INTERNAL = "__internal_fields__"
 
 @dataclass(frozen=True)
 class Declaration:
-    """What a field says of itself beside its type and text.
+    """Range, unit, level and other properties of a field, beside its type and text.
 
     Attributes:
         low, high: closed range of a number; None: no number, or one without a range.
@@ -78,7 +78,7 @@ def setting(
 
 
 class Conflict(ValueError):
-    """Raised in `__post_init__` of a settings class: a field does not go with the others."""
+    """Raised in `__post_init__` of a settings class if a field contradicts others."""
 
     def __init__(self, name: str, reason: str) -> None:
         super().__init__(reason)

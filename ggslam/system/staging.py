@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder's files replaced together: the new ones are written to a hidden folder inside it, then change places.
+"""Replaces several files of a folder together: new ones are written to a hidden folder inside it and then moved into
+place.
 
 While they do, the folder's marker (a JSON file) says from where and what is to go, so that whoever finds the folder
 after the program was killed can finish. At no time is a file gone whose successor is not on the disk.
@@ -21,9 +22,9 @@ from typing import Any
 
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.system.atomic import is_machine_error, reason_of, write_text
+from ggslam.system.child_processes import is_running
 from ggslam.system.folder_lock import LockTuning, folder_lock
 from ggslam.system.links import first_link_in, refuse_link
-from ggslam.system.process_tie import is_running
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted_text
 

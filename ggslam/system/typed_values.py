@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether what a file put into an object is what its class declares there, or what its constructor put there."""
+"""Checks values from a file against the types that the class declares, or that its constructor set."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Lengths = dict[str, int]
 
 
 class AnyFloat(float):
-    """Stands for floats that may also be NaN or infinite."""
+    """Marks floats that may also be NaN or infinite."""
 
 
 
@@ -51,7 +51,7 @@ def _is_no_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Example:
-    """What stood in an attribute before: only of its kind may follow. Float may follow whole numbers' place, never the
+    """The value that an attribute had, whose type the new value must have. A float may replace a whole number, not the
     other way round."""
 
     kind: type

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files from untrusted sources: read whole and within a limit, never through a name that leads out of their folder.
+"""Reads files from untrusted sources: within a size limit, and never through a name that leads out of their folder.
 
 Recordings, runs, stores and streams are passed around, so nothing in them is trusted: not a size, not a name, not the
 kind of a file. Whoever reads one reads it through here.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Zip archives from untrusted sources: opened like any untrusted file, members read within a limit."""
+"""Reads zip archives from untrusted sources: opened like any untrusted file, members read within a limit."""
 
 from __future__ import annotations
 

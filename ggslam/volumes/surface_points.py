@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ggslam.formats.cubes_to_come import CubesToCome
+from ggslam.formats.pending_cubes import PendingCubes
 from ggslam.formats.voxel_cloud import VoxelCloud, VoxelSums, cloud_of_sums, pack
 from ggslam.geometry.scene_size import surface_reach
 from ggslam.geometry.voxels import neighbour_step, voxel_keys
@@ -105,7 +105,7 @@ class _Sweep:
     """A TSDF that forgets what no view to come reaches."""
 
     def __init__(self, tsdf: TsdfMap, of_view: list[np.ndarray], least_weight: float) -> None:
-        self._tsdf, self._to_come, self._least = tsdf, CubesToCome(of_view), least_weight
+        self._tsdf, self._to_come, self._least = tsdf, PendingCubes(of_view), least_weight
         self._handed_out = np.empty(0, np.int64)
         self._voxel = tsdf.settings.voxel
 

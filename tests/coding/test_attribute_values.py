@@ -165,7 +165,7 @@ def test_arrays_that_do_not_fit_are_refused(values: np.ndarray, own: dict, messa
 
 
 def test_settings_of_an_absent_attribute_are_refused() -> None:
-    with pytest.raises(ConfigError, match="no attribute 'id'"):
+    with pytest.raises(ConfigError, match="'id'"):
         encode_cloud(np.zeros((1, 3)), {}, CodecSettings(attributes=IDS))
 
 
@@ -180,11 +180,11 @@ def test_object_ids_come_back_exactly_without_being_asked() -> None:
 def test_a_quantiser_beyond_the_bits_is_refused() -> None:
     grid = np.arange(30).reshape(10, 3)
     colors, values = np.zeros((10, 3), np.uint8), np.arange(10, dtype=np.uint16)
-    with pytest.raises(ConfigError, match="attribute 'color': qp: expected 4 to 51 for 8 bits, found 99"):
+    with pytest.raises(ConfigError, match="'color'.*qp.*4 to 51.*8.*99"):
         encode_cloud(grid, {"color": colors}, CodecSettings(qp=99))
     assert encode_cloud(grid, {"reflectance": values}, CodecSettings(qp=99)).data
 
 
 def test_an_unknown_setting_is_named() -> None:
-    with pytest.raises(ConfigError, match="^CodecSettings: unknown setting voxel; did you mean voxel_size"):
+    with pytest.raises(ConfigError, match=r"CodecSettings.*\bvoxel\b.*voxel_size"):
         CodecSettings(voxel=3)  # type: ignore[call-arg]

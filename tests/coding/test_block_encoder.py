@@ -92,6 +92,6 @@ def test_what_cannot_be_coded(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="finite"):
         encode_blocks(blocks(points, attributes, 1000), CodecSettings(slices=3), out)
     wide = {"far": np.arange(6000, dtype=np.int64) * 20}
-    with pytest.raises(ConfigError, match="0 to 119980 do not fit in 16 bits"):
+    with pytest.raises(ConfigError, match="119980.*16"):
         encode_blocks(blocks(cloud()[0], wide, 1000), CodecSettings(slices=3), out)
     assert not list(tmp_path.iterdir())

@@ -107,9 +107,9 @@ def test_a_stream_that_ends_between_two_slices_is_noticed() -> None:
     assert len(sizes) == 4
     for there in (1, 2, 3):
         cut = data[: len(data) - int(sizes[-1] - sizes[there - 1])]
-        with pytest.raises(FormatError, match=f"{there} of its 4 slices"):
+        with pytest.raises(FormatError, match=f"{there} of .*4 slices"):
             decode_cloud(cut)
-        with pytest.raises(FormatError, match=f"{there} of its 4 slices"):
+        with pytest.raises(FormatError, match=f"{there} of .*4 slices"):
             decode_in_parts(cut)
         assert len(decode_slice(cut, 0)) == len(decode_slice(data, 0))
 
@@ -150,7 +150,7 @@ def test_made_up_payloads(fill: int | None) -> None:
 def test_a_stream_cannot_claim_more_points_than_it_can_hold(streams: list[bytes]) -> None:
     units = [(unit.kind, bytes(unit.payload)) for unit in read_units(streams[0])]
     units = [(k, p[:-3] + b"\xff\xff\xff" if k == UnitType.GEOMETRY else p) for k, p in units]
-    with pytest.raises(FormatError, match="cannot hold 16777216 points"):
+    with pytest.raises(FormatError, match="16777216"):
         decode_cloud(b"".join(unit_bytes(kind, payload) for kind, payload in units))
 
 
@@ -179,8 +179,8 @@ def test_other_units_are_skipped(streams: list[bytes], kind: UnitType) -> None:
         (UnitType.SEQUENCE_PARAMETERS, "before the sequence parameter set"),
         (UnitType.GEOMETRY_PARAMETERS, "geometry parameter set"),
         (UnitType.GEOMETRY, "before the geometry"),
-        (UnitType.ATTRIBUTE_PARAMETERS, "parameter set 0, which the stream lacks"),
-        (UnitType.ATTRIBUTE, "lacks attribute 0"),
+        (UnitType.ATTRIBUTE_PARAMETERS, "parameter set 0"),
+        (UnitType.ATTRIBUTE, "attribute 0"),
     ],
 )
 def test_missing_units_are_named(streams: list[bytes], dropped: UnitType, message: str) -> None:

@@ -93,7 +93,7 @@ def test_a_box_clips(metres: np.ndarray) -> None:
 
 
 def test_grids_of_more_than_21_bits_are_refused(metres: np.ndarray) -> None:
-    with pytest.raises(ConfigError, match="choose larger voxels"):
+    with pytest.raises(ConfigError, match=r"2\^21"):
         encode_cloud(metres, settings=CodecSettings(voxel_size=1e-6))
     with pytest.raises(ConfigError, match="too small"):
         choose_quantization(metres * 1e9, 1e-9, 10, 1.0, None)
@@ -104,7 +104,7 @@ def test_positions_must_be_numbers() -> None:
         encode_cloud(np.array([[0.0, np.nan, 1.0]]))
     with pytest.raises(FormatError, match="without points"):
         encode_cloud(np.empty((0, 3)))
-    with pytest.raises(ConfigError, match=r"expected \[N, 3\]"):
+    with pytest.raises(ConfigError, match=r"\[N, 3\]"):
         encode_cloud(np.zeros((4, 2)))
 
 

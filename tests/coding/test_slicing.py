@@ -104,7 +104,7 @@ def test_an_empty_box_is_an_empty_cloud(surface: tuple) -> None:
 
 def test_an_unknown_slice_is_refused(surface: tuple) -> None:
     data = encode_cloud(surface[0], settings=CodecSettings(slices=3)).data
-    with pytest.raises(FormatError, match="no slice 3; it has 0 to 2"):
+    with pytest.raises(FormatError, match=r"\b3\b.*0 to 2"):
         decode_slice(data, 3)
 
 

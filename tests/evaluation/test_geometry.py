@@ -78,9 +78,9 @@ def test_icp_of_a_sample_is_repeatable_and_scores_all_points() -> None:
 
 
 def test_icp_without_common_ground_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least 10 points within 0.25 m of the target, found 0 of 600"):
+    with pytest.raises(ValueError, match="10 .*0.25 m.* 0 of 600"):
         register(corner(600) + 5, corner(600))
-    with pytest.raises(ValueError, match="point 1 is not finite"):
+    with pytest.raises(ValueError, match="point 1 "):
         overlap(np.array([[0, 0, 0], [0, np.nan, 0]]), corner(600))
     with pytest.raises(ValueError, match="expected points"):
         overlap(corner(600), np.empty((0, 3)))

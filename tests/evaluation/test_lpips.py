@@ -85,7 +85,7 @@ def test_known_weights(lpips: Lpips) -> None:
 def test_unusable_images_are_refused(lpips: Lpips) -> None:
     with pytest.raises(ValueError, match="one size"):
         lpips(pattern(64, 64), pattern(64, 65))
-    with pytest.raises(ValueError, match="at least 31"):
+    with pytest.raises(ValueError, match="31"):
         lpips(pattern(30, 64), pattern(30, 64))
     assert lpips(pattern(31, 31), altered(pattern(31, 31), "negative")) > 0
 

@@ -159,7 +159,7 @@ def test_wrong_images_are_refused() -> None:
     counts = SegmentationCounts()
     with pytest.raises(ValueError, match="sizes differ"):
         counts.add(np.zeros((4, 5), np.uint16), np.zeros((5, 4), np.uint16))
-    with pytest.raises(ValueError, match="truth: expected ids uint16"):
+    with pytest.raises(ValueError, match="truth: .*uint16"):
         counts.add(np.zeros((4, 5), np.uint16), np.zeros((4, 5), np.int32))
     with pytest.raises(ValueError, match="predicted"):
         counts.add(np.zeros((4, 5, 1), np.uint16), np.zeros((4, 5), np.uint16))

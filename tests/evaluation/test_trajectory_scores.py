@@ -118,5 +118,5 @@ def test_too_few_poses_give_no_scores() -> None:
     assert score_trajectory([], []) is None
     short = score_trajectory(truth[:3], truth[:3], rpe_delta=5)
     assert short is not None and json.loads(json.dumps(short.to_dict(), allow_nan=False))["rpe_trans_m"] is None
-    with pytest.raises(ValueError, match="10 estimated and 9 true"):
+    with pytest.raises(ValueError, match="10 .*9 "):
         score_trajectory(truth, truth[:9])

@@ -69,7 +69,7 @@ def test_a_gltf_whose_nodes_share_a_mesh(gaussians: GaussianMap, tmp_path: Path)
         gltf["scenes"], gltf["scene"] = [{"nodes": list(range(places))}], 0
         (tmp_path / f"{places}.gltf").write_text(json.dumps(gltf))
     assert len(read_splats(tmp_path / "20.gltf")) == 20 * COUNT
-    with pytest.raises(FormatError, match=r"it claims 1,05\d,\d{3} Gaussians, which"):
+    with pytest.raises(FormatError, match=r"2000\.gltf.* 1,05\d,\d{3} "):
         read_splats(tmp_path / "2000.gltf")
 
 
@@ -81,7 +81,7 @@ def test_a_streamed_sog_that_repeats_itself(kind: str, gaussians: GaussianMap, t
              for k in range(100)]  # fmt: skip
     index = {"tree": {"children": nodes}, "filenames": ["a.sog"] * (100 if many else 1)}
     (tmp_path / "lod-meta.json").write_text(json.dumps(index))
-    with pytest.raises(FormatError, match="names a file twice" if many else "names more Gaussians than"):
+    with pytest.raises(FormatError, match="twice" if many else "more Gaussians than"):
         read_splats(tmp_path / "lod-meta.json")
     index["tree"]["children"] = nodes[:1]
     index["filenames"] = ["a.sog"]

@@ -73,10 +73,10 @@ def test_all_properties_are_of_one_type(tmp_path: Path) -> None:
         broken = vertex.copy()
         broken["object_id"][7] = odd
         write_ply(tmp_path / "odd.ply", {"vertex": broken})
-        with pytest.raises(FormatError, match=r"'object_id' of vertex 7 is .*whole number"):
+        with pytest.raises(FormatError, match=r"'object_id' of vertex 7 "):
             read_gaussian_ply(tmp_path / "odd.ply")
     written.object_id[3] = 2**24 + 1
-    with pytest.raises(FormatError, match=r"map\.ply: object ids are at most 16777216"):
+    with pytest.raises(FormatError, match=r"map\.ply: .*16777216"):
         write_gaussian_ply(tmp_path / "map.ply", written, EXTRAS)
     np.testing.assert_array_equal(read_ply(tmp_path / "map.ply").elements["vertex"], vertex)
 
@@ -170,17 +170,17 @@ def test_damaged_maps_are_refused(tmp_path: Path) -> None:
     names = list(vertex.dtype.names or ())
     refused(vertex[[n for n in names if n not in ("scale_2", "rot_3")]].copy(), "scale_2.*rot_3")
     refused(vertex[[n for n in names if n != "f_rest_4"]].copy(), "not numbered")
-    refused(vertex[[n for n in names if n != "f_rest_8"]].copy(), "expected 0, 9, 24 or 45")
+    refused(vertex[[n for n in names if n != "f_rest_8"]].copy(), "0, 9, 24 or 45")
     broken = vertex.copy()
     broken["scale_1"][7] = np.nan
-    refused(broken, "'scale_1' of vertex 7 is nan")
+    refused(broken, "'scale_1'.* 7 .*nan")
     broken = vertex.copy()
     for i in range(4):
         broken[f"rot_{i}"][3] = 0
-    refused(broken, "quaternion of vertex 3 is zero")
+    refused(broken, "quaternion.* 3 ")
     refused(vertex.astype([(n, "u1" if n == "rot_0" else "f4") for n in names]), "rot_0.*floating")
     write_ply(path, {"points": vertex})
-    with pytest.raises(FormatError, match="holds no Gaussians"):
+    with pytest.raises(FormatError, match=r"bad\.ply.*no Gaussians"):
         read_gaussian_ply(path)
 
 

@@ -140,7 +140,7 @@ def test_blocks_are_the_whole_without_the_bad_ones(tmp_path: Path) -> None:
 def test_files_without_a_good_gaussian_are_refused(tmp_path: Path) -> None:
     vertex = rows(5)
     vertex["x"] = np.nan
-    with pytest.raises(FormatError, match="no Gaussian that can be drawn.*5 of 5"):
+    with pytest.raises(FormatError, match=r"map\.ply.*5 of 5"):
         open_splats(stored(tmp_path / "map.ply", vertex))
-    with pytest.raises(FormatError, match="no Gaussians in a format that is known"):
+    with pytest.raises(FormatError, match=r"points\.ply"):
         open_splats(stored(tmp_path / "points.ply", rows(5, ["x", "y", "z"])))

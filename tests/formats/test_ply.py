@@ -101,7 +101,7 @@ def test_every_cut_is_refused(tmp_path: Path, encoding: str) -> None:
         (("element vertex 2", "element vertex -1"), "negative count"),
         (("element vertex 2", "element vertex many"), "header line 4"),
         (("element vertex 2", "element vertex"), "header line 4"),
-        (("property float x", "property quad x"), "unknown type 'quad'"),
+        (("property float x", "property quad x"), "'quad'"),
         (("property float x", "property float y"), "declared twice"),
         (("list uchar int", "list float int"), "list length"),
         (("format binary_little_endian 1.0", "format middle_endian 1.0"), "format line"),
@@ -124,10 +124,10 @@ def test_damaged_lists_and_numbers_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.ply"
     text = "ply\nformat {} 1.0\nelement face 2\nproperty list {} int i\nend_header\n"
     path.write_bytes(text.format("binary_little_endian", "int").encode() + np.array([2**31 - 1, 1], "<i4").tobytes())
-    with pytest.raises(FormatError, match="truncated or damaged"):
+    with pytest.raises(FormatError, match=r"bad\.ply"):
         read_ply(path)
     path.write_bytes(text.format("binary_little_endian", "int").encode() + np.array([-1, 1], "<i4").tobytes())
-    with pytest.raises(FormatError, match="truncated or damaged"):
+    with pytest.raises(FormatError, match=r"bad\.ply"):
         read_ply(path)
     for body in ("1 2\nnan 3\n", "1 2\n-1 3\n", "1 2\n1 2.5\n", "1 2\n1 3000000000\n", "1 x\n1 2\n"):
         path.write_text(text.format("ascii", "uchar") + body)
@@ -136,7 +136,7 @@ def test_damaged_lists_and_numbers_are_refused(tmp_path: Path) -> None:
 
 
 def test_missing_file_endless_header_and_unwritable_values(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="file is missing"):
+    with pytest.raises(FormatError, match=r"none\.ply.*missing"):
         read_ply(tmp_path / "none.ply")
     (tmp_path / "long.ply").write_bytes(b"ply\n" + b"comment x\n" * 200_000)
     with pytest.raises(FormatError, match="end_header"):
@@ -147,7 +147,7 @@ def test_missing_file_endless_header_and_unwritable_values(tmp_path: Path) -> No
         write_ply(tmp_path / "a.ply", {"vertex": VERTEX}, ["a\nend_header"])
     with pytest.raises(ValueError, match="one ASCII word"):
         write_ply(tmp_path / "a.ply", {"a b": VERTEX})
-    with pytest.raises(RunFolderError, match="No such file"):
+    with pytest.raises(RunFolderError, match=r"a\.ply"):
         write_ply(tmp_path / "none" / "a.ply", {"vertex": VERTEX})
     assert not (tmp_path / "a.ply").exists()
 
@@ -158,7 +158,7 @@ def test_a_write_that_breaks_off_leaves_the_old_file(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))  # stands in for a disk that is full after 4 KiB
     try:
-        with pytest.raises(RunFolderError, match=r"cannot write .*a\.ply: File too large"):
+        with pytest.raises(RunFolderError, match=r"a\.ply: File too large"):
             write_ply(tmp_path / "a.ply", {"vertex": np.repeat(VERTEX, 10_000)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)

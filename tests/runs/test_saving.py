@@ -96,9 +96,9 @@ def test_a_whole_run_of_a_part(room: Path, tmp_path: Path) -> None:
     part = ggslam.open_sequence(room, scale=0.5)[4:8]
     outcome = ggslam.run_recording(part, tmp_path / "run", overrides=SETTINGS, evaluate=False)
     assert [frame.source_index for frame in outcome.result.frames] == [4, 5, 6, 7]
-    with pytest.raises(ConfigError, match="run_recording: choose scale when the sequence is opened"):
+    with pytest.raises(ConfigError, match="run_recording: .*scale"):
         ggslam.run_recording(part, tmp_path / "again", scale=0.5)
-    with pytest.raises(ConfigError, match="no such argument of open_sequence in strid"):
+    with pytest.raises(ConfigError, match="open_sequence.*strid"):
         ggslam.run_recording(room, tmp_path / "again", strid=2)
     with pytest.raises(SequenceError, match="no such folder"):
         ggslam.run_recording(tmp_path / "nothing", tmp_path / "again")
@@ -107,13 +107,13 @@ def test_a_whole_run_of_a_part(room: Path, tmp_path: Path) -> None:
 def test_a_file_is_no_run(tmp_path: Path) -> None:
     container = tmp_path / "map.ggz"
     container.write_bytes(b"PK")
-    with pytest.raises(RunFolderError, match="is a file, and a run is a folder; `ggslam decode` makes one of it"):
+    with pytest.raises(RunFolderError, match="file.*`ggslam decode`"):
         RunFolder.open(container)
 
 
 def test_unknown_exports(made: Made, tmp_path: Path) -> None:
     folder = ggslam.save_run(made[1], tmp_path / "run")
-    with pytest.raises(ConfigError, match="`format`: expected one of ply.*found 'stl'"):
+    with pytest.raises(ConfigError, match="`format`: .*ply.*'stl'"):
         ggslam.export_run(folder, tmp_path / "x", "stl")
-    with pytest.raises(ConfigError, match="`objects` goes with `format` ply, segmented, mesh, .*, usd, not pcd"):
+    with pytest.raises(ConfigError, match="`objects`.*`format` ply, segmented, mesh, .*, usd.*pcd"):
         ggslam.export_run(folder, tmp_path / "x", "pcd", objects="all")

@@ -101,7 +101,7 @@ def test_confidence(make_more: Callable[[str], Path], name: str) -> None:
         finer = 4 if name in FINER else 1
         depth = sequence.frame(1).depth[5 * finer]
         assert np.flatnonzero(depth)[0] == first_seen * finer
-    with pytest.raises(SequenceError, match="min_confidence: expected 0, 1 or 2, found 3"):
+    with pytest.raises(SequenceError, match="min_confidence.*0, 1 or 2.*3"):
         open_sequence(place, min_confidence=3)
 
 
@@ -149,9 +149,9 @@ def test_transforms_with_distortion_and_units(make_more: Callable[[str], Path]) 
         path.write_text(json.dumps({**content, "camera_model": model, "k1": 0.3}))
         assert len(open_sequence(folder)) == FRAMES
     for change, message in (
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model EQUIRECTANGULAR is not supported"),
-        ({"fl_x": -1}, "impossible camera"), ({"frames": 3}, "'frames'"),
-        ({"cx": "wide"}, "expected a number for 'cx'"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
+        ({"fl_x": -1}, "-1"), ({"frames": 3}, "'frames'"),
+        ({"cx": "wide"}, "'cx'"),
     ):  # fmt: skip
         path.write_text(json.dumps({**content, **change}))
         with pytest.raises(SequenceError, match=rf"transforms\.json.*{message}"):
@@ -159,7 +159,7 @@ def test_transforms_with_distortion_and_units(make_more: Callable[[str], Path]) 
     for frame in content["frames"]:
         del frame["depth_file_path"]
     path.write_text(json.dumps(content))
-    with pytest.raises(SequenceError, match="has no depth_file_path or depth_path: a recording without depth"):
+    with pytest.raises(SequenceError, match="depth_file_path or depth_path"):
         open_sequence(folder)
 
 
@@ -236,13 +236,13 @@ def test_ros_depth_of_another_camera_is_registered(tmp_path: Path) -> None:
 
 def test_ros_topics_can_be_given(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "walk.bag", False)
-    with pytest.raises(SequenceError, match=r"no topic /nowhere \(for color\); it holds /camera"):
+    with pytest.raises(SequenceError, match="/nowhere .*color.*/camera"):
         open_sequence(bag, topics=["color=/nowhere"])
-    with pytest.raises(SequenceError, match="topic: expected ROLE=TOPIC with a role of color"):
+    with pytest.raises(SequenceError, match="ROLE=TOPIC.*color"):
         open_sequence(bag, topics=["sound=/camera/color/image_raw"])
-    with pytest.raises(SequenceError, match="16UC1 is no colour that is known"):
+    with pytest.raises(SequenceError, match="16UC1"):
         open_sequence(bag, topics=["color=/camera/aligned_depth_to_color/image_raw"])
-    with pytest.raises(SequenceError, match="sensor_msgs/.*Image holds no pose"):
+    with pytest.raises(SequenceError, match="sensor_msgs/.*Image.*pose"):
         open_sequence(bag, topics=["pose=/camera/color/image_raw"])
     assert open_sequence(bag).ground_truth is None
 
@@ -266,10 +266,10 @@ def test_seven_scenes_registered_by_a_calibration(make: Callable[[str], Path], t
     np.testing.assert_allclose(row[:11], 3.0)
     assert (row[17:19] == 0).any()  # behind the square: seen by colour, not by depth
     calibration.write_text(lines + color)
-    with pytest.raises(SequenceError, match=r"depth\.yaml: entry 'T_color_depth' is missing"):
+    with pytest.raises(SequenceError, match=r"depth\.yaml: .*'T_color_depth'.*missing"):
         open_sequence(folder, depth_camera=calibration)
     calibration.write_text(lines + T.replace("-0.1", "nan"))
-    with pytest.raises(SequenceError, match="16 numbers of a rigid transform"):
+    with pytest.raises(SequenceError, match="'T_color_depth'.*16 numbers"):
         open_sequence(folder, depth_camera=calibration)
 
 
@@ -291,5 +291,5 @@ def test_folder_with_a_depth_camera_of_other_size_and_aspect(make: Callable[[str
 def test_confidence_of_another_size(make_more: Callable[[str], Path]) -> None:
     folder = make_more("strayscanner")
     assert cv2.imwrite(str(folder / "confidence" / "000002.png"), confidence((16, 12)))
-    with pytest.raises(SequenceError, match=r"000002\.png: expected confidence of 32x24 like depth, found 16x12"):
+    with pytest.raises(SequenceError, match=r"000002\.png: .*32x24.*16x12"):
         open_sequence(folder).frame(2)

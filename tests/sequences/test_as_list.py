@@ -28,7 +28,7 @@ def test_indices(room: Path) -> None:
     assert sequence[0].source_index == 2 and sequence[-1].source_index == 10 and sequence[-1].index == 4
     assert same(sequence[np.int64(1)], sequence.frame(1))
     for wrong in (5, -6):
-        with pytest.raises(IndexError, match=f"-5 to 4, found {wrong}"):
+        with pytest.raises(IndexError, match=f"-5.*4.*{wrong}"):
             sequence[wrong]
     with pytest.raises(TypeError):
         sequence["first"]  # type: ignore[call-overload]
@@ -44,7 +44,7 @@ def test_slices_are_sequences(room: Path) -> None:
     assert np.array_equal(part.timestamps, sequence.timestamps[7:17:3])
     assert part.has_masks and same(part[0], sequence[7]) and len(sequence) == 24
     assert len(sequence[30:]) == 0 and list(sequence[30:]) == [] and not sequence[30:].has_masks
-    with pytest.raises(SequenceError, match="step of a slice must be at least 1, found -1"):
+    with pytest.raises(SequenceError, match="slice.* 1.* -1"):
         sequence[::-1]
 
 
@@ -98,7 +98,7 @@ def test_batches_of_frames_that_lack_something(room: Path) -> None:
     last = open_sequence(room, start=2, stop=8, stride=2)[1:][-1]
     assert [collate_frames([last])[name].tolist() for name in ("index", "source_index")] == [[1], [6]]
     small = open_sequence(room, stop=1, scale=0.5)[0]
-    with pytest.raises(SequenceError, match="one size, found 80x60, 160x120"):
+    with pytest.raises(SequenceError, match="80x60, 160x120"):
         collate_frames([frame, small])
-    with pytest.raises(SequenceError, match="found none"):
+    with pytest.raises(SequenceError, match="none"):
         collate_frames([])

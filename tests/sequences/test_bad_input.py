@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,37 +44,37 @@ def break_frame(folder: Path, damage: str) -> str:
     color, depth = replica_file(folder, "frame", 3), replica_file(folder, "depth", 3)
     if damage == "missing depth":
         depth.unlink()
-        return r"frame 3: depth file .*depth000003\.png is missing"
+        return r"frame 3: .*depth000003\.png is missing"
     if damage == "truncated png":
         noisy_image(depth, True)
         truncate(depth)
-        return r"depth000003\.png: PNG is truncated"
+        return r"depth000003\.png: .*truncated"
     if damage == "truncated in the last bytes":
         noisy_image(depth, True)
         depth.write_bytes(depth.read_bytes()[:-12])
-        return r"depth000003\.png: PNG is truncated: no end marker"
+        return r"depth000003\.png: .*end marker"
     if damage == "flipped bit":
         noisy_image(depth, True)
         content = bytearray(depth.read_bytes())
         content[len(content) // 2] ^= 4
         depth.write_bytes(content)
-        return r"depth000003\.png: PNG is damaged: wrong checksum"
+        return r"depth000003\.png: .*checksum"
     if damage == "truncated jpg":
         noisy_image(color, False)
         truncate(color, 0.8)
-        return r"frame000003\.jpg: JPEG is truncated"
+        return r"frame000003\.jpg: .*truncated"
     if damage == "empty file":
         color.write_bytes(b"")
-        return r"frame000003\.jpg: file is empty"
+        return r"frame000003\.jpg: .*empty"
     if damage == "text file":
         color.write_text("not an image at all")
-        return r"frame000003\.jpg: expected a PNG or JPEG image"
+        return r"frame000003\.jpg: .*PNG or JPEG"
     if damage == "depth of another size":
         assert cv2.imwrite(str(depth), np.ones((12, 16), np.uint16))
-        return r"depth000003\.png: expected depth of 32x24 as in the first frame, found 16x12"
+        return r"depth000003\.png: .*32x24.*16x12"
     if damage == "8-bit depth":
         assert cv2.imwrite(str(depth), np.ones((24, 32), np.uint8))
-        return r"depth000003\.png: expected a 16-bit depth image with one channel, found 1 channel of 8-bit"
+        return r"depth000003\.png: .*16-bit.*8-bit"
     raise AssertionError(damage)
 
 
@@ -102,30 +103,30 @@ def test_damaged_frame(make: Make, damage: str) -> None:
 def test_first_frame_damaged(make: Make) -> None:
     folder = make("replica")
     replica_file(folder, "depth", 0).write_bytes(b"")
-    with pytest.raises(SequenceError, match="file is empty"):
+    with pytest.raises(SequenceError, match=r"depth000000\.png: .*empty"):
         open_sequence(folder)
     assert read_all(folder, on_bad_frame="skip") == 4
     for i in range(5):
         replica_file(folder, "depth", i).write_bytes(b"")
-    with pytest.raises(SequenceError, match="none of 5 frames can be read"):
+    with pytest.raises(SequenceError, match=r"\b5 frames.*depth000000\.png"):
         open_sequence(folder, on_bad_frame="skip")
 
 
 def test_no_recording(tmp_path: Path) -> None:
-    with pytest.raises(SequenceError, match="no such folder or file"):
+    with pytest.raises(SequenceError, match=str(tmp_path / "nowhere")):
         open_sequence(tmp_path / "nowhere")
     (tmp_path / "file").write_text("x")
-    with pytest.raises(SequenceError, match="found a file"):
+    with pytest.raises(SequenceError, match=f"{tmp_path / 'file'}.*found a file"):
         open_sequence(tmp_path / "file")
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(SequenceError, match="it holds nothing"):
+    with pytest.raises(SequenceError, match=f"{empty}.*holds nothing"):
         open_sequence(empty)
     (empty / "holiday.mp4").write_text("x")
-    with pytest.raises(SequenceError, match=r"(?s)it holds holiday\.mp4.*replica: results/frame") as caught:
+    with pytest.raises(SequenceError, match=r"(?s)holiday\.mp4.*replica: results/frame") as caught:
         open_sequence(empty)
     assert all(name in str(caught.value) for name in ("tum:", "7scenes:", "scannet:", "folder:"))
-    with pytest.raises(SequenceError, match="unknown format 'kitti'; known: .*replica"):
+    with pytest.raises(SequenceError, match="kitti.*replica"):
         open_sequence(empty, format="kitti")
     for name in ("replica", "tum", "7scenes", "scannet", "folder", "synthetic"):
         with pytest.raises(SequenceError):
@@ -135,17 +136,17 @@ def test_no_recording(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"start": 5}, "start must be from 0 to 4, found 5"),
-        ({"start": -1}, "start must be from 0 to 4, found -1"),
-        ({"stop": 0}, "stop must be above start 0, found 0"),
-        ({"start": 3, "stop": 3}, "stop must be above start 3, found 3"),
-        ({"stride": 0}, "stride must be at least 1, found 0"),
-        ({"scale": 0.0}, "`scale`: expected"),
-        ({"scale": 2.0}, "`scale`: expected"),
-        ({"depth_scale": 0.0}, "depth scale must be a positive number"),
-        ({"depth_scale": 1e-320}, "depth scale must be a positive number"),
-        ({"masks": "/nowhere/at/all"}, "masks folder /nowhere/at/all does not exist"),
-        ({"on_bad_frame": "ignore"}, "`on_bad_frame`: expected 'error' or 'skip'"),
+        ({"start": 5}, "start.* 0 .* 4.* 5"),
+        ({"start": -1}, "start.* 0 .* 4.* -1"),
+        ({"stop": 0}, "stop.*start 0.* 0"),
+        ({"start": 3, "stop": 3}, "stop.*start 3.* 3"),
+        ({"stride": 0}, "stride.* 1.* 0"),
+        ({"scale": 0.0}, r"`scale`.* 0(\.0)?$"),
+        ({"scale": 2.0}, r"`scale`.* 2(\.0)?$"),
+        ({"depth_scale": 0.0}, "depth scale.* 0"),
+        ({"depth_scale": 1e-320}, "depth scale.* 1e-320|9.99"),
+        ({"masks": "/nowhere/at/all"}, "/nowhere/at/all"),
+        ({"on_bad_frame": "ignore"}, "`on_bad_frame`.*error.*skip"),
     ],
 )
 def test_impossible_options(make: Make, options: dict[str, object], message: str) -> None:
@@ -165,9 +166,9 @@ def test_short_trajectory(make: Make) -> None:
     (folder / "traj.txt").write_text("\n".join(lines[:3]))
     short = open_sequence(folder)
     assert short.ground_truth is not None and np.isnan(short.ground_truth[:, 0, 0]).tolist() == [False] * 3 + [True] * 2
-    assert "traj.txt: holds 3 poses for 5 frames; they are taken for the first 3" in short.warnings[0]
+    assert re.search(r"traj\.txt: .*\b3 poses.*\b5 frames", short.warnings[0])
     (folder / "traj.txt").write_text("\n".join([*lines[:2], "1 2 3", *lines[3:]]))
-    assert "traj.txt, line 3: expected 16 or 12 numbers, found 3" in without_pose_2(folder)
+    assert re.search(r"traj\.txt, line 3: .*16 or 12.* 3", without_pose_2(folder))
     (folder / "traj.txt").write_text("\n".join([*lines[:2], lines[2].replace(lines[2].split()[3], "nan"), *lines[3:]]))
     assert "traj.txt, line 3: pose holds NaN" in without_pose_2(folder)
     (folder / "traj.txt").write_bytes(b"\xff\xfe\x00")
@@ -179,17 +180,17 @@ def test_wrong_aspect(make: Make) -> None:
     folder = make("folder")
     for i in range(5):
         assert cv2.imwrite(str(folder / "depth" / f"{i}.png"), np.ones((20, 32), np.uint16))
-    with pytest.raises(SequenceError, match=r"0\.png: depth is 32x20, but colour 0\.png is 32x24"):
+    with pytest.raises(SequenceError, match=r"0\.png.*32x20.*0\.png.*32x24"):
         open_sequence(folder)
 
 
 def test_tum_bad_lists(make: Make) -> None:
     folder = make("tum")
     (folder / "rgb.txt").write_text("# nothing\n")
-    with pytest.raises(SequenceError, match=r"rgb\.txt: lists no images"):
+    with pytest.raises(SequenceError, match=r"rgb\.txt: .*no images"):
         open_sequence(folder)
     (folder / "rgb.txt").write_text("1000.0 rgb/a.png\nbroken\n")
-    with pytest.raises(SequenceError, match=r"rgb\.txt, line 2: expected 'time file', found 'broken'"):
+    with pytest.raises(SequenceError, match=r"rgb\.txt, line 2: .*'broken'"):
         open_sequence(folder)
 
 
@@ -232,15 +233,15 @@ def without_pose_2(folder: Path) -> str:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("width: 32\n", "entry 'height' is missing"),
+        ("width: 32\n", "'height'"),
         ("[", "not YAML"),
-        ("", "expected entries width"),
-        ("width: 32\nheight: 24\nfx: wide\nfy: 3\ncx: 1\ncy: 1\n", "expected a number for 'fx', found 'wide'"),
-        (f"width: {'9' * 400}\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\n", "expected a number for 'width'"),
-        ("width: 32\nheight: 24\nfx: -3\nfy: 3\ncx: 1\ncy: 1\n", "impossible camera"),
-        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1e7\ncy: 1\n", "impossible principal point 1e.07, 1 of"),
-        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\n", "entry 'depth_scale' is missing"),
-        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\ndepth_scale: 1\ndistortion: [1]\n", "for 'distortion'"),
+        ("", "width"),
+        ("width: 32\nheight: 24\nfx: wide\nfy: 3\ncx: 1\ncy: 1\n", "'fx'.*'wide'"),
+        (f"width: {'9' * 400}\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\n", "'width'"),
+        ("width: 32\nheight: 24\nfx: -3\nfy: 3\ncx: 1\ncy: 1\n", "-3"),
+        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1e7\ncy: 1\n", "1e.07, 1 "),
+        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\n", "'depth_scale'"),
+        ("width: 32\nheight: 24\nfx: 3\nfy: 3\ncx: 1\ncy: 1\ndepth_scale: 1\ndistortion: [1]\n", "'distortion'"),
     ],
 )
 def test_folder_bad_settings(make: Make, text: str, message: str) -> None:
@@ -261,7 +262,7 @@ def test_icl_nuim_numbers_beyond_counting(tmp_path: Path) -> None:
     path = make_icl_nuim(tmp_path) / "associations.txt"
     first = path.read_text().splitlines()[0].split()
     path.write_text(" ".join([first[0], first[1], "inf", *first[3:]]) + "\n")
-    with pytest.raises(SequenceError, match=r"associations\.txt, line 1: expected 'number"):
+    with pytest.raises(SequenceError, match=r"associations\.txt, line 1: "):
         open_sequence(path.parent)
 
 
@@ -270,14 +271,14 @@ def test_names_that_no_file_can_have(tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     content["frames"][0]["file_path"] = "images/" + "9" * 300
     path.write_text(json.dumps(content))
-    with pytest.raises(SequenceError, match="9999.*: File name too long"):
+    with pytest.raises(SequenceError, match="9999.*: .*too long"):
         open_sequence(path.parent)
 
 
 def test_replica_bad_parameters(make: Make) -> None:
     folder = make("replica")
     (folder / "cam_params.json").write_text('{"camera": {"w": 32}}')
-    with pytest.raises(SequenceError, match=r"cam_params\.json, camera: entry 'h' is missing \(`camera` or"):
+    with pytest.raises(SequenceError, match=r"cam_params\.json, camera: .*'h'.*`camera`"):
         open_sequence(folder)
 
 
@@ -285,7 +286,7 @@ def test_masks_that_belong_to_nothing(make: Make, tmp_path: Path) -> None:
     masks = tmp_path / "masks"
     masks.mkdir()
     assert cv2.imwrite(str(masks / "900.png"), np.zeros((24, 32), np.uint8))
-    with pytest.raises(SequenceError, match=r"no mask is named like frame000000\.jpg; found 900\.png"):
+    with pytest.raises(SequenceError, match=r"frame000000\.jpg.*900\.png"):
         open_sequence(make("replica"), masks=masks)
 
 

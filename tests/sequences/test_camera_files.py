@@ -261,26 +261,26 @@ def test_what_opencv_writes_is_what_opencv_reads(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        ("ost.yaml", ros("thin_prism", FOUR), "lens distortion of the model 'thin_prism' cannot be undone"),
-        ("camchain.yaml", kalibr(model="fov", values=(0.9,)), "the model 'fov' cannot be undone"),
-        ("camchain.yaml", kalibr(camera="omni"), "cam0: the camera model 'omni' is not supported"),
-        ("camchain.yaml", kalibr() + kalibr().replace("cam0", "cam1"), "holds cam0, cam1; leave only"),
-        ("cameras.txt", colmap("THIN_PRISM_FISHEYE", *[1.0] * 12), "COLMAP's model THIN_PRISM_FISHEYE is not su"),
-        ("cameras.txt", colmap("PINHOLE", FX, FY, *CORNER) + "2 PINHOLE 640 480 1 1 1 1\n", "holds 2 cameras"),
-        ("cameras.txt", colmap("PINHOLE", FX, FY), "expected width, height and fx, fy, cx, cy of PINHOLE"),
+        ("ost.yaml", ros("thin_prism", FOUR), "thin_prism"),
+        ("camchain.yaml", kalibr(model="fov", values=(0.9,)), "fov"),
+        ("camchain.yaml", kalibr(camera="omni"), "cam0.*omni"),
+        ("camchain.yaml", kalibr() + kalibr().replace("cam0", "cam1"), "cam0, cam1"),
+        ("cameras.txt", colmap("THIN_PRISM_FISHEYE", *[1.0] * 12), "THIN_PRISM_FISHEYE"),
+        ("cameras.txt", colmap("PINHOLE", FX, FY, *CORNER) + "2 PINHOLE 640 480 1 1 1 1\n", r"\b2\b"),
+        ("cameras.txt", colmap("PINHOLE", FX, FY), "PINHOLE"),
         ("rs.json", CASES["realsense"][1].replace("[0.0, 0.0, 0.0, 0.0, 0.0]", "[0.1, 0, 0, 0, 0]"),
-         "model 'Inverse Brown Conrady' cannot be undone"),
-        ("K.txt", f"{FX} 5.0 {CX}\n0 {FY} {CY}\n0 0 1\n", "skew .5. is not supported"),
-        ("K.txt", f"-{FX} 0 {CX}\n0 {FY} {CY}\n0 0 1\n", "expected positive focal lengths"),
-        ("K.txt", "1 2 3 4 5 6\n", "'fx fy cx cy', or COLMAP's cameras.txt; found 6 numbers"),
-        ("K.txt", "hello\n", "found 'hello'"),
-        ("ost.yaml", ros("plumb_bob", FIVE).replace("cols: 5", "cols: 4"), "expected 1 x 4 numbers, found 5"),
-        ("ost.yaml", ros("plumb_bob", (0.1, 0.2, 0.3)), "coefficients of 'plumb_bob' for 'distortion', found 3"),
+         "Inverse Brown Conrady"),
+        ("K.txt", f"{FX} 5.0 {CX}\n0 {FY} {CY}\n0 0 1\n", "skew .5."),
+        ("K.txt", f"-{FX} 0 {CX}\n0 {FY} {CY}\n0 0 1\n", "focal"),
+        ("K.txt", "1 2 3 4 5 6\n", r"\b6\b"),
+        ("K.txt", "hello\n", "hello"),
+        ("ost.yaml", ros("plumb_bob", FIVE).replace("cols: 5", "cols: 4"), "1 x 4.*5"),
+        ("ost.yaml", ros("plumb_bob", (0.1, 0.2, 0.3)), "plumb_bob.*distortion.*3"),
         ("info.yaml", ECHO.replace("  width: 0", "  width: 320").replace("  x_offset: 0", "  x_offset: 9"), "cut out"),
-        ("orb.yaml", ORB2.replace("Camera.cy", "Camera.zy"), "entry 'cy' is missing"),
-        ("orb.yaml", STELLA.replace("perspective", "equirectangular"), "model 'equirectangular' cannot be undone"),
+        ("orb.yaml", ORB2.replace("Camera.cy", "Camera.zy"), "'cy'"),
+        ("orb.yaml", STELLA.replace("perspective", "equirectangular"), "equirectangular"),
         ("d.yaml", "width: 640\nheight: 480\nfx: 1\nfy: 1\ncx: 1\ncy: 1\nT_color_depth: [1]\n",
-         "is the calibration of a depth camera .it holds T_color_depth.*`depth_camera`"),
+         "T_color_depth.*`depth_camera`"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_refused_by_name(tmp_path: Path, file: str, text: str, message: str) -> None:
@@ -300,7 +300,7 @@ def test_other_sizes_are_scaled_or_refused(make: Callable[[str], Path], tmp_path
     np.testing.assert_allclose((c.fx, c.fy, c.cx, c.cy), expected, rtol=1e-12)
     assert sequence.camera_source.endswith(", scaled from 640x480 to images of 32x24")
     path.write_text(path.read_text().replace("image_height: 480", "image_height: 360"))
-    with pytest.raises(SequenceError, match="image is 32x24, but the intrinsics of the recording are for 640x360"):
+    with pytest.raises(SequenceError, match="32x24.*640x360"):
         open_sequence(folder, camera=path)
 
 
@@ -322,7 +322,7 @@ def test_a_depth_camera_by_another_programs_file(make: Callable[[str], Path], tm
     folder, T = make("folder"), "T_color_depth: [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
     theirs, ours = tmp_path / "ros.yaml", tmp_path / "ours.yaml"
     theirs.write_text(ros("plumb_bob", (0.0,) * 5))
-    with pytest.raises(SequenceError, match="ros.yaml: entry 'T_color_depth' is missing: the 16 numbers, row by row"):
+    with pytest.raises(SequenceError, match=r"ros\.yaml.*T_color_depth"):
         open_sequence(folder, depth_camera=theirs)
     theirs.write_text(ros("plumb_bob", (0.0,) * 5) + T)
     ours.write_text(f"width: 640\nheight: 480\nfx: {FX}\nfy: {FY}\ncx: {CX}\ncy: {CY}\n{T}")
@@ -360,7 +360,7 @@ def test_a_file_in_the_folder_is_found(make: Callable[[str], Path], name: str) -
     rate = "30 frames/s of calibration.yaml" if name == "orb-slam2" else "nominal 30 frames/s"
     assert open_sequence(folder, depth_scale=5000).time_source == rate
     (folder / "K.txt").write_text("1 1 1 1")
-    with pytest.raises(SequenceError, match=rf"holds .*{file}.*; which is the colour camera's is told by `camera`"):
+    with pytest.raises(SequenceError, match=rf"{file}.*`camera`"):
         open_sequence(folder, depth_scale=5000)
     assert open_sequence(folder, depth_scale=5000, intrinsics="30 31 15 11").camera.fx == 30
 

@@ -182,8 +182,8 @@ def test_misaligned(copy: Path, shift: tuple[int, int], scale: float) -> None:
 
 
 def test_a_convention_that_is_none(copy: Path) -> None:
-    with pytest.raises(SequenceError, match="known: opencv, world-to-camera, opengl"):
+    with pytest.raises(SequenceError, match="opencv, world-to-camera, opengl"):
         open_sequence(copy, pose_convention="opengles")
     (copy / "poses.txt").unlink()
-    with pytest.raises(SequenceError, match="tells no poses"):
+    with pytest.raises(SequenceError, match=f"{copy.name}.*poses"):
         open_sequence(copy, pose_convention="opengl")

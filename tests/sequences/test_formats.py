@@ -147,7 +147,7 @@ def test_tum_association_falls_back(make: Make, tmp_path: Path) -> None:
     assert len(sequence) >= 1
     far = [f"{float(line.split()[0]) + 7:.6f} {line.split()[1]}" for line in lines[1:]]
     (folder / "depth.txt").write_text("\n".join(far))
-    with pytest.raises(SequenceError, match=r"within 0.08 s.*closest: 6\.\d+ s"):
+    with pytest.raises(SequenceError, match=r"0\.08 s.*6\.\d+ s"):
         open_sequence(folder)
 
 
@@ -225,7 +225,7 @@ def test_poses_whose_times_go_backwards_are_told_of(make: Make) -> None:
 def test_a_time_that_is_none_is_named_with_its_line(make: Make, word: str) -> None:
     folder = make("folder")
     (folder / "timestamps.txt").write_text("# seconds\n" + "".join(f"{t}\n" for t in (0.0, 0.1, word, 0.3, 0.4)))
-    with pytest.raises(SequenceError, match=rf"timestamps.txt, line 4: expected a time in seconds, found '{word}'"):
+    with pytest.raises(SequenceError, match=rf"timestamps\.txt, line 4: .*'{word}'"):
         open_sequence(folder)
 
 

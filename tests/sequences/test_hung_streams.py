@@ -13,8 +13,8 @@ import pytest
 
 from ggslam.sequences import open_sequence
 from ggslam.sequences.depth_doubts import DepthDoubts
-from ggslam.sequences.glances import look_over
 from ggslam.sequences.hung_streams import Stretch, find_hung
+from ggslam.sequences.thumbnails import thumbnails_of
 from ggslam.synthetic import write_synthetic_sequence
 
 FRAMES = 24
@@ -51,7 +51,7 @@ def told(folder: Path) -> dict[str, tuple[str, str]]:
 def test_a_stream_that_hangs_is_told_with_its_frames(spoilt: Path, kind: str, first: int, last: int) -> None:
     hold(spoilt, KINDS[kind], first, last)
     sequence = open_sequence(spoilt)
-    (found,) = find_hung(sequence, look_over(sequence), kind)
+    (found,) = find_hung(sequence, thumbnails_of(sequence), kind)
     assert (found.first, found.last) == (first, last)
     severity, text = told(spoilt)[f"{kind}_repeats"]
     assert severity == "doubtful" and f"{last - first + 1} of {FRAMES} frames, {first} to {last}," in text
@@ -65,8 +65,8 @@ def test_colour_that_was_compressed_again_hangs_too(spoilt: Path) -> None:
     hold(spoilt, "rgb", 7, 19)
     edit(spoilt, "rgb", lambda i: np.clip(i.astype(int) + random.integers(-1, 2, i.shape), 0, 255).astype(np.uint8))
     sequence = open_sequence(spoilt)
-    assert find_hung(sequence, look_over(sequence), "color") == [Stretch(7, 19)]
-    few = [view for view in look_over(sequence) if view.index % 4 == 0]
+    assert find_hung(sequence, thumbnails_of(sequence), "color") == [Stretch(7, 19)]
+    few = [view for view in thumbnails_of(sequence) if view.index % 4 == 0]
     assert find_hung(sequence, few, "color") == [Stretch(7, 19)]
 
 
@@ -78,7 +78,7 @@ def test_colour_of_changing_compression_is_one_stretch(spoilt: Path) -> None:
         assert image is not None and cv2.imwrite(str(path.with_suffix(".jpg")), image, [1, 95 if k < 15 else 72])
         path.unlink()
     sequence = open_sequence(spoilt)
-    assert find_hung(sequence, look_over(sequence), "color") == [Stretch(7, 23)]
+    assert find_hung(sequence, thumbnails_of(sequence), "color") == [Stretch(7, 23)]
     assert told(spoilt)["color_repeats"][1].endswith("try `stop` 8")
 
 
@@ -88,7 +88,7 @@ def test_depth_that_hangs_with_fresh_noise(spoilt: Path) -> None:
     hold(spoilt, "depth", 6, 23)
     edit(spoilt, "depth", lambda i: np.rint(i * (1 + random.normal(0, 0.002, i.shape))).astype(np.uint16))
     sequence = open_sequence(spoilt)
-    assert find_hung(sequence, look_over(sequence), "depth") == [Stretch(6, 23)]
+    assert find_hung(sequence, thumbnails_of(sequence), "depth") == [Stretch(6, 23)]
 
 
 def test_a_lamp_before_a_tripod_is_no_depth_that_hangs(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_lamp_before_a_tripod_is_no_depth_that_hangs(tmp_path: Path) -> None:
     light = np.linspace(0.3, 1.4, 160)[None, :, None]
     edit(folder, "rgb", lambda i: np.clip(i * light, 0, 255).astype(np.uint8), first=8)
     sequence = open_sequence(folder)
-    views = look_over(sequence)
+    views = thumbnails_of(sequence)
     assert views[0].same_depth(views[-1]) and views[0].color_moved(views[-1])
     assert find_hung(sequence, views, "depth") == []
 
@@ -165,6 +165,6 @@ def test_nothing_is_said_of_sound_rooms(tmp_path: Path, path: str, movers: tuple
 def test_nothing_is_said_of_true_recordings(shared_data: Path) -> None:
     for name in ("redkitchen", "phone_scan", "hololens_walk", "rgbd_dataset_freiburg3_cabinet", "shelf"):
         sequence = open_sequence(shared_data / name, scale=0.5)
-        views = look_over(sequence)
+        views = thumbnails_of(sequence)
         assert [find_hung(sequence, views, kind) for kind in KINDS] == [[], []], name
         assert min(view.grain for view in views) > 0.8 and min(view.surface for view in views) > 0.9, name

@@ -157,7 +157,7 @@ def test_segments_that_pred_json_does_not_list(make: Make, tmp_path: Path, caplo
         mask = sequence.frame(0).mask
     assert mask is not None and mask[0, 0] == 0 and mask[0, -1] == 1
     assert "pred.json does not list count as unlabelled" in caplog.text
-    with pytest.raises(SequenceError, match=r"frame000004\.png: not one of its ids is listed in .*pred\.json"):
+    with pytest.raises(SequenceError, match=r"frame000004\.png: .*pred\.json"):
         sequence.frame(4)
 
 
@@ -194,7 +194,7 @@ def test_more_ids_than_fit(make: Make, tmp_path: Path) -> None:
         write_rgb(masks / f"frame{i:06d}.png", np.arange(i * 20_000, (i + 1) * 20_000).reshape(100, 200) * 3)
     for policy in ("error", "skip"):
         sequence = open_sequence(make("replica"), masks=masks, on_bad_frame=policy)  # type: ignore[arg-type]
-        with pytest.raises(SequenceError, match=rf"{masks}: expected at most 65535 different ids, found 99999"):
+        with pytest.raises(SequenceError, match=rf"{masks}: .*65535.*99999"):
             sequence.frame(2)
         shutil.rmtree(tmp_path / "replica")
 
@@ -224,7 +224,7 @@ def test_other_size(make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture
 def test_other_aspect(make: Make, tmp_path: Path) -> None:
     write_grey(tmp_path / "m" / "frame000000.png", half(3, (24, 24)).astype(np.uint8))
     sequence = open_sequence(make("replica"), masks=tmp_path / "m")
-    with pytest.raises(SequenceError, match=r"frame000000\.png: mask is 24x24, expected 32x24"):
+    with pytest.raises(SequenceError, match=r"frame000000\.png: .*24x24.*32x24"):
         sequence.frame(0)
 
 
@@ -246,17 +246,17 @@ def damage(folder: Path, kind: str) -> str:
     path = folder / "semantic_instance" / "semantic_instance_3.png"
     if kind == "truncated":
         path.write_bytes(path.read_bytes()[:-9])
-        return r"semantic_instance_3\.png: PNG is truncated"
+        return r"semantic_instance_3\.png: .*truncated"
     if kind == "empty file":
         path.write_bytes(b"")
-        return r"semantic_instance_3\.png: file is empty"
+        return r"semantic_instance_3\.png: .*empty"
     if kind == "jpeg":
         path.write_bytes(cv2.imencode(".jpg", half(3).astype(np.uint8))[1].tobytes())
-        return r"semantic_instance_3\.png: expected a PNG mask"
+        return r"semantic_instance_3\.png: .*PNG"
     picture = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
     picture[:5, :5, 3] = 128
     assert cv2.imwrite(str(path), picture if kind == "transparent" else picture[..., :3].astype(np.uint16))
-    return r"semantic_instance_3\.png: expected .*" + ("transparent" if kind == "transparent" else "16-bit")
+    return r"semantic_instance_3\.png: .*" + ("transparent" if kind == "transparent" else "16-bit")
 
 
 @pytest.mark.parametrize("lazy", [False, True])
@@ -331,7 +331,7 @@ def test_own_masks_given_by_name_keep_their_names(make: Make) -> None:
 def test_two_masks_of_one_number(make: Make, tmp_path: Path) -> None:
     for name in ("a_1", "b_1"):
         write_grey(tmp_path / "m" / f"{name}.png", half(1).astype(np.uint8))
-    with pytest.raises(SequenceError, match=r"a_1\.png and b_1\.png both have the number of frame000001\.jpg"):
+    with pytest.raises(SequenceError, match=r"a_1\.png.*b_1\.png.*frame000001\.jpg"):
         open_sequence(make("replica"), masks=tmp_path / "m")
 
 

@@ -89,7 +89,7 @@ def test_intrinsics_that_a_recording_lacks(tmp_path: Path, name: str, way: int) 
     whole = open_sequence(place)
     color, wanted = whole.color_size, [np.median(frame.depth) for frame in whole]
     LACKS[name][way](place)
-    with pytest.raises(SequenceError, match=r"`camera` or `intrinsics` tell the camera instead\)"):
+    with pytest.raises(SequenceError, match="`camera` or `intrinsics`"):
         open_sequence(place)
     text, camera = f"61 62 {color[0] / 2} {color[1] / 2}", Camera(*color, 61, 62, color[0] / 2, color[1] / 2)
     file = tmp_path / "own.yaml"
@@ -117,7 +117,7 @@ def test_depth_scale_that_a_recording_lacks(
     folder = make(name)
     scale, depth = open_sequence(folder).depth_scale, open_sequence(folder).frame(1).depth
     remove(folder)
-    with pytest.raises(SequenceError, match=r"scale' is missing \(`depth_scale` tells it instead\)"):
+    with pytest.raises(SequenceError, match="scale'.*`depth_scale`"):
         open_sequence(folder)
     assert np.array_equal(open_sequence(folder, depth_scale=scale).frame(1).depth, depth)
 
@@ -126,7 +126,7 @@ def test_depth_camera_that_a_recording_lacks(make: Callable[[str], Path], tmp_pa
     folder = make("folder")
     with (folder / "camera.yaml").open("a") as file:
         file.write("depth_camera: {width: 32, height: 24}\n")
-    with pytest.raises(SequenceError, match=r"T_color_depth' is missing.*\(`depth_camera` tells it instead\)"):
+    with pytest.raises(SequenceError, match="'T_color_depth'.*`depth_camera`"):
         open_sequence(folder)
     own = tmp_path / "depth.yaml"
     T = "T_color_depth: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n"
@@ -177,7 +177,7 @@ def test_bag_of_a_camera_that_nobody_calibrated(tmp_path: Path, ros2: bool, monk
 
     monkeypatch.setattr("format_makers.BagMessages.info", zeros)
     path = write_bag(tmp_path / ("walk" if ros2 else "walk.bag"), ros2)
-    with pytest.raises(SequenceError, match=r"color/camera_info: impossible camera.*`camera` or `intrinsics` tell"):
+    with pytest.raises(SequenceError, match="color/camera_info: .*`camera` or `intrinsics`"):
         open_sequence(path)
     sequence = open_sequence(path, intrinsics="30 31 15 11")
     assert sequence.camera == Camera(32, 24, 30, 31, 15, 11) and not sequence.registered

@@ -102,9 +102,9 @@ def test_camera_info_begins_with_zeros(tmp_path: Path, storage: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"step": 60}, "32x24 pixels of 16UC1 need rows of 64 bytes, found rows of 60 .step."),
-        ({"step": 80}, "in rows of 80 bytes .step. need 1920 bytes, found 1536 .truncated"),
-        ({"width": 0}, "an image of 0x24 pixels of 16UC1 is none"),
+        ({"step": 60}, "32x24.*16UC1.*64.*60"),
+        ({"step": 80}, "80.*1920.*1536"),
+        ({"width": 0}, "0x24.*16UC1"),
     ],
 )
 def test_sizes_that_do_not_fit(tmp_path: Path, change: dict[str, int], message: str) -> None:

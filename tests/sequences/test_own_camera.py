@@ -64,12 +64,12 @@ def test_impossible_intrinsics(make: Callable[[str], Path], text: str) -> None:
 
 def test_both_or_a_file_that_is_none(make: Callable[[str], Path], tmp_path: Path) -> None:
     folder = make("replica")
-    with pytest.raises(SequenceError, match="`camera` and `intrinsics`: expected one of them"):
+    with pytest.raises(SequenceError, match="`camera` and `intrinsics`"):
         open_sequence(folder, intrinsics="30 31 15 11", camera=tmp_path / "a.yaml")
-    with pytest.raises(SequenceError, match=r"a\.yaml: file is missing"):
+    with pytest.raises(SequenceError, match=r"a\.yaml: .*missing"):
         open_sequence(folder, camera=tmp_path / "a.yaml")
     (tmp_path / "a.yaml").write_text("width: 640\nheight: 200\nfx: 300\nfy: 310\ncx: 15\ncy: 11\n")
-    with pytest.raises(SequenceError, match="image is 32x24, but the intrinsics of the recording are for 640x200"):
+    with pytest.raises(SequenceError, match="32x24.*640x200"):
         open_sequence(folder, camera=tmp_path / "a.yaml")
 
 
@@ -82,11 +82,11 @@ def test_focal_lengths_in_other_units_than_pixels(make: Callable[[str], Path], t
     told = (tmp_path / "own.yaml", f"width: 32\nheight: 24\n{numbers}\n"), (tmp_path / "K.yaml", f"{numbers}\n")
     for path, text in told:
         path.write_text(text)
-        with pytest.raises(SequenceError, match=rf"{path.name}: impossible focal lengths.*32x24: expected pixels"):
+        with pytest.raises(SequenceError, match=rf"{path.name}: .*focal.*32x24"):
             open_sequence(folder, camera=path)
         refuse(ggslam("inspect", folder, "--camera", path), path.name, "impossible focal lengths")
     own.write_text(f"{told[0][1]}depth_scale: 1000\n")
-    with pytest.raises(SequenceError, match=r"camera\.yaml: impossible focal lengths"):
+    with pytest.raises(SequenceError, match=r"camera\.yaml: .*focal"):
         open_sequence(folder)
     own.write_text(kept)
     assert open_sequence(folder).camera.width == 32
@@ -97,7 +97,7 @@ def test_intrinsics_need_no_file_of_the_recording(make: Callable[[str], Path]) -
     (folder / "camera.yaml").unlink()
     sequence = open_sequence(folder, format="folder", intrinsics="30 31 15 11", depth_scale=5000)
     assert sequence.camera == Camera(32, 24, 30, 31, 15, 11)
-    with pytest.raises(SequenceError, match="holds no camera.yaml; the units of its depth .*`depth_scale`"):
+    with pytest.raises(SequenceError, match=r"camera\.yaml.*`depth_scale`"):
         open_sequence(folder, format="folder", intrinsics="30 31 15 11")
     scans = make("scannet")
     (scans / "frames" / "intrinsic" / "intrinsic_color.txt").unlink()

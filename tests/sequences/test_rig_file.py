@@ -89,7 +89,7 @@ def test_instants_are_chosen_as_frames_are(two: Path) -> None:
     rig = open_rig(path, start=1, stop=5, stride=2)
     assert [f.source_index for f in rig] == [1, 1, 3, 3]
     assert rig.selection == range(1, 5, 2)
-    with pytest.raises(SequenceError, match="start must be from 0 to 4, found 5"):
+    with pytest.raises(SequenceError, match="start.* 0 .* 4.* 5"):
         open_rig(path, start=5)
 
 
@@ -131,7 +131,7 @@ def test_damaged_images_and_masks_are_told_by_the_rigs_numbers(two: Path) -> Non
 
 def test_a_file_without_cameras_says_so(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text("camera: []\n")
-    with pytest.raises(SequenceError, match=r"rig.yaml: expected an entry 'cameras'"):
+    with pytest.raises(SequenceError, match=r"rig\.yaml: .*'cameras'"):
         open_sequence(tmp_path / "rig.yaml")
 
 
@@ -145,22 +145,22 @@ def test_a_camera_has_its_own_scale_and_intrinsics(two: Path) -> None:
 
 
 BAD: dict[str, tuple[list[dict[str, Any]], dict[str, Any], str]] = {
-    "one camera": ([entry("a", TUM)], {}, "two cameras or more, found 'a' alone"),
-    "one recording": ([entry("a", TUM), entry("b", TUM)], {}, "cameras 'a' and 'b' have one recording"),
-    "twice": ([entry("a", TUM), entry("a", "folder")], {}, "camera 'a' is there twice"),
-    "no recording": ([entry("a", TUM), entry("b", "nowhere")], {}, "camera 'b': .*nowhere: no such folder or file"),
-    "long name": ([entry("a", TUM), entry("b", "x" * 300)], {}, "camera 'b': 'x+...': too long for a path: 300"),
-    "no home": ([entry("a", TUM), entry("b", "~nobody-of-that-name/x")], {}, "no such folder or file"),
-    "unknown entry": ([entry("a", TUM), entry("b", "folder", T_rig_camra=1)], {}, "did you mean 'T_rig_camera'"),
-    "unknown name": ([entry("a", TUM), entry("b", "folder")], {"tollerance": 1}, "did you mean 'tolerance'"),
-    "not rigid": ([entry("a", TUM), entry("b", "folder", 2 * np.eye(4))], {}, "'b': expected 'T_rig_camera'"),
-    "no transform": ([entry("a", TUM), {"name": "b", "recording": "folder"}], {}, "'T_rig_camera' is missing"),
-    "no name": ([entry("a", TUM), {**entry("b", "folder"), "name": "a/b"}], {}, "expected a 'name'"),
-    "no list": ([entry("a", TUM), {**entry("b", "folder"), "topics": "x"}], {}, "'topics' to be a list"),
-    "tolerance": ([entry("a", TUM), entry("b", "folder")], {"tolerance": 0}, "'tolerance' above 0"),
-    "scale": ([entry("a", TUM), entry("b", "folder", scale=2)], {}, "'scale' to be a number from 0.001 to 1"),
+    "one camera": ([entry("a", TUM)], {}, "two cameras.*'a'"),
+    "one recording": ([entry("a", TUM), entry("b", TUM)], {}, "'a' and 'b'.*one recording"),
+    "twice": ([entry("a", TUM), entry("a", "folder")], {}, "'a'.*twice"),
+    "no recording": ([entry("a", TUM), entry("b", "nowhere")], {}, "'b': .*nowhere"),
+    "long name": ([entry("a", TUM), entry("b", "x" * 300)], {}, "'b': 'x+...'.*300"),
+    "no home": ([entry("a", TUM), entry("b", "~nobody-of-that-name/x")], {}, "'b'.*~nobody-of-that-name"),
+    "unknown entry": ([entry("a", TUM), entry("b", "folder", T_rig_camra=1)], {}, "T_rig_camra.*'T_rig_camera'"),
+    "unknown name": ([entry("a", TUM), entry("b", "folder")], {"tollerance": 1}, "tollerance.*'tolerance'"),
+    "not rigid": ([entry("a", TUM), entry("b", "folder", 2 * np.eye(4))], {}, "'b': expected.*'T_rig_camera'"),
+    "no transform": ([entry("a", TUM), {"name": "b", "recording": "folder"}], {}, "'T_rig_camera'.*missing"),
+    "no name": ([entry("a", TUM), {**entry("b", "folder"), "name": "a/b"}], {}, "'name'"),
+    "no list": ([entry("a", TUM), {**entry("b", "folder"), "topics": "x"}], {}, "'topics'"),
+    "tolerance": ([entry("a", TUM), entry("b", "folder")], {"tolerance": 0}, "'tolerance'.* 0"),
+    "scale": ([entry("a", TUM), entry("b", "folder", scale=2)], {}, "'scale'.*0.001.* 1"),
     "apart": (
-        [entry("a", TUM), entry("b", "folder", time_offset=5)], {}, "no image of 'a' was taken within 0.02 s"
+        [entry("a", TUM), entry("b", "folder", time_offset=5)], {}, "'a'.*0.02 s"
     ),
 }  # fmt: skip
 
@@ -177,7 +177,7 @@ def test_bad_rigs_are_refused_in_one_line(two: Path, what: str) -> None:
 def test_what_is_given_twice_is_refused(two: Path) -> None:
     text = write_rig(two, entry("a", TUM), entry("b", "folder")).read_text()
     (two / "rig.yaml").write_text(text.replace(f"  recording: {TUM}", f"  recording: {TUM}\n  recording: folder"))
-    with pytest.raises(SequenceError, match=r"line \d+: 'recording' is given twice"):
+    with pytest.raises(SequenceError, match=r"line \d+: .*'recording'"):
         open_sequence(two)
 
 
@@ -191,7 +191,7 @@ def test_a_rig_of_rigs_is_refused(two: Path) -> None:
 
 def test_what_holds_for_one_camera_is_said_in_the_file(two: Path) -> None:
     path = write_rig(two, entry("a", "folder"), entry("b", "again"))
-    with pytest.raises(SequenceError, match="`depth_scale` is of one camera; say it in the rig's file"):
+    with pytest.raises(SequenceError, match="`depth_scale`"):
         open_sequence(path, depth_scale=1000)
-    with pytest.raises(SequenceError, match="expected rig.yaml"):
+    with pytest.raises(SequenceError, match=r"rig\.yaml"):
         open_sequence(two / TUM, format="rig")

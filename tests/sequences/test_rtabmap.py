@@ -58,7 +58,7 @@ def test_intrinsics_of_each_frame(tmp_path: Path) -> None:
 def test_two_exports_in_a_folder(tmp_path: Path) -> None:
     make_rtabmap(tmp_path, "a_")
     make_rtabmap(tmp_path, "b_")
-    with pytest.raises(SequenceError, match="expected one export with .*, found a_rgb, b_rgb"):
+    with pytest.raises(SequenceError, match="a_rgb, b_rgb"):
         open_sequence(tmp_path)
 
 

@@ -156,7 +156,7 @@ def test_npy_depth(tmp_path: Path) -> None:
     np.testing.assert_allclose([frame.depth[12, 16] for frame in sequence], [1, 1.1], atol=1e-7)
     (folder / "depth" / "0.npy").rename(folder / "depth" / "0.exr")
     (folder / "depth" / "1.npy").unlink()
-    with pytest.raises(SequenceError, match=r"depth: no PNG or \.npy images, found 0\.exr"):
+    with pytest.raises(SequenceError, match=r"depth: .*0\.exr"):
         open_sequence(folder, intrinsics="30 31 15 11", depth_scale=1)
 
 

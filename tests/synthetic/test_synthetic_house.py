@@ -134,7 +134,7 @@ def test_a_route_that_cannot_be_gone() -> None:
     with pytest.raises(SequenceError, match="no route"):
         camera_path(b.scene, 10, "route")
     b.scene.route = np.array([[0, 0, 1, 0, 0], [1, 0, 0.2, 90, 0], [1, 1, 1, 180, 0], [0, 1, 1, 270, 0]], float)
-    with pytest.raises(SequenceError, match="nearer than 0.3 m"):
+    with pytest.raises(SequenceError, match=r"0\.3 m"):
         camera_path(b.scene, 10, "route")
 
 
@@ -158,9 +158,9 @@ def test_a_written_loop_repeats(quick_light: None, caster: RayCaster, house: Sce
     np.testing.assert_allclose(frame.depth, depth, atol=2e-4)
     assert frame.mask is not None and (frame.mask == mask).all()
     assert contents(tmp_path / "a")["depth/000000.png"] != contents(tmp_path / "c")["depth/000000.png"]
-    with pytest.raises(SequenceError, match="expected one of room, loop, corridor, bare, found 'maze'"):
+    with pytest.raises(SequenceError, match="room, loop, corridor, bare.*'maze'"):
         write_synthetic_sequence(tmp_path / "d", scene="maze")
-    with pytest.raises(SequenceError, match="depth_distortion: expected 0 to 10"):
+    with pytest.raises(SequenceError, match="depth_distortion: .*0 to 10"):
         write_synthetic_sequence(tmp_path / "d", depth_distortion=-1.0)
 
 

@@ -140,5 +140,5 @@ def test_what_cannot_move_is_refused(tmp_path: Path, words: tuple[object, ...], 
 
 
 def test_python_refuses_unknown_movers(tmp_path: Path) -> None:
-    with pytest.raises(SequenceError, match="expected some of walker, mug, door, found 'dog'"):
+    with pytest.raises(SequenceError, match="walker, mug, door.*'dog'"):
         write_synthetic_sequence(tmp_path / "room", movers=["dog"])

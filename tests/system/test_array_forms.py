@@ -71,9 +71,9 @@ def test_arrays_and_indices_out_of_files() -> None:
     ]:  # fmt: skip
         with pytest.raises(FormatError, match=f"places: .*{message}|places: '.*' {message}|{message}"):
             check_arrays({**good, name: value}, forms, "places")
-    with pytest.raises(FormatError, match="places: no array 'counts'"):
+    with pytest.raises(FormatError, match="places: .*'counts'"):
         check_arrays({"poses": good["poses"]}, forms, "places")
     check_indices("rows", [0, 4], 5)
     for number in (-1, 5):
-        with pytest.raises(FormatError, match=f"rows: expected numbers from 0 to below 5, found {number}"):
+        with pytest.raises(FormatError, match=f"rows: .*0 .*5.* {number}"):
             check_indices("rows", [0, number], 5)

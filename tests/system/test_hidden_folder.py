@@ -52,6 +52,6 @@ def test_a_store_appears_whole_or_not_at_all(tmp_path: Path) -> None:
         assert names(target) == []
     with GridStore.open(target) as store:
         assert store.get((0, 0, 0), "points.pcd") == b"1"
-    with pytest.raises(RunFolderError, match=r"is not empty \(it holds"), coming_store(target):
+    with pytest.raises(RunFolderError, match="not empty"), coming_store(target):
         pass
     assert names(tmp_path) == ["store"]

@@ -26,7 +26,7 @@ def test_a_file_is_read_within_its_limit(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"12345")
     assert read_untrusted(path) == read_untrusted(path, 5) == b"12345"
-    with pytest.raises(FormatError, match=r"a\.bin: too large.*5 bytes, at most 4"):
+    with pytest.raises(FormatError, match=r"a\.bin: .*\b5\b.*\b4\b"):
         read_untrusted(path, 4)
 
 
@@ -64,7 +64,7 @@ def test_a_file_that_no_machine_holds_is_the_fault_of_the_file(tmp_path: Path) -
     path = tmp_path / "a.bin"
     with path.open("wb") as file:
         file.truncate(1 << 42)
-    with pytest.raises(FormatError, match=r"too large for what it is: 4,398,046,511,104 bytes, at most"):
+    with pytest.raises(FormatError, match="4,398,046,511,104"):
         read_untrusted(path)
 
 
@@ -111,7 +111,7 @@ def test_links_out_of_a_folder_are_found_however_deep(tmp_path: Path) -> None:
     (tmp_path / "named").symlink_to(folder)
     refuse_links(tmp_path / "named")  # whoever names a link has chosen where it leads
     (folder / "renders" / "deep" / "x.png").symlink_to("/etc/passwd")
-    with pytest.raises(FormatError, match=r"deep/x\.png: is a link to /etc/passwd, outside"):
+    with pytest.raises(FormatError, match=r"deep/x\.png: .*/etc/passwd"):
         refuse_links(folder)
 
 
@@ -125,7 +125,7 @@ def test_a_copy_is_within_its_limit(tmp_path: Path) -> None:
     copy_untrusted(tmp_path / "a", tmp_path / "b", len(data))
     assert (tmp_path / "b").read_bytes() == data
     os.truncate(tmp_path / "a", 50 << 30)
-    with pytest.raises(RunFolderError, match=r"a: too large for what it is: 53,687,091,200 bytes"):
+    with pytest.raises(RunFolderError, match="a: .*53,687,091,200"):
         copy_untrusted(tmp_path / "a", tmp_path / "c", 1 << 20, RunFolderError)
     assert not (tmp_path / "c").exists()
 

@@ -27,7 +27,7 @@ def test_members_are_read_within_a_limit(tmp_path: Path, way: str) -> None:
     path = archive_of(tmp_path / "a.zip", way, 1)
     with open_zip(path) as archive:
         assert read_member(archive, "a", 1 << 20) == bytes(1 << 20)
-        with pytest.raises(ValueError, match="a has 1,048,576 bytes; at most 1,048,575 are read"):
+        with pytest.raises(ValueError, match="a.*1,048,576.*1,048,575"):
             read_member(archive, "a", (1 << 20) - 1)
         with pytest.raises(KeyError):
             read_member(archive, "b", 1)

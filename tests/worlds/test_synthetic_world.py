@@ -179,9 +179,9 @@ def test_work_per_scan_does_not_grow_with_the_world() -> None:
 
 
 def test_impossible_numbers_are_named(world: World) -> None:
-    with pytest.raises(SequenceError, match="size: expected 25 to 1000 m, found 5"):
+    with pytest.raises(SequenceError, match="size: .*25 to 1000 m.* 5"):
         make_world(5.0)
-    with pytest.raises(SequenceError, match="length: expected at least 1 m"):
+    with pytest.raises(SequenceError, match="length: .*1 m"):
         walk(world, 0.0)
     with pytest.raises(ConfigError, match="rings"):
         Scanner(rings=0)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import runpy
 import sys
 
-from ggslam.system.process_tie import die_with
+from ggslam.system.child_processes import die_with
 
 
 def main() -> None:

@@ -17,8 +17,8 @@ from ggslam.merging.objects import RunObjects
 from ggslam.native.loader import NativeContext
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.known_runs import read_known_run, read_map
 from ggslam.runs.map_container import is_container, read_container
+from ggslam.runs.merge_inputs import read_known_run, read_map
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.sequence import PartRecord, SequenceRecord

@@ -8,7 +8,7 @@ import sys
 from multiprocessing.connection import Connection
 
 from ggslam.jobs.tasks.outcomes import outcome_of
-from ggslam.system.process_tie import die_with
+from ggslam.system.child_processes import die_with
 
 
 def main() -> None:

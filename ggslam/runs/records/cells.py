@@ -23,7 +23,7 @@ class CellMember(FileRecord):
 
 
 class CellsRecord(Record):
-    """What the file says of itself.
+    """The head of the file.
 
     Attributes:
         format, version: `CELLS_FORMAT`, and that of the layout.

@@ -11,8 +11,8 @@ from ggslam.scene.oriented_box import OrientedBox
 
 
 class ChangedSide(Record):
-    """A thing as one of the visits has it: ids of the objects that it is, the share of it that the other visit looked
-    at and did not find, and a box around it, world of the older run."""
+    """An object as one of the visits has it: its object ids, the share of it that the other visit looked at without
+    finding it, and its box in the world of the older run."""
 
     ids: list[int]
     not_there: float | None = None
@@ -20,8 +20,8 @@ class ChangedSide(Record):
 
 
 class ChangeRecord(Record):
-    """A change: what happened, to what, how sure; `T_new_old` of what moved, how far its middle went and how far it
-    turned; the name of its picture."""
+    """A change: its kind, object and certainty; `T_new_old` of what moved, with distance and angle; the name of its
+    picture."""
 
     kind: str
     name: str
@@ -36,7 +36,7 @@ class ChangeRecord(Record):
 
 
 class UnseenRecord(Record):
-    """A thing of which nothing is said, and why; earlier files have no reason: the newer visit hardly looked at it."""
+    """An object that cannot be judged, with the reason; without one, the newer visit hardly looked at it."""
 
     name: str
     ids: list[int]

@@ -16,7 +16,7 @@ CONTAINER_VERSION: Final = 2
 
 
 class ContainerRecord(Record):
-    """The head of a container.
+    """The head of a container: its format, version and content.
 
     Attributes:
         format, version: `CONTAINER_FORMAT`, and that of the layout.

@@ -72,7 +72,7 @@ class MoverFrameRecord(Record):
 
 
 class DisplacementRecord(Record):
-    """From the place before to the place after.
+    """A motion from the place before to the place after.
 
     Attributes:
         T_new_old: [4, 4], world: what lay at p before lies at T_new_old p.

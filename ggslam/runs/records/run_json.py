@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""run.json: that a folder is a run, what it was made with, whether it is whole, how it was edited."""
+"""run.json: marks a folder as a run and says what it was made with, whether it is complete and how it was edited."""
 
 from __future__ import annotations
 

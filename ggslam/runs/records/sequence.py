@@ -52,7 +52,7 @@ class OpenRecord(Record):
 
 
 class SkippedRecord(Record):
-    """A damaged frame that was passed over; see `sequences.sequence.SkippedFrame`."""
+    """A damaged frame that was skipped; see `sequences.sequence.SkippedFrame`."""
 
     index: int | None = None
     source_index: int | None = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""start.json beside the checkpoints of a run: what it was asked to do, so that it can be asked again."""
+"""start.json beside the checkpoints: the arguments of a run, so that it can be resumed with the same."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VERSION: Final = 3
 
 
 class StartRecord(RecordFile):
-    """What a run was asked to do.
+    """The arguments of a run.
 
     Attributes:
         version: of the format.

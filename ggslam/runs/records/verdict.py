@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""verdict.json: how good a run is, told by its own figures."""
+"""verdict.json: the quality of a run, judged by its own figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def worst(grades: list[Grade]) -> Grade:
 
 
 class AspectRecord(Record):
-    """One side of a run.
+    """One aspect of a run's quality.
 
     Attributes:
         grade: None: it was not measured; `text` says why.
@@ -51,7 +51,7 @@ class FitRecord(Record):
 
 
 class RunVerdict(RecordFile):
-    """How good a run is. No ground truth is used.
+    """The quality of a run, judged without ground truth.
 
     Attributes:
         grade: of the run as a whole.

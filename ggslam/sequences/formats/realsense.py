@@ -158,7 +158,7 @@ def _invert_distortion(coefficients: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 class Playback:
-    """A recording, played as often as it takes. Frames in order are quick; going back starts it anew."""
+    """A recording that is played. Frames in order are fast; going back starts it again."""
 
     def __init__(self, path: Path, options: ReadOptions = NO_OPTIONS) -> None:
         self.path = path

@@ -153,7 +153,7 @@ def _value(info: Any, name: str) -> Any:
 
 @dataclass(frozen=True)
 class _Lens:
-    """What a camera_info tells."""
+    """The content of a camera_info message."""
 
     camera: Camera | None
     distortion: np.ndarray | None = None

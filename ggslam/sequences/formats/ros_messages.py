@@ -57,7 +57,7 @@ class Bag:
 
     def _check_uncompressed(self) -> None:
         """Of one file of a bag nothing tells that each message is compressed."""
-        with _told(str(self.path)):
+        with _errors_of_damage(str(self.path)):
             first = next(iter(self._reader.messages()), None)
         if first is not None and bytes(first[2][:4]) == ZSTD_START:
             raise SequenceError(
@@ -71,7 +71,7 @@ class Bag:
             SequenceError: the bag is damaged.
         """
         stamps, logged = [], []
-        with self._lock, _told(f"{self.path}, {topic}"):
+        with self._lock, _errors_of_damage(f"{self.path}, {topic}"):
             for _, time, raw in self._read(topic):
                 stamps.append(self._stamp(raw))
                 logged.append(time)
@@ -95,7 +95,7 @@ class Bag:
             SequenceError: there is none, or the bag is damaged.
         """
         place = f"{self.path}, {topic}, message {number}"
-        with self._lock, _told(place):
+        with self._lock, _errors_of_damage(place):
             at, cursor = self._cursors.pop(topic, (-1, iter(())))
             if at != number:
                 at, cursor = self._seek(topic, number)
@@ -108,7 +108,7 @@ class Bag:
 
     def messages(self, topic: str) -> list[Any]:
         """All messages of a topic of small ones. Raises SequenceError if the bag is damaged."""
-        with self._lock, _told(f"{self.path}, {topic}"):
+        with self._lock, _errors_of_damage(f"{self.path}, {topic}"):
             return [self._reader.deserialize(raw, self._type(topic)) for _, _, raw in self._read(topic)]
 
     def _seek(self, topic: str, number: int) -> tuple[int, Iterator[Any]]:
@@ -135,8 +135,8 @@ class Bag:
         return float(seconds + 1e-9 * nanoseconds)
 
 
-class _told:
-    """Turns whatever goes wrong inside a damaged bag into one SequenceError."""
+class _errors_of_damage:
+    """Turns any error inside a damaged bag into one SequenceError."""
 
     def __init__(self, place: str) -> None:
         self._place = place

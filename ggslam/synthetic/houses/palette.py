@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The materials that the house has beside those of the furnished room: each of its spaces looks unlike the others."""
+"""The materials of the house; each of its spaces looks different."""
 
 from __future__ import annotations
 

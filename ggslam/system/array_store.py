@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What never changes, written once: arrays and parts of growing lists, gathered into files by number, to which trees of
-objects (`object_tree`) refer."""
+"""Stores arrays and parts of growing lists once, in numbered files, to which trees of objects (`object_tree`) refer."""
 
 from __future__ import annotations
 
@@ -19,8 +18,8 @@ def kept_name(number: int) -> str:
     return f"kept-{number:06d}.bin"
 
 
-class KeptArrays:
-    """Files of what is kept, of which one is being gathered. See `object_tree.Keeper` and `object_tree.Kept`.
+class ArrayStore:
+    """The numbered files, one of which is being filled. See `object_tree.Keeper` and `object_tree.Kept`.
 
     Args:
         folder: of the files.

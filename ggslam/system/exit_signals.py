@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A program from its first to its last moment: a signal to stop ends it with 128 + its number also while modules are
-still loaded and while the interpreter tidies up, where Python itself dies of it or loses it."""
+"""Ends the program with 128 plus the signal's number, also while modules are loaded and while the interpreter shuts
+down, where Python itself dies of the signal or loses it."""
 
 from __future__ import annotations
 

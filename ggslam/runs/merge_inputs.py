@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading what merging needs of a run: its places and keyframes, and its map with the keyframes' numbers and votes."""
+"""Reads what merging needs of a run: places, keyframes, and the map with the keyframes' numbers and votes."""
 
 from __future__ import annotations
 
@@ -86,8 +86,10 @@ def read_map(folder: RunFolder) -> tuple[GaussianMap, SegmentedMap | None]:
     gaussians = folder.gaussians(with_moments=True)
     birth = read_all_arrays(folder.path / PLACES_FILE, "the places of a run").get("birth")
     keyframes = len(folder.keyframes().keyframes)
-    if birth is None or birth.shape != (len(gaussians),) or not (
-        -1 <= birth.min(initial=-1) <= birth.max(initial=-1) < keyframes
+    if (
+        birth is None
+        or birth.shape != (len(gaussians),)
+        or not (-1 <= birth.min(initial=-1) <= birth.max(initial=-1) < keyframes)
     ):
         raise RunFolderError(f"{folder.path / PLACES_FILE}: not of this map, which has {len(gaussians)} Gaussians")
     gaussians.birth_keyframe[:] = torch.from_numpy(birth.astype(np.int32))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes and those that made them: which end together, and which are still at work."""
+"""Ends child processes with their parent, and tells which processes still run."""
 
 from __future__ import annotations
 

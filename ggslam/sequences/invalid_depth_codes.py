@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers in depth images that are no distance: one that many pixels of all images hold, beyond all that is
-measured."""
+"""Detects numbers in depth images that mean "not measured": one number, beyond all real depth, in many pixels of all
+images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ggslam.sequences.sequence import Sequence
 from ggslam.system.tuning import Tuning
 
 
-class PlantedCodeTuning(Tuning):
+class InvalidCodeTuning(Tuning):
     """When a number in depth images is said to mean "not measured"."""
 
     frames = 6
@@ -32,17 +32,17 @@ class PlantedCodeTuning(Tuning):
 
 
 @dataclass(frozen=True)
-class PlantedCode:
-    """A stored number that looks like "nothing measured", and the share of the pixels with depth that hold it."""
+class InvalidDepthCode:
+    """A stored number that seems to mean "not measured", and its share of the pixels with depth."""
 
     code: float
     share: float
 
 
-def find_planted_code(sequence: Sequence) -> PlantedCode | None:
+def find_invalid_depth_code(sequence: Sequence) -> InvalidDepthCode | None:
     """Looks at some depth images as stored; None: nothing of the kind, or it is left out already."""
     images = []
-    for number in np.unique(np.linspace(0, len(sequence) - 1, PlantedCodeTuning.frames).round().astype(int)):
+    for number in np.unique(np.linspace(0, len(sequence) - 1, InvalidCodeTuning.frames).round().astype(int)):
         try:
             raw = read_stored_depth(sequence.files(int(number)).depth).astype(np.float64)
         except SequenceError:
@@ -56,14 +56,14 @@ def find_planted_code(sequence: Sequence) -> PlantedCode | None:
     top = float(values.max())
     held, near = (
         float((values == top).mean()),
-        float(((values >= PlantedCodeTuning.near * top) & (values < top)).mean()),
+        float(((values >= InvalidCodeTuning.near * top) & (values < top)).mean()),
     )
     rest = 1 - held - near
-    often = float(np.mean([(known == top).mean() > PlantedCodeTuning.min_share / 5 for known in images]))
+    often = float(np.mean([(known == top).mean() > InvalidCodeTuning.min_share / 5 for known in images]))
     planted = (
-        held > PlantedCodeTuning.min_share
-        and near < PlantedCodeTuning.max_near * held
-        and often >= PlantedCodeTuning.min_frames
-        and rest > PlantedCodeTuning.min_rest
+        held > InvalidCodeTuning.min_share
+        and near < InvalidCodeTuning.max_near * held
+        and often >= InvalidCodeTuning.min_frames
+        and rest > InvalidCodeTuning.min_rest
     )
-    return PlantedCode(top, held) if planted else None
+    return InvalidDepthCode(top, held) if planted else None

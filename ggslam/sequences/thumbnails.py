@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small views of frames spread over a recording: what is compared to see whether its streams go on and show a scene."""
+"""Small versions of some frames, compared to see whether colour and depth keep changing and show a scene."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ggslam.sequences.sequence import Sequence
 from ggslam.system.tuning import Tuning
 
 
-class GlanceTuning(Tuning):
+class ThumbnailTuning(Tuning):
     """When small views of two frames show the same, and when they do not."""
 
     frames = 24
@@ -57,8 +57,8 @@ class GlanceTuning(Tuning):
 
 
 @dataclass(frozen=True)
-class Glance:
-    """A frame in small.
+class Thumbnail:
+    """A small version of a frame.
 
     Attributes:
         index: of the frame.
@@ -77,42 +77,42 @@ class Glance:
     @property
     def blank(self) -> bool:
         """Whether its colour image shows one colour and nothing else."""
-        return bool(np.ptp(self.grey) < GlanceTuning.same_grey)
+        return bool(np.ptp(self.grey) < ThumbnailTuning.same_grey)
 
-    def same_color(self, other: Glance) -> bool:
+    def same_color(self, other: Thumbnail) -> bool:
         """Whether both hold one colour image that shows something: bare walls look alike wherever one stands."""
         change = np.abs(self.grey - other.grey)
         return bool(
-            self.grey.std() > GlanceTuning.min_contrast
-            and np.percentile(change, GlanceTuning.same_percentile) < GlanceTuning.same_grey
+            self.grey.std() > ThumbnailTuning.min_contrast
+            and np.percentile(change, ThumbnailTuning.same_percentile) < ThumbnailTuning.same_grey
         )
 
-    def like_color(self, other: Glance) -> bool:
+    def like_color(self, other: Thumbnail) -> bool:
         """Whether both may hold one colour image, compressed otherwise."""
         return bool(
-            np.percentile(np.abs(self.grey - other.grey), GlanceTuning.same_percentile) < GlanceTuning.like_grey
+            np.percentile(np.abs(self.grey - other.grey), ThumbnailTuning.same_percentile) < ThumbnailTuning.like_grey
         )
 
-    def same_depth(self, other: Glance) -> bool:
+    def same_depth(self, other: Thumbnail) -> bool:
         """Whether both hold one depth image: bit by bit, or but for noise, where jumps of depth would move."""
         return np.array_equal(self.depth, other.depth) or self._depth_again(other)
 
-    def _depth_again(self, other: Glance) -> bool:
+    def _depth_again(self, other: Thumbnail) -> bool:
         known = (self.depth > 0) & (other.depth > 0)
-        if known.sum() < GlanceTuning.min_depths:
+        if known.sum() < ThumbnailTuning.min_depths:
             return False
         change = np.abs(self.depth - other.depth) / np.maximum(np.minimum(self.depth, other.depth), 1e-6)
         if (
-            np.median(change[known]) > GlanceTuning.same_depth
-            or np.percentile(change[known], 90) > GlanceTuning.most_same_depth
+            np.median(change[known]) > ThumbnailTuning.same_depth
+            or np.percentile(change[known], 90) > ThumbnailTuning.most_same_depth
         ):
             return False
         jumps = [at & known for at in _jumps(self.depth)]
         return all(
-            at.sum() >= GlanceTuning.min_jumps and np.median(change[at]) < GlanceTuning.same_jumps for at in jumps
+            at.sum() >= ThumbnailTuning.min_jumps and np.median(change[at]) < ThumbnailTuning.same_jumps for at in jumps
         )
 
-    def color_moved_on(self, other: Glance) -> bool:
+    def color_moved_on(self, other: Thumbnail) -> bool:
         """Whether the colour images show other things beside what `same_depth` calls the same: a lamp that is switched
         on before a camera at rest is none."""
         if not self.color_moved(other):
@@ -120,45 +120,47 @@ class Glance:
         if np.array_equal(self.depth, other.depth):
             return True
         here, there = _edges(self.grey), _edges(other.grey)
-        return float((here * there).mean()) < GlanceTuning.other_edges
+        return float((here * there).mean()) < ThumbnailTuning.other_edges
 
-    def color_moved(self, other: Glance) -> bool:
+    def color_moved(self, other: Thumbnail) -> bool:
         """Whether the colour images show other things, exposure forgiven."""
         if self.blank or other.blank:
             return False
         here, there = ((view.grey - view.grey.mean()) / view.grey.std() for view in (self, other))
-        level = GlanceTuning.other_grey / min(float(self.grey.std()), float(other.grey.std()))
-        return bool((np.abs(here - there) > max(level, 0.1)).mean() > GlanceTuning.moved)
+        level = ThumbnailTuning.other_grey / min(float(self.grey.std()), float(other.grey.std()))
+        return bool((np.abs(here - there) > max(level, 0.1)).mean() > ThumbnailTuning.moved)
 
-    def depth_moved(self, other: Glance) -> bool:
+    def depth_moved(self, other: Thumbnail) -> bool:
         """Whether the depth images show other things."""
         known = (self.depth > 0) & (other.depth > 0)
-        if known.sum() < GlanceTuning.min_depths:
+        if known.sum() < ThumbnailTuning.min_depths:
             return False
         change = np.abs(self.depth - other.depth)[known] / np.minimum(self.depth, other.depth)[known]
-        return bool((change > GlanceTuning.other_depth).mean() > GlanceTuning.moved)
+        return bool((change > ThumbnailTuning.other_depth).mean() > ThumbnailTuning.moved)
 
 
-def glance_at(frame: Frame) -> Glance:
+def make_thumbnail(frame: Frame) -> Thumbnail:
     """A frame in small."""
     grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    share = cv2.resize((frame.depth > 0).astype(np.float32), GlanceTuning.size, interpolation=cv2.INTER_AREA)
-    depth = cv2.resize(frame.depth, GlanceTuning.size, interpolation=cv2.INTER_AREA)
+    share = cv2.resize((frame.depth > 0).astype(np.float32), ThumbnailTuning.size, interpolation=cv2.INTER_AREA)
+    depth = cv2.resize(frame.depth, ThumbnailTuning.size, interpolation=cv2.INTER_AREA)
     depth = np.where(share > 0.5, depth / np.maximum(share, 1e-6), np.float32(0))
-    small = cv2.resize(grey, GlanceTuning.size, interpolation=cv2.INTER_AREA)
-    return Glance(frame.index, small, depth, _grain(grey), _surface(frame.depth))
+    small = cv2.resize(grey, ThumbnailTuning.size, interpolation=cv2.INTER_AREA)
+    return Thumbnail(frame.index, small, depth, _grain(grey), _surface(frame.depth))
 
 
-def look_over(sequence: Sequence) -> list[Glance]:
+def thumbnails_of(sequence: Sequence) -> list[Thumbnail]:
     """Frames spread over a recording; damaged ones are left out."""
-    chosen = np.unique(np.linspace(0, len(sequence) - 1, min(GlanceTuning.frames, len(sequence))).round().astype(int))
-    return [found for k in chosen.tolist() if (found := glance_of(sequence, k)) is not None]
+    chosen = np.unique(
+        np.linspace(0, len(sequence) - 1, min(ThumbnailTuning.frames, len(sequence))).round().astype(int)
+    )
+    return [found for k in chosen.tolist() if (found := thumbnail_of(sequence, k)) is not None]
 
 
-def glance_of(sequence: Sequence, index: int) -> Glance | None:
+def thumbnail_of(sequence: Sequence, index: int) -> Thumbnail | None:
     """Frame `index` in small; None: it is damaged."""
     try:
-        return glance_at(sequence.frame(index, masks=False))
+        return make_thumbnail(sequence.frame(index, masks=False))
     except SequenceError:
         return None
 
@@ -169,7 +171,7 @@ def _jumps(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for axis in (1, 0):
         there = np.roll(depth, -1, axis)
         nearer = np.minimum(depth, there)
-        at = (nearer > 0) & (np.abs(depth - there) > GlanceTuning.jump * nearer)
+        at = (nearer > 0) & (np.abs(depth - there) > ThumbnailTuning.jump * nearer)
         (at[:, -1:] if axis else at[-1:])[:] = False
         found.append(at)
     return found[0], found[1]
@@ -192,6 +194,6 @@ def _surface(depth: np.ndarray) -> float:
     left, right = depth[::2, :-1], depth[::2, 1:]
     known = (left > 0) & (right > 0)
     left, right = left[known], right[known]
-    if len(left) < GlanceTuning.min_neighbours:
+    if len(left) < ThumbnailTuning.min_neighbours:
         return float("nan")
-    return float((np.abs(left - right) < GlanceTuning.same_neighbour * np.minimum(left, right)).mean())
+    return float((np.abs(left - right) < ThumbnailTuning.same_neighbour * np.minimum(left, right)).mean())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Slices in several threads, results in order."""
+"""Codes slices in several threads and returns results in order."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cubes of space a sweep is done with, when what comes is cut in sections."""
+"""Tells which cubes of space are finished while a map is processed section by section."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 
-class CubesToCome:
-    """Tells which cubes no section to come reaches.
+class PendingCubes:
+    """Tells which cubes no later section reaches.
 
     Args:
         of_section: the cubes that each reaches into: keys int64, each once; None: into any.

@@ -12,7 +12,7 @@ import pytest
 
 PROGRAM = """
 import atexit, os, signal, sys, threading, time
-from ggslam.system.whole_program import run_program
+from ggslam.system.exit_signals import run_program
 
 def send():
     print("sent", flush=True)
