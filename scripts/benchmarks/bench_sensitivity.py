@@ -2,7 +2,7 @@
 """What each number is worth: halves and doubles it and prints how ATE, PSNR and mIoU of short runs change.
 
     python scripts/benchmarks/bench_sensitivity.py room livingroom@0.25 --csv numbers.csv --names tracking. loops.
-    python scripts/benchmarks/bench_sensitivity.py room livingroom@0.25 --csv numbers.csv --constants mapping tracking
+    python scripts/benchmarks/bench_sensitivity.py room livingroom@0.25 --csv numbers.csv --tuning mapping tracking
     python scripts/benchmarks/bench_sensitivity.py room --csv numbers.csv --print
 
 Each run appends a row, so that a table that was cut off goes on where it ended. A row whose hash (of trajectory and
@@ -19,12 +19,12 @@ import gc
 import hashlib
 import importlib
 import pkgutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.slam.config import Config
 from ggslam.system.interrupts import StopRequest, stop_on_request
 from ggslam.system.settings import walk
+from ggslam.system.tuning import Tuning, overridden
 
 SCORES = ("ate_mm", "psnr_db", "miou")
 COLUMNS = ("recording", "number", "value", "hash", *SCORES, "seconds", "error")
@@ -47,7 +48,7 @@ BASE = "(unchanged)"
 
 @dataclass(frozen=True)
 class Change:
-    """A number with another value: as an override of the settings, or as a constant `module:NAME` of the code."""
+    """A number with another value: as an override of the settings, or as a field `Class:name` of a tuning class."""
 
     name: str
     value: Any
@@ -79,41 +80,35 @@ def setting_changes(prefixes: list[str], internal: bool) -> Iterator[Change]:
             yield from (Change(one.path, value) for value in other_values(one.default, low, high))
 
 
-def constant_changes(rooms: list[str]) -> Iterator[Change]:
-    """Of every number that a module of these rooms binds to a name in capitals, but for those of other modules."""
+def tuning_changes(rooms: list[str]) -> Iterator[Change]:
+    """Of every number in the tuning classes of these rooms."""
     for room in rooms:
-        package = importlib.import_module(f"ggslam.{room}")
-        for found in pkgutil.walk_packages(package.__path__, f"ggslam.{room}."):
-            try:
-                module = importlib.import_module(found.name)
-            except (ImportError, GgslamError):
-                continue  # needs a package that is not here
-            source = Path(str(module.__file__)).read_text()
-            for name, value in vars(module).items():
-                if name.isupper() and type(value) in (int, float) and f"\n{name}" in source:
-                    yield from (Change(f"{found.name}:{name}", other) for other in other_values(value))
+        for name, kind in sorted(tuning_classes(room).items()):
+            for field, value in vars(kind).items():
+                if not field.startswith("_"):
+                    yield from (Change(f"{name}:{field}", other) for other in other_values(value))
+
+
+@cache
+def tuning_classes(room: str) -> dict[str, type[Tuning]]:
+    """Tuning classes of a room as "room.Class"."""
+    package = importlib.import_module(f"ggslam.{room}")
+    for found in pkgutil.walk_packages(package.__path__, f"ggslam.{room}."):
+        with suppress(ImportError, GgslamError):  # needs a package that is not here
+            importlib.import_module(found.name)
+    kinds = [kind for kind in Tuning.__subclasses__() if kind.__module__.startswith(f"ggslam.{room}.")]
+    return {f"{room}.{kind.__name__}": kind for kind in kinds}
 
 
 @contextmanager
 def applied(change: Change) -> Iterator[None]:
-    """Constants hold another value meanwhile, in every module that imported them."""
+    """Fields of tuning classes hold another value meanwhile."""
     if ":" not in change.name:
         yield
         return
-    place, name = change.name.split(":")
-    value = getattr(importlib.import_module(place), name)
-    holders = [m for m in _modules() if vars(m).get(name) is value]
-    for holder in holders:
-        setattr(holder, name, change.value)
-    try:
+    name, field = change.name.split(":")
+    with overridden(tuning_classes(name.split(".")[0])[name], **{field: change.value}):
         yield
-    finally:
-        for holder in holders:
-            setattr(holder, name, value)
-
-
-def _modules() -> list[Any]:
-    return [module for path, module in list(sys.modules.items()) if path.startswith("ggslam.")]
 
 
 def run(
@@ -212,7 +207,7 @@ def _difference(table: Table, row: dict[str, Any], name: str) -> float:
 
 def measure(arguments: argparse.Namespace, table: Table, stop: StopRequest, say: Callable[[str], None]) -> None:
     """Makes the runs that the table lacks."""
-    changes = [*setting_changes(arguments.names, arguments.internal), *constant_changes(arguments.constants)]
+    changes = [*setting_changes(arguments.names, arguments.internal), *tuning_changes(arguments.tuning)]
     used: set[str] = set()
     for recording in arguments.recordings:
         path, _, scale = recording.partition("@")
@@ -236,7 +231,7 @@ def main() -> None:
     parser.add_argument("--csv", type=Path, required=True, help="rows are appended to this file")
     parser.add_argument("--names", nargs="*", default=[], metavar="PREFIX", help="settings by the begin of their paths")
     parser.add_argument("--internal", action="store_true", help="only internal settings")
-    parser.add_argument("--constants", nargs="*", default=[], metavar="ROOM", help="constants of rooms of the package")
+    parser.add_argument("--tuning", nargs="*", default=[], metavar="ROOM", help="tuning classes of these rooms")
     parser.add_argument("--stop", type=int, default=16, help="frames of each recording")
     parser.add_argument("--stride", type=int, default=1)
     parser.add_argument("--set", nargs="*", default=["mapping.iterations_per_frame=1", "refine_iterations=10"])

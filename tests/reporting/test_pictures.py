@@ -7,6 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
+from sklearn.decomposition import PCA
 
 from ggslam.reporting.pictures import IdentityColors, color_of_ids, compare_pictures, legend
 
@@ -34,6 +35,19 @@ def test_identities_differ_in_colour_and_keep_it_from_picture_to_picture() -> No
     assert np.abs(faint - shown[0]).max() <= 1  # what is covered by less is not another identity
     alpha[0, 0] = 0.2
     assert not colors.picture(images[0], alpha)[0, 0].any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_identity_colours_are_the_principal_components_of_scikit_learn(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vectors = (rng.normal(size=(600, 16)) * np.linspace(3, 0.1, 16) @ rng.normal(size=(16, 16))).astype(np.float32)
+    components = PCA(3, svd_solver="full").fit(vectors.astype(float)).transform(vectors)
+    low, high = np.percentile(components, [1, 99], axis=0)
+    level = np.clip((components - low) / (high - low), 0, 1)
+    picture = IdentityColors(vectors).picture(vectors.T.reshape(16, 20, 30), np.ones((20, 30), np.float32))
+    ours = picture.reshape(-1, 3) / 255
+    mirrored = np.abs(ours - (1 - level)).max(0) < np.abs(ours - level).max(0)  # the sign of a component is free
+    assert np.abs(ours - np.where(mirrored, 1 - level, level)).max() < 1.5 / 255
 
 
 @pytest.mark.parametrize("features", [np.zeros((0, 16)), np.ones((1, 16)), np.zeros((9, 16)), np.ones((9, 2))])

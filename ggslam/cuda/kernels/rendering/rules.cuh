@@ -1,19 +1,26 @@
 // SPDX-License-Identifier: Apache-2.0
-// The rendering rules, stated in ggslam/rendering/reference.py.
+// The formulas that CPU and GPU share, for one Gaussian per thread: see ggslam/native/formulas.
 #pragma once
 #include "common/platform.cuh"
 #include "abi/cuda/rendering.hpp"
+#include "native/formulas/formulas.hpp"
+#include "native/formulas/rendering_rules.hpp"
 
 namespace ggslam::cuda {
 
-constexpr float kLog2MinAlpha = -7.99435344f;  // log2(1 / 255): weaker contributions are skipped
-constexpr float kMaxAlpha = 0.999f;
-constexpr float kMinTransmittance = 1e-4f;  // a pixel takes no further Gaussian once its transmittance is below
-constexpr float kFrustumMargin = 0.15f;     // of the image size: slopes beyond are clamped in the Jacobian
-constexpr float kMaxDepth = 1e6f;           // metres; Gaussians farther away are skipped
-constexpr float kMinLogScale = -23.0f, kMaxLogScale = 10.0f;
-constexpr float kMinQuaternionNorm2 = 1e-20f, kMaxQuaternionNorm2 = 1e20f;
-constexpr float kFinite = 1e30f;  // numbers beyond count as not finite
-constexpr float kLog2E = 1.44269504f, kLn2 = 0.69314718f;
+using Number = float;
+using Verdict = bool;
+
+__device__ inline float broadcast(float x) { return x; }
+__device__ inline float maximum(float a, float b) { return fmaxf(a, b); }
+__device__ inline float clamp(float x, float low, float high) { return fminf(fmaxf(x, low), high); }
+__device__ inline float absolute(float x) { return fabsf(x); }
+__device__ inline float square_root(float x) { return sqrtf(x); }
+__device__ inline float exponential(float x) { return expf(x); }
+__device__ inline float sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
+__device__ inline bool greater(float a, float b) { return a > b; }
+__device__ inline bool greater_equal(float a, float b) { return a >= b; }
+__device__ inline bool both(bool a, bool b) { return a && b; }
+__device__ inline float zero_unless(bool condition, float x) { return condition ? x : 0.0f; }
 
 }  // namespace ggslam::cuda

@@ -27,8 +27,6 @@ __device__ inline float log2_alpha(const Splat& s, float dx, float dy) {
   return fmaf(s.conic_r * r, r, fmaf(s.conic_y * dy, dy, s.log2_opacity));
 }
 
-__device__ inline float clamp(float x, float low, float high) { return fminf(fmaxf(x, low), high); }
-
 // Whether alpha reaches 1/255 somewhere in a rectangle of pixel centres from (x, y) to (x + width, y + height). Exact: the
 // highest value lies at the mean if that is inside, else on one of the two sides facing it, at the point of that side
 // where the quadratic is highest.

@@ -2,18 +2,15 @@
 // Colour of a Gaussian as seen from the camera, and its derivatives. Whoever uses a colour cuts it off at black.
 #pragma once
 #include "rendering/projection.cuh"
-#include "rendering/spherical_harmonics.cuh"
+#include "native/formulas/spherical_harmonics.hpp"
 
 namespace ggslam::cuda {
 
-// Unit direction from the camera centre to the mean, in the world frame: W^T position / |position|; returns
-// 1 / |position|.
-__device__ inline float viewing_direction(const ViewConstants& c, const float position[3], float direction[3]) {
-  const float inverse_length =
-      1.0f / sqrtf(position[0] * position[0] + position[1] * position[1] + position[2] * position[2]);
-  for (int i = 0; i < 3; ++i)
-    direction[i] = (c.W[0][i] * position[0] + c.W[1][i] * position[1] + c.W[2][i] * position[2]) * inverse_length;
-  return inverse_length;
+// All 16 values of the basis; those beyond `count` are zero, so that loops over all of them may stay unrolled.
+__device__ inline void whole_sh_basis(int count, const float direction[3], float basis[16]) {
+#pragma unroll
+  for (int k = 0; k < 16; ++k) basis[k] = 0.0f;
+  sh_basis(count, direction[0], direction[1], direction[2], basis);
 }
 
 __device__ inline void view_colour(const GaussianArrays& arrays, const ViewConstants& c, std::int64_t row,
@@ -25,7 +22,7 @@ __device__ inline void view_colour(const GaussianArrays& arrays, const ViewConst
   }
   float direction[3], basis[16];
   viewing_direction(c, position, direction);
-  sh_basis(arrays.active_sh_coefficients, direction[0], direction[1], direction[2], basis);
+  whole_sh_basis(arrays.active_sh_coefficients, direction, basis);
   for (int channel = 0; channel < 3; ++channel) colour[channel] = 0.5f;
 #pragma unroll
   for (int k = 0; k < 16; ++k)
@@ -53,7 +50,7 @@ __device__ inline void differentiate_view_colour(const GaussianArrays& arrays, c
   const int count = arrays.active_sh_coefficients;
   float d[3];
   const float inverse_length = viewing_direction(c, position, d);
-  sh_basis(count, d[0], d[1], d[2], basis);
+  whole_sh_basis(count, d, basis);
   for (int i = 0; i < 3; ++i) position_gradient[i] = 0.0f;
   if (count == 1) return;
   const float* sh = arrays.sh + row * arrays.sh_coefficients * 3;
@@ -65,7 +62,7 @@ __device__ inline void differentiate_view_colour(const GaussianArrays& arrays, c
     if (k < count)
       for (int channel = 0; channel < 3; ++channel) weight[k] += colour_gradient[channel] * sh[3 * k + channel];
   }
-  sh_direction_gradient(d[0], d[1], d[2], weight, g);
+  sh_direction_gradient(count, d[0], d[1], d[2], weight, g);
   const float along = g[0] * d[0] + g[1] * d[1] + g[2] * d[2];
   for (int i = 0; i < 3; ++i) g[i] = (g[i] - along * d[i]) * inverse_length;  // world frame
   for (int i = 0; i < 3; ++i) position_gradient[i] = c.W[i][0] * g[0] + c.W[i][1] * g[1] + c.W[i][2] * g[2];

@@ -7,7 +7,7 @@
 #pragma once
 #include "common/platform.cuh"
 #include "abi/cuda/tracking.hpp"
-#include "tracking/symmetric3.cuh"
+#include "native/formulas/depth_window.hpp"
 
 namespace ggslam::cuda {
 
@@ -30,43 +30,12 @@ __device__ inline bool grid_point(const DepthPointsJob& job, int cell, GridPoint
   return point->z >= s.min_depth && point->z <= s.max_depth;
 }
 
-// Scatter of the neighbours on the same surface, about their mean; false if they are too few.
-__device__ inline bool window_scatter(const DepthPointsJob& job, const GridPoint& point, float (&scatter)[6]) {
-  const DepthPointsSettings& s = job.settings;
-  const float z = point.z, sigma = s.noise_constant + s.noise_square * z * z;
-  // A surface seen at an angle of up to about 75 degrees changes its depth by 4 z / f per pixel.
-  const float slope = 4.0f * z / s.fx;
-  const float x0 = (point.u - s.cx) / s.fx, y0 = (point.v - s.cy) / s.fy;
-  float n = 0, sum[3] = {0, 0, 0}, outer[6] = {0, 0, 0, 0, 0, 0};
-  for (int j = -s.window; j <= s.window; ++j)
-    for (int i = -s.window; i <= s.window; ++i) {
-      const int du = i * s.window_step, dv = j * s.window_step;
-      const float e = job.depth[(point.v + dv) * s.width + point.u + du];
-      const float reach = slope * max(abs(du), abs(dv)) + 3.0f * sigma;
-      if (!(e > 0) || fabsf(e - z) > reach) continue;
-      const float x = (x0 + du / s.fx) * e - x0 * z, y = (y0 + dv / s.fy) * e - y0 * z, d = e - z;
-      n += 1;
-      sum[0] += x, sum[1] += y, sum[2] += d;
-      outer[0] += x * x, outer[1] += x * y, outer[2] += x * d;
-      outer[3] += y * y, outer[4] += y * d, outer[5] += d * d;
-    }
-  const int side = 2 * s.window + 1;
-  if (n < s.min_neighbours * side * side) return false;
-  const float f = 1 / n;
-  int k = 0;
-#pragma unroll
-  for (int a = 0; a < 3; ++a)
-#pragma unroll
-    for (int b = a; b < 3; ++b, ++k) scatter[k] = f * outer[k] - f * f * sum[a] * sum[b];
-  return true;
-}
-
 // One bit for each grid point: whether it has depth and enough neighbours.
 __global__ void __launch_bounds__(kPointThreads) find_points_kernel(DepthPointsJob job) {
   const int cell = static_cast<int>(blockIdx.x * kPointThreads + threadIdx.x);
   GridPoint point;
   float scatter[6];
-  const bool good = grid_point(job, cell, &point) && window_scatter(job, point, scatter);
+  const bool good = grid_point(job, cell, &point) && window_scatter(job.depth, job.settings, point.u, point.v, point.z, scatter);
   const unsigned bits = __ballot_sync(kAllLanes, good);
   if (threadIdx.x % kWarp == 0) static_cast<std::uint32_t*>(job.workspace)[cell / kWarp] = bits;
 }
@@ -85,27 +54,12 @@ __device__ inline unsigned sum_over_block(unsigned value, unsigned (&room)[kThre
 }
 
 __device__ inline void write_point(const DepthPointsJob& job, const GridPoint& at, std::int64_t n) {
-  const DepthPointsSettings& s = job.settings;
   const PointArrays& out = job.out;
-  float scatter[6] = {0, 0, 0, 0, 0, 0}, values[3], axes[3][3], shape[3];
-  window_scatter(job, at, scatter);
-  eigen_symmetric3(scatter, values, axes);
-  const float z = at.z, point[3] = {(at.u - s.cx) / s.fx * z, (at.v - s.cy) / s.fy * z, z};
-  const float facing = axes[2][0] * point[0] + axes[2][1] * point[1] + axes[2][2] * point[2];
-#pragma unroll
-  for (int i = 0; i < 3; ++i) {
-    out.points[3 * n + i] = point[i];
-    out.normals[3 * n + i] = facing > 0 ? -axes[2][i] : axes[2][i];
-  }
-  // The measured thickness contains the noise of the depth seen along the normal; what remains is the surface's.
-  const float sigma = s.noise_constant + s.noise_square * z * z;
-  const float along = facing * facing / (point[0] * point[0] + point[1] * point[1] + z * z);
-  values[2] = fmaxf(values[2] - 2 * sigma * sigma * along, 0.0f);
-  regularized_axes(values, s.min_thickness, 1.0f, s.max_elongation, shape);
-  compose_symmetric3(shape, axes, out.covariances + 6 * n);
+  float scatter[6] = {0, 0, 0, 0, 0, 0};
+  window_scatter(job.depth, job.settings, at.u, at.v, at.z, scatter);
+  out.weights[n] = describe_point(job.settings, at.u, at.v, at.z, scatter, out.points + 3 * n, out.normals + 3 * n,
+                                  out.covariances + 6 * n);
   out.pixels[2 * n] = at.u, out.pixels[2 * n + 1] = at.v;
-  const float ratio = (s.noise_constant + s.noise_square) / sigma;
-  out.weights[n] = fminf(ratio * ratio, s.max_weight);
 }
 
 // Writes the good points, each behind those before it.

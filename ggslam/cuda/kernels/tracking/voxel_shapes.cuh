@@ -2,7 +2,7 @@
 // Means, normals and covariances of a target's voxels from the moments of their members, as in
 // native/src/tracking/kernels/voxel_target.cpp.
 #pragma once
-#include "tracking/symmetric3.cuh"
+#include "native/formulas/symmetric3.hpp"
 #include "tracking/voxel_lookup.cuh"
 
 namespace ggslam::cuda {

@@ -18,18 +18,9 @@
 #include "common/buffer.hpp"
 #include "common/context.hpp"
 #include "abi/core/rendering.hpp"
+#include "native/formulas/rendering_rules.hpp"
 
 namespace ggslam {
-
-// --- the rendering rules: one contract for all backends, stated in ggslam/rendering/reference.py ---------------------
-constexpr float kLog2MinAlpha = -7.99435344f;   // log2(1 / 255): weaker contributions are skipped
-constexpr float kMaxAlpha = 0.999f;
-constexpr float kMaxAlphaOf3dgs = 0.99f;        // in pictures by the rules of 3DGS
-constexpr float kMinTransmittance = 1e-4f;      // a pixel takes no further Gaussian once its transmittance is below
-constexpr float kFrustumMargin = 0.15f;         // of the image size: slopes beyond are clamped in the Jacobian
-constexpr float kMaxDepth = 1e6f;               // metres; Gaussians farther away are skipped
-constexpr float kMinLogScale = -23.0f, kMaxLogScale = 10.0f;  // Gaussians with a scale outside are skipped
-constexpr float kMinQuaternionNorm2 = 1e-20f, kMaxQuaternionNorm2 = 1e20f;
 
 constexpr int kSubBlocks = 32;                  // sub-blocks of a tile, each of as many pixels as a vector has lanes
 constexpr int kBaseGradients = 10;              // log-alpha moments 1, r, dy, r^2, r dy, dy^2; colour; depth

@@ -2,7 +2,8 @@
 // Sums each Gaussian's gradient slots, differentiates its projection, then either writes the gradients or applies Adam
 // at once, so that no gradient array is ever written or read.
 #include "rendering/kernels/adam.hpp"
-#include "rendering/kernels/projection_backward.hpp"
+#include "rendering/kernels/projection_math.hpp"
+#include "native/formulas/projection_backward.hpp"
 #include "rendering/kernels/view_colour.hpp"
 
 namespace ggslam::GGSLAM_ISA {
@@ -51,7 +52,7 @@ void sh_rows(const GaussianArrays& arrays, const Float basis[16], const Float co
 void differentiate_group(const Rasterizer& r, const ViewConstants& c, const Group& group, GroupGradients& out,
                          double* twist) {
   const GaussianArrays& arrays = r.gaussians;
-  const RawGaussians raw = load_gaussians(arrays, group.rows);
+  const RawGaussian raw = load_gaussians(arrays, group.rows);
   const Projection p = project(c, raw);
   SplatGradients g = splat_gradients(group);
   differentiate_cut_at_black(arrays, c, group.rows, p.position, g.colour);

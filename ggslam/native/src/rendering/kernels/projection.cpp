@@ -23,7 +23,7 @@ inline const float* splat_fields(const SplatVectors& v, int four, int lane) {
 // Whether any Gaussian may reach into the image, by its mean and its largest scale alone: most of a large map does not.
 // An ellipse extends by less than 3.34 standard deviations (alpha falls from 1 to 1/255), and those in the image are at
 // most scale * focal length / z * |(1, slope)|, besides the low-pass filter's. Everything is multiplied by z.
-inline bool may_be_seen(const ViewConstants& c, const CameraView& view, const RawGaussians& g) {
+inline bool may_be_seen(const ViewConstants& c, const CameraView& view, const RawGaussian& g) {
   constexpr float kDeviations = 3.34f;
   Float p[3];
   for (int i = 0; i < 3; ++i)
@@ -58,7 +58,7 @@ inline Mask tile_range(Float centre, Float extent, int size, int tile_size, Int&
 inline Float black_or_more(Float colour) { return maximum(colour, Float{}); }
 
 inline void make_splats(const Rasterizer& r, const ViewConstants& c, const Rows& rows, SplatVectors& out) {
-  const RawGaussians g = load_gaussians(r.gaussians, rows);
+  const RawGaussian g = load_gaussians(r.gaussians, rows);
   out.visible = 0;
   if (!may_be_seen(c, r.view, g)) return;
   const Projection p = project(c, g);

@@ -2,19 +2,9 @@
 // Colour of Gaussians as seen from the camera, and its derivatives. Whoever uses a colour cuts it off at black.
 #pragma once
 #include "rendering/kernels/projection_math.hpp"
-#include "rendering/kernels/spherical_harmonics.hpp"
+#include "native/formulas/spherical_harmonics.hpp"
 
 namespace ggslam::GGSLAM_ISA {
-
-// Unit directions from the camera centre to the means, in the world frame: W^T position / |position|.
-static inline Float viewing_direction(const ViewConstants& c, const Float position[3], Float direction[3]) {
-  const Float inverse_length =
-      1.0f / square_root(position[0] * position[0] + position[1] * position[1] + position[2] * position[2]);
-  for (int i = 0; i < 3; ++i)
-    direction[i] =
-        (c.W[0][i] * position[0] + c.W[1][i] * position[1] + c.W[2][i] * position[2]) * inverse_length;
-  return inverse_length;
-}
 
 static inline Float load_sh(const GaussianArrays& arrays, const Rows& rows, int k, int channel) {
   Float v;

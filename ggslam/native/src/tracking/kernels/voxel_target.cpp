@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Gaussians gathered in voxels: where each belongs, what its voxel learns from it, and the voxel's final shape.
-#include "common/kernels/symmetric3.hpp"
+#include "native/formulas/symmetric3.hpp"
 #include "tracking/kernels/voxel_lookup.hpp"
 
 namespace ggslam::GGSLAM_ISA {
