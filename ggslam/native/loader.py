@@ -56,8 +56,8 @@ def _installed_library() -> ctypes.CDLL | None:
 
 
 def source_hash(package: Path) -> str:
-    """SHA-256 of the C++ sources in a package's native/src, native/formulas and abi, as CMakeLists.txt computes it: of lines of
-    path and SHA-256, sorted by path."""
+    """SHA-256 of the C++ sources in a package's native/src, native/formulas and abi, as CMakeLists.txt computes it: of
+    lines of path and SHA-256, sorted by path."""
     files = [p for folder in ("native/src", "native/formulas", "abi") for p in (package / folder).rglob("*.?pp")]
     paths = {p.relative_to(package).as_posix(): p for p in files}
     lines = [f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n" for name, path in sorted(paths.items())]
