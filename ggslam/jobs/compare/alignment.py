@@ -18,6 +18,7 @@ from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.poses import fit_similarity, inverse
 from ggslam.sequences.association import TOLERANCE, pair_times
+from ggslam.system.counting import counted
 from ggslam.system.tuning import Tuning
 
 Alignment = Literal["auto", "none", "truth", "icp", "trajectory"]
@@ -78,8 +79,8 @@ def by_trajectory(a: Side, b: Side, pairs: np.ndarray) -> np.ndarray:
         raise ConfigError(f"`align` trajectory: {lacking.path} is a file and has no trajectory; use icp or none")
     if len(pairs) < FEWEST_POSES:
         raise ConfigError(
-            f"`align` trajectory: {a.path} and {b.path} have {len(pairs)} poses at common times, expected at least "
-            f"{FEWEST_POSES}"
+            f"`align` trajectory: {a.path} and {b.path} share {counted(len(pairs), 'time')} of poses, expected at "
+            f"least {FEWEST_POSES}"
         )
     source, target = a.trajectory.T_world_camera[pairs[:, 0]], b.trajectory.T_world_camera[pairs[:, 1]]
     return align_points(source[:, :3, 3], target[:, :3, 3])[0]
@@ -142,7 +143,9 @@ def _true_world(side: Side) -> np.ndarray:
                           "recording knows true poses")  # fmt: skip
     pairs = pair_times(side.trajectory.timestamps, side.truth.timestamps, 1e-3)
     if len(pairs) < FEWEST_POSES:
-        raise ConfigError(f"`align` truth: {side.path}: {len(pairs)} poses have a true one, {FEWEST_POSES} needed")
+        raise ConfigError(
+            f"`align` truth: {side.path}: found true poses for {counted(len(pairs), 'pose')}, {FEWEST_POSES} needed"
+        )
     found, true = side.trajectory.T_world_camera[pairs[:, 0]], side.truth.T_world_camera[pairs[:, 1]]
     T = fit_similarity(_arms(found), _arms(true))[0]
     positions = true[:, :3, 3]

@@ -42,6 +42,7 @@ from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
+from ggslam.system.counting import counted
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.tuning import Tuning
 
@@ -230,7 +231,9 @@ def _with_consent(confirm: Callable[[str], bool] | None) -> Apply:
         removed = len(change.before.means)
         if confirm is None or edit.kind != "remove" or removed <= EditTuning.confirmed_share * before:
             return change
-        if not confirm(f"`remove` {names}: {removed} of {before} Gaussians, {removed / before:.0%} of the map"):
+        if not confirm(
+            f"`remove` {names}: {removed} of {counted(before, 'Gaussian')}, {removed / before:.0%} of the map"
+        ):
             raise ConfigError(f"`remove` {names}: not confirmed; nothing was changed")
         return change
 

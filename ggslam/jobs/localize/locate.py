@@ -42,6 +42,7 @@ from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder
+from ggslam.system.counting import counted
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.settings import tuning_note
 from ggslam.system.tuning import Tuning
@@ -150,7 +151,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     with delay_interrupts():
         write_localization(report, out, observer)
     if error is not None:
-        observer.note(f"stopped after {len(results)} of {len(recording)} frames, which are in {out}")
+        observer.note(f"stopped after {len(results)} of {counted(len(recording), 'frame')}, which are in {out}")
         raise error
     return report
 
@@ -330,7 +331,9 @@ def _run(
             results.append(localizer.locate(item))
             observer.advance(len(results), len(recording))
         if isinstance(recording, ScanSequence) and recording.all_empty:
-            raise SequenceError(f"{recording.path}: none of {len(recording)} scans has a point with a position")
+            raise SequenceError(
+                f"{recording.path}: none of {counted(len(recording), 'scan')} has a point with a position"
+            )
     except (GgslamError, KeyboardInterrupt) as stopped:  # what was located is written first
         return results, stopped
     return results, None

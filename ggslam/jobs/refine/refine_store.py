@@ -30,6 +30,7 @@ from ggslam.jobs.tasks.engines import Engine
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_copy import copy_store
+from ggslam.system.counting import counted
 
 
 @dataclass
@@ -149,7 +150,9 @@ class _Refinement:
         self.done.finish()
         if len(failures) == outcome.cells:
             first = next(iter(outcome.failures.values()))
-            raise FormatError(f"{self.store.path}: no part of its {outcome.cells} cells can be used: {first}")
+            raise FormatError(
+                f"{self.store.path}: no part of its {counted(outcome.cells, 'cell')} can be used: {first}"
+            )
         outcome.seconds = time.perf_counter() - start
         return outcome
 

@@ -19,6 +19,7 @@ from ggslam.runs.records.verdict import AspectRecord, Grade, worst
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import LOST_SHARE
+from ggslam.system.counting import counted
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 
@@ -129,13 +130,13 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
         if stopped or total < TrackingGradeTuning.min_frames or codes & {"no_motion", "both_repeat"}
         else "good",
     ]
-    words = [f"{total - lost} of {total} frames located"]
+    words = [f"{total - lost} of {counted(total, 'frame')} located"]
     words += [f"{searched} of them by search"] if searched else []
     words += [f"{doubted} against what the image shows"] if doubted else []
     words += ["nothing in view tells the motion"] if "textureless" in codes else []
     words += ["most with an open direction"] if "degenerate" in codes else []
     words += [f"the path jumps {len(jumps)} times (the first: frame {jumps[0]})"] if jumps else []
-    words += [f"{dropped} frames dropped"] if dropped else []
+    words += [f"{counted(dropped, 'frame')} dropped"] if dropped else []
     words += ["the depth images show noise"] if "depth_noise" in codes else []
     words += ["both streams hang"] if "both_repeat" in codes else []
     one = ["too few to tell"] if total < TrackingGradeTuning.min_frames else ["one frame shows no motion"]
@@ -227,7 +228,7 @@ def grade_objects(table: ObjectTable | None, scored: ScoredFigures) -> AspectRec
         return _aspect(["bad"], 0, "objects", ["none, though they were looked for"])
     share = max(counts) / (sum(counts) + table.unlabelled_gaussians)
     grades = [_at_most(share, ObjectGradeTuning.doubtful_object_share, ObjectGradeTuning.bad_object_share)]
-    number = "1 object" if len(counts) == 1 else f"{len(counts)} objects"
+    number = counted(len(counts), "object")
     words = [f"{number}, the largest has {share:.0%} of the Gaussians"]
     if scored.id_accuracy is not None:
         grades.append(
@@ -251,8 +252,8 @@ def grade_movers(result: SlamResult) -> AspectRecord:
         _at_most(rate, ObjectGradeTuning.doubtful_movers, ObjectGradeTuning.bad_movers) if often else "good",
         "bad" if often and picture > ObjectGradeTuning.bad_moving_share else "good",
     ]
-    movers = "1 mover" if len(result.movers) == 1 else f"{len(result.movers)} movers"
-    words = [f"{movers} in {frames} of {total} frames, {picture:.1%} of the image there"]
+    movers = counted(len(result.movers), "mover")
+    words = [f"{movers} in {frames} of {counted(total, 'frame')}, {picture:.1%} of the image there"]
     return _aspect(grades, 100 * frames / max(1, total), "%", words)
 
 

@@ -27,6 +27,7 @@ from ggslam.runs.records.verdict import AspectRecord, FitRecord, Grade, RunVerdi
 from ggslam.sequences.camera_doubts import doubt_centre
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
+from ggslam.system.counting import counted
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 
@@ -132,7 +133,7 @@ def _failure(result: SlamResult) -> str:
     total, lost = len(result.frames), [f for f in result.frames if f.status == TrackingStatus.LOST.value]
     if len(lost) <= TrackingGradeTuning.max_lost * total:
         return ""
-    return f"the camera was lost in {len(lost)} of {total} frames (the first: {lost[0].frame_index})"
+    return f"the camera was lost in {len(lost)} of {counted(total, 'frame')} (the first: {lost[0].frame_index})"
 
 
 def _advice(

@@ -27,6 +27,7 @@ from ggslam.slam.realtime import RealtimeSlam
 from ggslam.slam.result import SlamResult, StepReport, tracked_poses
 from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.slam import Slam
+from ggslam.system.counting import counted
 from ggslam.system.interrupts import StopRequest
 from ggslam.system.staging import new_staging
 
@@ -158,7 +159,9 @@ class SlamLoop:
             if self.folder is not None and slam.frames:
                 stamps = np.array([frame.timestamp for frame in slam.frames])
                 kept = self.folder.save_trajectory(stamps, _last_poses(slam), repr(failure))
-                self.observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {kept.path}")
+                self.observer.note(
+                    f"the map is lost; the trajectory of {counted(len(stamps), 'frame')} is in {kept.path}"
+                )
             raise
 
 

@@ -36,6 +36,7 @@ from ggslam.submaps.cell_records import CellChange
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.submaps.store_objects import ObjectEvent, StoreObjects, read_objects
+from ggslam.system.counting import counted
 from ggslam.system.tuning import Tuning
 
 AddRun = Callable[[Path, GridStore, "str | None", "float | None"], object]
@@ -149,7 +150,7 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
             observer.begin("record", len(poses))
             watched = _with_progress(items, observer, len(poses))
             written = record_visit(store, watched, poses, sights, request.visit or source.resolve().name, request.at)
-            observer.note(f"{len(written)} cells written")
+            observer.note(f"{counted(len(written), 'cell')} written")
             if missed := _words_of_missed(store, poses):
                 observer.note(missed)
         elif cloud is not None:
@@ -275,8 +276,8 @@ def _words_of_missed(store: GridStore, poses: np.ndarray) -> str:
     s, grid = store.settings, store.grid
     enough = math.ceil(50 * s.spacing * math.sqrt(grid.spans.sum())) / 100
     return (
-        f"{missed} of {len(known)} poses lie in cells that nothing was recorded of: none came within R {s.radius:g} m "
-        f"of their centres; `--set submaps.radius={enough:g}` records every cell that is passed"
+        f"{missed} of {counted(len(known), 'pose')} lie in cells that nothing was recorded of: none came within R "
+        f"{s.radius:g} m of their centres; `--set submaps.radius={enough:g}` records every cell that is passed"
     )
 
 

@@ -36,6 +36,7 @@ from ggslam.runs.publishing import change_in_run
 from ggslam.runs.records.volumes import VolumesRecord
 from ggslam.scene.origin import moved_pose
 from ggslam.scene.poses import translation
+from ggslam.system.counting import counted
 from ggslam.system.json_files import write_json
 from ggslam.system.staging import finish_saving, make_staging, publish
 from ggslam.system.tuning import Tuning
@@ -173,7 +174,7 @@ class _Writer:
         save_tsdf(self.path("tsdf.npz"), tsdf)
         held = tsdf.memory_bytes / 1e6
         self.tell(
-            f"TSDF: {len(tsdf)} blocks of 8^3 voxels, {tsdf.dense_blocks} near surfaces, {held:.0f} MB",
+            f"TSDF: {counted(len(tsdf), 'block')} of 8^3 voxels, {tsdf.dense_blocks} near surfaces, {held:.0f} MB",
             tsdf={"blocks": len(tsdf), "dense_blocks": tsdf.dense_blocks, "memory_mb": held},
         )
 
@@ -202,7 +203,7 @@ class _Writer:
             safe = "".join(c if c.isalnum() else "_" for c in name)
             path = self.path(f"object_{number}_{safe}.ply")
             write_mesh(path, part.vertices, part.triangles, part.normals, part.colors, part.labels)
-        self.tell(f"{len(objects)} objects have a mesh of their own: {self.out / 'object_*.ply'}")
+        self.tell(f"wrote meshes of {counted(len(objects), 'object')}: {self.out / 'object_*.ply'}")
 
     def floor(self) -> None:
         """Which way is up, and where the floor is."""
@@ -247,8 +248,8 @@ class _Writer:
         held = field_.memory_bytes / 1e6
         ground = "the floor" if upright.floor is not None else "a metre below the camera"
         self.tell(
-            f"distance field: {len(field_)} blocks, {held:.0f} MB, last update {1e3 * seconds:.0f} ms; slice "
-            f"{height - base:.2f} m above {ground}",
+            f"distance field: {counted(len(field_), 'block')}, {held:.0f} MB, last update {1e3 * seconds:.0f} ms; "
+            f"slice {height - base:.2f} m above {ground}",
             esdf={"blocks": len(field_), "memory_mb": held, "last_update_ms": 1e3 * seconds,
                   "slice_height": height - base, "band": [low, high], "map_frame": axes},
         )  # fmt: skip
