@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The likeliest motions of a thing, by places and colours together, from starts all around."""
+"""Finds the likeliest motions of a candidate by positions and colours, from starts all around."""
 
 from __future__ import annotations
 

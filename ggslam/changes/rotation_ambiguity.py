@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the turn of a thing that moved is known: round things and plain ones look alike from many sides."""
+"""Whether the rotation of a moved object is known: round and plain objects look alike from many sides."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a thing lay before and after: its surface brought upon itself, by shape and colour."""
+"""Aligns an object's surface before and after its motion, by shape and colour."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How A is brought into the frame of B: not at all, by true poses, by common times, or by ICP."""
+"""Aligns A with the frame of B: not at all, by true poses, by common times, or by ICP."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class AlignmentTuning(Tuning):
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two things compared.
+    """One side of a comparison.
 
     Attributes:
         path: a run's folder or a file.

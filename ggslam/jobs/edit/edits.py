@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edits of a run's map: a new run folder with the edited map and pictures of before and after. What `ggslam edit` does,
-usable from Python."""
+"""Edits a run's map: writes a run folder with the edited map and pictures from before and after. `ggslam edit`
+calls this."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ Apply = Callable[[SegmentedMap, Edit], Change]
 
 @dataclass
 class EditOutcome:
-    """What came of it.
+    """Result of editing a run.
 
     Attributes:
         folder: the edited run, or the file that stands for it.

@@ -21,7 +21,7 @@ from ggslam.system.counting import counted
 
 @dataclass
 class Contents:
-    """What is in a file.
+    """Contents of a coded file.
 
     Attributes:
         facts: name and words of each thing that is to be known.

@@ -31,7 +31,7 @@ from ggslam.volumes.output_frame import OutputFrame
 
 @dataclass(frozen=True)
 class MeshRequest:
-    """Which mesh is wanted.
+    """A request for a mesh.
 
     Attributes:
         voxel: edge of the voxels, metres; None: as the run's settings say; where they say nothing, as goes with the

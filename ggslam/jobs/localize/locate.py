@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The work behind `ggslam localize`: opens map and recording, locates every frame, writes what came of it."""
+"""Localizes a recording in a stored map: opens both, locates every frame, and writes the results."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class LocateTuning(Tuning):
 
 @dataclass(frozen=True)
 class LocalizeRequest:
-    """What is asked for.
+    """A request to localize a recording.
 
     Attributes:
         map: folder of a grid store or a run, or a cloud.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A grid store trained further, cell by cell: what `ggslam refine STORE` does.
+"""Trains a grid store further, cell by cell. `ggslam refine STORE` calls this.
 
 Every cell is trained from the store as it was, with an order of its own, so that the result does not depend on how many
 workers there are nor on which cell comes first.
@@ -35,7 +35,7 @@ from ggslam.system.counting import counted
 
 @dataclass
 class StoreRefinement:
-    """What came of refining a store.
+    """Result of refining a store.
 
     Attributes:
         path: the store.
@@ -118,7 +118,7 @@ def _check_recordings(store: GridStore) -> None:
 
 @dataclass
 class _Refinement:
-    """A store about to be trained."""
+    """A store while it is refined."""
 
     store: GridStore
     done: CellsDone

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a run saves its state, and what it takes to go on from there."""
+"""Decides when a run saves its state, and saves what resuming needs."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the figures of a run are worth: each aspect of `verdict.json` as good, doubtful or bad.
+"""Grades each aspect of a run in `verdict.json` as good, doubtful or bad.
 
 Every limit stands here, with what it was set by. They were set between what runs of sound recordings (walks with
 Kinect, RealSense, HoloLens and an iPhone, rendered and generated rooms, at full and half size) and runs of faulty ones
@@ -100,7 +100,7 @@ OF_RECORDING = {
 
 @dataclass(frozen=True)
 class ScoredFigures:
-    """What only scoring tells.
+    """Figures that only scoring provides.
 
     Attributes:
         overfit_db: PSNR of keyframes over that of held-out frames, exposure forgiven; None: no frame was held out.

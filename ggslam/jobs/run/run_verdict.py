@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a run is: the grades of its aspects as one, and what to try next."""
+"""The verdict on a run: the grades of its aspects combined, and advice on what to try next."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop over a recording: frame after frame into `Slam`, with checkpoints on the way, until it ends or is ended."""
+"""The loop over a recording: feeds frames to `Slam` and saves checkpoints until the end or an interruption."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Follower = Callable[[Slam, Frame, StepReport], None]
 
 @dataclass
 class SlamLoop:
-    """What the loop works with.
+    """Everything that the loop over a recording uses.
 
     Attributes:
         sequence: the recording.

@@ -54,7 +54,7 @@ class FillTuning(Tuning):
 
 @dataclass(frozen=True)
 class SubmapsRequest:
-    """What is asked for.
+    """A request to fill or list a grid store.
 
     Attributes:
         source: folder of a run, a cloud, or folder of a recording.

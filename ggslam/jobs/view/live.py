@@ -51,7 +51,7 @@ class LiveViewTuning(Tuning):
 
 @dataclass
 class _Snapshot:
-    """What is shown: copies, so that the run can go on."""
+    """A snapshot for the page, copied so that the run can continue."""
 
     gaussians: GaussianTensors
     poses: np.ndarray

@@ -72,7 +72,7 @@ class VolumeOutputTuning(Tuning):
 
 @dataclass(frozen=True)
 class OutputRequest:
-    """What is written, beside what there always is.
+    """Optional outputs.
 
     Attributes:
         mesh: file of the mesh; None: mesh.ply beside the rest.
@@ -133,7 +133,7 @@ class Surface:
 
 @dataclass
 class Outputs:
-    """What was written.
+    """Files that were written.
 
     Attributes:
         files: all of them.
