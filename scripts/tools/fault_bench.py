@@ -63,6 +63,10 @@ class Row:
     problems: list[str] = field(default_factory=list)
 
 
+UNTOUCHED = "existing files are untouched"
+"""What is said to be kept if a fault changed nothing that was there."""
+
+
 class Place:
     """A folder in which one fault happens.
 
@@ -117,7 +121,7 @@ class Place:
         found = [what for what in (run_at(self.out), run_elsewhere(self.ended[-1].text, self.folder)) if what]
         after = sums(self.folder)
         if all(after.get(name) == digest for name, digest in self._before.items()):
-            found.append("all that was there before")
+            found.append(UNTOUCHED)
         return found
 
 
@@ -138,7 +142,8 @@ def run_at(folder: Path) -> str:
     try:
         mark = json.loads((folder / "run.json").read_text())
         frames = sum(line[:1] != "#" for line in (folder / "trajectory.txt").read_text().splitlines())
-        return f"a {'complete' if mark.get('complete') else 'run marked incomplete, a'} run of {frames} frames"
+        kind = "a complete" if mark.get("complete") else "an incomplete"
+        return f"{kind} run of {frames} frame{'s' * (frames != 1)}"
     except (OSError, ValueError):
         states = list((folder / "checkpoints").glob("state-*.bin")) if folder.is_dir() else []
         return f"{len(states)} checkpoints to resume from" if states else ""

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -27,7 +28,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("COLUMNS", "1000")
 os.environ["NO_COLOR"] = "1"
 
-from fault_bench import FEW, Place, Row, command  # noqa: E402
+from fault_bench import FEW, UNTOUCHED, Place, Row, command  # noqa: E402
 from fault_cases import FAULTS, NotHere  # noqa: E402
 
 import ggslam.cli.main  # noqa: E402, F401  (what all processes share)
@@ -36,12 +37,16 @@ import ggslam.jobs.run.pipeline  # noqa: E402, F401
 FRAMES = 14
 HEAD = """# Faults
 
-What goes wrong, what ggslam says (the line that matters), and what is kept of your work; written by
-`python fault_table.py --markdown docs/faults.md`, which lets each happen in a folder of its own, here `.`.
-Exit codes: 0 done (3 with `--strict` where the verdict is bad or something seems wrong), 2 the input's fault, 1 the
-machine's or ours, or most frames lost, 128 + n after signal n, -9 after a kill.
-After a kill the line is that of the command that goes on.
+What goes wrong, the line of ggslam's answer that matters (shortened), the exit code, and what of the work in progress
+is kept. Existing files stay as they are wherever the last column does not say otherwise. Every row happened, in its own
+folder (here `.`): the page is written by `python scripts/tools/fault_table.py --markdown docs/faults.md`.
+
+Exit codes: 0 done (3 with `--strict` where something seems wrong), 1 this machine's fault or ours, or most frames were
+lost, 2 the input's fault, 128 + n after signal n, -9 after a kill. After a kill the line is that of the command that
+goes on.
 """
+MOST = 84
+"""Characters of a message on the page."""
 
 
 def make_inputs(folder: Path) -> tuple[Path, Path]:
@@ -71,17 +76,31 @@ def happen(name: str, folder: Path, recording: Path, run: Path) -> Row | None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def cell(text: str, most: int) -> str:
+def brief(said: str) -> str:
+    """What a message says, without its kind, the folder of the fault and remarks in brackets; cut off between words."""
+    words = re.sub(r" \([^()]*\)", "", said.removeprefix("error: ")).replace("./recording/", "").split()
+    short = words[:1]
+    for word in words[1:]:
+        if len(" ".join([*short, word])) > MOST:
+            return " ".join(short).rstrip(".,;:") + " …"
+        short.append(word)
+    return " ".join(short)
+
+
+def cell(text: str) -> str:
     """Text for a Markdown table."""
-    short = text if len(text) <= most else text[: most - 1] + "…"
-    return short.replace("|", "\\|").replace("<", "&lt;")
+    return text.replace("|", "\\|").replace("<", "&lt;")
 
 
 def table(rows: list[Row]) -> str:
-    lines = ["| fault | what the user sees | exit code | what was kept |", "|---|---|---|---|"]
+    lines = ["| fault | message | exit | kept |", "|---|---|---|---|"]
     for row in rows:
-        kept = row.kept + (f" **{', '.join(row.problems)}**" if row.problems else "")
-        lines.append(f"| {row.fault} | {cell(row.said, 220)} | {row.code} | {cell(kept, 120)} |")
+        parts = row.kept.split("; ")
+        kept = "; ".join(part for part in parts if part != UNTOUCHED)
+        if UNTOUCHED not in parts:
+            kept += " (an existing file has changed)"
+        bad = f" **{', '.join(row.problems)}**" if row.problems else ""
+        lines.append(f"| {row.fault} | {cell(brief(row.said))} | {row.code} | {cell(kept + bad)} |")
     return "\n".join(lines)
 
 

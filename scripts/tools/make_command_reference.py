@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import sys
 import typing
+from collections import Counter
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -26,14 +27,15 @@ PAGE = Path(__file__).parents[2] / "docs" / "commands.md"
 HEAD = """# Commands
 
 Every command has `--help`, which says the same as this page. An option means the same in all commands: `--out` is what
-to write, `--sequence` where the recording is now, `--start`, `--stop`, `--stride` and `--scale` select frames and
-resize images, `--set NAME=VALUE` overrides a [setting](settings.md), `--config` names a [preset](presets.md) or a YAML
-file.
+to write, `--set NAME=VALUE` overrides a [setting](settings.md), `--config` names a [preset](presets.md) or a YAML file.
 
 Exit codes: 0 done, 2 something in the input is wrong (one line says what and where), 1 ggslam or the machine is at
 fault, or a run lost most of its frames, 3 a run that `--strict` finds bad, 130 interrupted. Where output is no
 terminal, long commands print a line of progress every 10 seconds.
 """
+TABLE = "| argument or option | meaning | default |\n|---|---|---|"
+_SHARED = 3
+"""Commands that have the same option from which it is explained once."""
 _GROUPS = {
     "Make a map": ("run", "inspect", "synth", "doctor"),
     "Look and score": ("view", "render", "report", "eval", "compare"),
@@ -54,28 +56,39 @@ def page() -> str:
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     rest = sorted(set(commands) - {name for names in _GROUPS.values() for name in names})
     groups = {**_GROUPS, **({"More": tuple(rest)} if rest else {})}
-    parts = [HEAD]
+    options = [rows(name, command).items() for name, command in commands.items()]
+    counts = Counter(row for found in options for option, row in found if option.startswith("--"))
+    shared = {row for row, count in counts.items() if count >= _SHARED}
+    parts = [HEAD, "## Shared options\n", TABLE, *sorted(shared), ""]
     for title, names in groups.items():
         parts.append(f"## {title}\n")
-        parts += [section(name, commands[name]) for name in names]
+        parts += [section(name, commands[name], shared) for name in names]
     return "\n".join(parts)
 
 
-def section(name: str, command: Any) -> str:
-    """One command: what it does, examples, arguments and options."""
+def rows(name: str, command: Any) -> dict[str, str]:
+    """Arguments and options of a command, each as a row of a table, by name."""
     if isinstance(command, ExportCommand):
         command.name_formats()
-    arguments = [p for p in command.params if p.param_type_name == "argument"]
-    options = [p for p in command.params if p.param_type_name == "option" and not p.hidden]
-    usage = " ".join([f"ggslam {name}", *(p.metavar or p.name.upper() for p in arguments), "[OPTIONS]"])
     kinds = typing.get_type_hints(_COMMANDS[name][0])
+    shown = [p for p in command.params if p.param_type_name == "argument"]
+    shown += [p for p in command.params if p.param_type_name == "option" and not p.hidden]
+    return {p.opts[0]: f"| {names(p, kinds[p.name])} | {cell(p.help or '')} | {default(p)} |" for p in shown}
+
+
+def section(name: str, command: Any, shared: set[str]) -> str:
+    """One command: what it does, examples, arguments and options; of those in `shared` only the names."""
+    every = rows(name, command)
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    usage = " ".join([f"ggslam {name}", *(p.metavar or p.name.upper() for p in arguments), "[OPTIONS]"])
     lines = [f"### ggslam {name}\n", f"{cell(command.help)}\n", "```text", usage, "```\n"]
     before, _, shown = command.epilog.partition("[bold]Examples[/]")
     lines += [f"{cell(before)}\n"] if before.strip() else []
     examples = [re.sub(r"\s{2,}\(", "   # (", line.strip()) for line in shown.splitlines() if line.strip()]
     lines += ["```bash", *examples, "```\n"]
-    lines += ["| argument or option | meaning | default |", "|---|---|---|"]
-    lines += [f"| {names(p, kinds[p.name])} | {cell(p.help or '')} | {default(p)} |" for p in [*arguments, *options]]
+    lines += [TABLE, *(row for row in every.values() if row not in shared)]
+    if others := [f"`{option}`" for option, row in every.items() if row in shared]:
+        lines += [f"\n[Shared](#shared-options): {', '.join(others)}."]
     old = [f"`{before}` is the old name of `{now}`" for before, now in OLD_NAMES.get(name, {}).items()]
     return "\n".join([*lines, *([f"\n{'; '.join(old)}."] if old else []), ""])
 
