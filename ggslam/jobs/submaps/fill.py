@@ -54,7 +54,7 @@ class FillTuning(Tuning):
 
 @dataclass(frozen=True)
 class SubmapsRequest:
-    """A request to fill or list a grid store.
+    """A request to fill a grid store.
 
     Attributes:
         source: folder of a run, a cloud, or folder of a recording.
