@@ -11,7 +11,7 @@ import typer
 
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 if TYPE_CHECKING:
     from ggslam.changes.change import Change

@@ -14,7 +14,7 @@ from ggslam.cli.changes_command import print_changes
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import typer
 from ggslam.cli import options
 from ggslam.cli.console import console
 from ggslam.errors import ConfigError
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 EPILOG = """
 [bold]Examples[/]

@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from ggslam.cli import options
 from ggslam.cli.console import console
 from ggslam.errors import ConfigError
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 if TYPE_CHECKING:
     from ggslam.jobs.edit.edits import Edit

@@ -12,7 +12,7 @@ import typer
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.errors import ConfigError
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 if TYPE_CHECKING:
     from ggslam.coding import CodecSettings, CodingReport

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from ggslam.cli import options
 from ggslam.cli.console import console, table
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import typer
 
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 if TYPE_CHECKING:
     from ggslam.jobs.merge.merge import MergeOutcome

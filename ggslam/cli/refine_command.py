@@ -13,7 +13,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 if TYPE_CHECKING:
     from ggslam.jobs.refine.refine_store import StoreRefinement

@@ -13,7 +13,7 @@ import typer
 
 from ggslam.cli.console import console, progress_bar
 from ggslam.errors import SequenceError
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 if TYPE_CHECKING:
     from ggslam.synthetic import Shutter

@@ -11,7 +11,7 @@ import typer
 from ggslam.cli.changes_command import IdsName, choice_of_ids, print_changes
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 if TYPE_CHECKING:
     from ggslam.jobs.update.update import UpdateOutcome

@@ -12,7 +12,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.volumes.output_frame import OutputFrame
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from ggslam.objects.segmented_rows import (
 from ggslam.objects.table import ObjectTable, Observation
 from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 Vector = Sequence[float]

@@ -12,7 +12,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import upright_axes
 from ggslam.viewer.model import EditableMap, ListedObject

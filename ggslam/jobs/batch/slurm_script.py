@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 from ggslam.jobs.batch.manifest import Manifest, option
 from ggslam.jobs.tasks.processors import ProcessorTuning
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 

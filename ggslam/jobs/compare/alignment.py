@@ -18,7 +18,7 @@ from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.poses import fit_similarity, inverse
 from ggslam.sequences.association import TOLERANCE, pair_times
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 Alignment = Literal["auto", "none", "truth", "icp", "trajectory"]

@@ -19,7 +19,7 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.runs.map_file import MapFile
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import make_folder
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 WHOLE = "all"
 """What the whole of a file without objects is called."""

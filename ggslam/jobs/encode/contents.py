@@ -16,7 +16,7 @@ from ggslam.objects.table import ObjectTable
 from ggslam.runs.map_container import MAP, TABLE, Container, open_container
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.system.atomic import write_bytes
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 
 @dataclass

@@ -17,7 +17,7 @@ from ggslam.runs.opened_points import opened_points
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.object_names import object_file_name
 from ggslam.system.atomic import make_folder, write_bytes
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 OBJECT_EXTRAS = ("object_id", "identity")
 """Properties of a 3DGS PLY that say which object a Gaussian belongs to."""

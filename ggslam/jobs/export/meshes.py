@@ -22,7 +22,7 @@ from ggslam.runs.rendered_views import RenderedViews
 from ggslam.scene.frame import Frame
 from ggslam.scene.object_names import object_file_name
 from ggslam.system.atomic import make_folder
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.volumes.floor_frame import FLOOR_FILE, FloorTuning, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh

@@ -42,7 +42,7 @@ from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.settings import tuning_note
 from ggslam.system.tuning import Tuning

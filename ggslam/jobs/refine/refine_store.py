@@ -30,7 +30,7 @@ from ggslam.jobs.tasks.engines import Engine
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_copy import copy_store
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 
 @dataclass

@@ -24,7 +24,7 @@ from ggslam.jobs.report.run_plots import (
 from ggslam.reporting import page as p
 from ggslam.reporting.page import Html
 from ggslam.reporting.plots import Plot
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 
 _ABSENT = "not there"
 

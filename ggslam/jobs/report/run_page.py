@@ -21,7 +21,7 @@ from ggslam.reporting.page import Html
 from ggslam.runs.records.metrics import SETS, MetricsRecord, SegmentationRecord, SurfaceScoresRecord
 from ggslam.runs.records.record import Record
 from ggslam.runs.records.verdict import GRADES
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 FOOTER = "Written by ggslam. The page needs nothing but itself: no network, no other files."

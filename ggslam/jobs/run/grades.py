@@ -19,7 +19,7 @@ from ggslam.runs.records.verdict import AspectRecord, Grade, worst
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import LOST_SHARE
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 

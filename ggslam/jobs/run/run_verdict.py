@@ -27,7 +27,7 @@ from ggslam.runs.records.verdict import AspectRecord, FitRecord, Grade, RunVerdi
 from ggslam.sequences.camera_doubts import doubt_centre
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 

@@ -27,7 +27,7 @@ from ggslam.slam.realtime import RealtimeSlam
 from ggslam.slam.result import SlamResult, StepReport, tracked_poses
 from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.slam import Slam
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.interrupts import StopRequest
 from ggslam.system.staging import new_staging
 

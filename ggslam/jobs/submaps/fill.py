@@ -36,7 +36,7 @@ from ggslam.submaps.cell_records import CellChange
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.submaps.store_objects import ObjectEvent, StoreObjects, read_objects
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 AddRun = Callable[[Path, GridStore, "str | None", "float | None"], object]

@@ -20,7 +20,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import vertical_fov, view_from_behind
 from ggslam.viewer.safe_text import plain

@@ -33,7 +33,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.object_names import object_file_name
 from ggslam.sequences import Sequence
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted
 from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover

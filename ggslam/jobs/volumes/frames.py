@@ -20,7 +20,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
-from ggslam.system.counting import counted
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 
