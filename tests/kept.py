@@ -79,7 +79,11 @@ def light_maps_kept() -> Iterator[None]:
         if len(scene.shapes) < 20:
             return lighting.bake(scene)
         bare = [dataclasses.replace(shape, material=None, faces={}) for shape in scene.shapes]  # type: ignore[arg-type]
-        precision = (lighting.PATCH, lighting.LARGEST_MAP, lighting.AMBIENT_RAYS)
+        precision = (
+            lighting.LightingTuning.patch_m,
+            lighting.LightingTuning.max_patches,
+            lighting.LightingTuning.ambient_rays,
+        )
         words = pickle.dumps((dataclasses.replace(scene, shapes=bare), precision))
         name = f"lights-{hashlib.sha256(words).hexdigest()[:16]}"
 

@@ -13,8 +13,8 @@ import typer
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
-from ggslam.system.plurals import counted
 from ggslam.system.json_files import json_ready
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:

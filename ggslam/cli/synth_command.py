@@ -137,10 +137,10 @@ def synth(
     movers: MoversOption = None,
 ) -> None:
     """Generate a recording: textured, furnished rooms with exact poses and instance masks."""
-    from ggslam.synthetic import FRAMES_WITH_MOVERS, SCENES, Shutter
+    from ggslam.synthetic import SCENES, Shutter, SynthTuning
 
     if frames is None:
-        frames = FRAMES_WITH_MOVERS if movers is not None else SCENES[scene.value].frames
+        frames = SynthTuning.frames_with_movers if movers is not None else SCENES[scene.value].frames
     write = _writer(rig, rig_delay, changes, visit, movers, speed, Shutter(blur, rolling, depth_delay))
     cameras = f" by each of {rig}" if rig is not None else ""
     with progress_bar() as bar:

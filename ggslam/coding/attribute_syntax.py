@@ -7,17 +7,36 @@ Reading stops with a FormatError that names the first tool which this decoder la
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from ggslam.coding.bits import BitReader, BitWriter
 from ggslam.coding.geometry_syntax import refuse
 from ggslam.errors import FormatError
+from ggslam.system.tuning import Tuning
 
-MAX_PARAMETER_SETS = 16
+MAX_PARAMETER_SETS: Final = 16
 """Attribute parameter sets of a stream: their ids have 4 bits."""
-RAHT, PREDICTING, LIFTING, RAW = 0, 1, 2, 3
-MAX_DETAIL_LEVELS = 32
-_HEADER_BYTES = 1 << 10  # no valid header is longer
-_BY_DISTANCE = 0
+RAHT: Final = 0
+"""Number of the region-adaptive hierarchical transform."""
+PREDICTING: Final = 1
+"""Number of the predicting transform."""
+LIFTING: Final = 2
+"""Number of the lifting transform."""
+RAW: Final = 3
+"""Number of values that are stored as they are."""
+
+
+class AttributeLimits(Tuning):
+    """Limits on hostile streams."""
+
+    max_detail_levels = 32
+    """Most levels of detail."""
+    header_bytes = 1 << 10
+    """Bytes of an attribute data unit that its header is read from; no valid header is longer."""
+
+
+_BY_DISTANCE: Final = 0
+"""Number of decimation by distance."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +144,7 @@ def _read_details(r: BitReader, encoding: int) -> DetailSettings:
     levels = r.ue() + 1
     periods: tuple[int, ...] = ()
     canonical, decimation, distance, distance_deltas = False, _BY_DISTANCE, 0, False
-    if levels > MAX_DETAIL_LEVELS:
+    if levels > AttributeLimits.max_detail_levels:
         raise FormatError(f"an attribute parameter set with {levels} levels of detail")
     if levels == 1:
         canonical = r.flag()
@@ -203,7 +222,7 @@ class AttributeHeader:
         Args:
             components: of the attribute, on which the syntax depends.
         """
-        r = BitReader(payload[:_HEADER_BYTES], "the header of an attribute data unit")
+        r = BitReader(payload[: AttributeLimits.header_bytes], "the header of an attribute data unit")
         identity = r.u(4)
         r.u(3)
         attribute, slice_id = r.ue(), r.ue()
@@ -214,7 +233,7 @@ class AttributeHeader:
         layers: tuple[tuple[int, int], ...] = ()
         if r.flag():
             count = r.ue() + 1
-            if count > MAX_DETAIL_LEVELS:
+            if count > AttributeLimits.max_detail_levels:
                 raise FormatError(f"slice {slice_id}: quantiser offsets of {count} levels")
             layers = tuple((r.se(), r.se()) for _ in range(count))
         refuse(r.ue() != 0, "quantiser offsets by region")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -23,17 +23,25 @@ from ggslam.coding.sequence_parameters import (
     MATRIX_BT709,
     MATRIX_IDENTITY,
     MATRIX_YCGCO,
-    MAX_ATTRIBUTES,
     AttributeDescription,
+    SequenceLimits,
 )
 from ggslam.coding.settings import AttributeSettings, CodecSettings
 from ggslam.coding.slice_coder import rgb_to_ycbcr, ycbcr_to_rgb
 from ggslam.errors import ConfigError, FormatError
+from ggslam.system.tuning import Tuning
 
 _GBR = [1, 2, 0]  # where G, B, R are in R, G, B
 _RGB = [2, 0, 1]  # and back
-ID_BITS = 16
-_SMALL_IDS = 256  # few enough that the transform brings all of them back
+ID_BITS: Final = 16
+"""Bits of an object id."""
+
+
+class IdTuning(Tuning):
+    """When object ids are coded without a table."""
+
+    small_ids = 256
+    """Ids below this are coded as they are: the transform restores all of them."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,7 @@ class IdTable:
     def of(values: np.ndarray, bits: int = ID_BITS - 1) -> IdTable:
         """The table of ids, with a stride of 2^`bits` at most."""
         ids = np.unique(values).astype(np.uint16)
-        if ids[-1] < _SMALL_IDS:
+        if ids[-1] < IdTuning.small_ids:
             ids = np.arange(ids[-1] + 1, dtype=np.uint16)
         return IdTable.of_bits(ids, min(bits, ID_BITS - (len(ids) - 1).bit_length()))
 
@@ -250,8 +258,8 @@ def plan_summaries(
         raise ConfigError(
             f"{len(plans)} attributes with {len(sets)} different quantisers; a stream has room for {MAX_PARAMETER_SETS}"
         )
-    if len(plans) > MAX_ATTRIBUTES:
-        raise ConfigError(f"{len(plans)} attributes; {MAX_ATTRIBUTES} are supported")
+    if len(plans) > SequenceLimits.max_attributes:
+        raise ConfigError(f"{len(plans)} attributes; {SequenceLimits.max_attributes} are supported")
     return plans
 
 

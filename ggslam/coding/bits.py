@@ -6,9 +6,12 @@ The exponential Golomb code of the first edition has a prefix of ones, not of ze
 
 from __future__ import annotations
 
+from typing import Final
+
 from ggslam.errors import FormatError
 
-MAX_GOLOMB_PREFIX = 32
+MAX_GOLOMB_PREFIX: Final = 32
+"""Longest prefix of an exponential Golomb code: values have at most 32 bits."""
 
 
 class BitWriter:

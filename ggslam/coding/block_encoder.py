@@ -31,10 +31,19 @@ from ggslam.coding.slice_encoder import CloudToCode, CodedSlice, encode_slice
 from ggslam.coding.slices import PlaneCuts, Points, slices_wanted
 from ggslam.errors import FormatError
 from ggslam.system.atomic import atomic_write, write_failure
+from ggslam.system.tuning import Tuning
 
 Block = tuple[np.ndarray, Mapping[str, np.ndarray]]
 """Points [N, 3] and attributes by name, as `encode_cloud` takes them; all blocks of a cloud have the same types."""
-_ROWS = 1 << 16
+
+
+class BlockTuning(Tuning):
+    """How much of a cloud is in memory."""
+
+    rows_at_once = 1 << 16
+    """Points that are read at a time."""
+
+
 _POINTS = " points"
 
 
@@ -120,8 +129,8 @@ class _Spool:
     def blocks(self) -> Iterator[np.ndarray]:
         """All rows, some at a time."""
         self.file.flush()
-        for start in range(0, self.count, _ROWS):
-            yield self.rows(self.file, start, min(_ROWS, self.count - start))
+        for start in range(0, self.count, BlockTuning.rows_at_once):
+            yield self.rows(self.file, start, min(BlockTuning.rows_at_once, self.count - start))
 
     def quantization(self) -> Quantization:
         """The grid."""

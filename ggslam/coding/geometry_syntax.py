@@ -7,19 +7,28 @@ Reading stops with a FormatError that names the first tool which this decoder la
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from ggslam.coding.bits import BitReader, BitWriter
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.errors import FormatError
+from ggslam.system.tuning import Tuning
 
-MAX_DEPTH = 21
-"""Bits of a position in a slice that are supported."""
-MAX_LEVELS = 63
+MAX_DEPTH: Final = 21
+"""Bits of a position's coordinate, in a slice as on the grid: three of them fit a 63-bit code."""
+MAX_LEVELS: Final = 63
 """Levels of a tree: one for each bit of the three coordinates."""
-ALL_AXES = 7
-FOOTER_BYTES = 3
-_HEADER_BYTES = 256  # no valid header is longer
+ALL_AXES: Final = 7
+"""A level that splits along all axes: one bit for each."""
+FOOTER_BYTES: Final = 3
+"""Bytes of the number of points at the end of a geometry data unit."""
+
+
+class GeometryLimits(Tuning):
+    """A limit on hostile streams."""
+
+    header_bytes = 256
+    """Bytes of a geometry data unit that its header is read from; no valid header is longer."""
 
 
 def refuse(present: bool, tool: str) -> None:
@@ -217,7 +226,7 @@ class GeometryHeader:
         if len(payload) <= FOOTER_BYTES:
             raise FormatError(f"a geometry data unit of {len(payload)} bytes")
         view = memoryview(payload)
-        r = BitReader(view[:_HEADER_BYTES], "the header of a geometry data unit")
+        r = BitReader(view[: GeometryLimits.header_bytes], "the header of a geometry data unit")
         identity = r.u(4)
         r.u(3)
         slice_id, tag, frame = r.ue(), r.u(sequence.slice_tag_bits), r.u(sequence.frame_counter_bits)

@@ -8,24 +8,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
-from ggslam.coding.geometry_syntax import ALL_AXES, GeometryParameters
+from ggslam.coding.geometry_syntax import ALL_AXES, MAX_DEPTH, GeometryParameters
 from ggslam.coding.grid_points import GridPoints
 from ggslam.coding.settings import CodecSettings
 from ggslam.coding.slice_coder import SliceCoder
+from ggslam.system.tuning import Tuning
 
-DENSE_POINTS_PER_CUBE = 1.5
-"""Occupied voxels per occupied cube of 4 x 4 x 4 above which neighbours give useful contexts."""
-PLANES_POINTS_PER_CUBE = 4.0
-"""Up to so many it is worth trying whether planes make the geometry smaller..."""
-PLANES_GAIN = 0.03
-"""...by this part at least."""
-PLANE_THRESHOLDS = (77, 99, 113)  # of the common test conditions
-_SAMPLE = 1 << 14
-_MOST_CUBES = 6  # of the longest side, as a logarithm
-_MASK = (1 << 21) - 1
+
+class GeometryTuning(Tuning):
+    """Which coding tools suit a cloud."""
+
+    dense = 1.5
+    """Occupied voxels per occupied cube of 4 x 4 x 4 above which neighbours give useful contexts."""
+    planes = 4.0
+    """Occupied voxels per cube up to which the planar mode is tried."""
+    planes_gain = 0.03
+    """Smallest share of the bytes that the planar mode must save."""
+    sample = 1 << 14
+    """Points that are looked at, about."""
+    cube_bits = 6
+    """Cubes along the longest side, as a binary logarithm."""
+
+
+PLANE_THRESHOLDS: Final = (77, 99, 113)
+"""Thresholds of the planar mode in MPEG's common test conditions."""
 
 
 class GeometrySample:
@@ -37,8 +47,8 @@ class GeometrySample:
     """
 
     def __init__(self, count: int, size: Sequence[int]) -> None:
-        self._one_in = 1 << max(0, (count // _SAMPLE).bit_length() - 1)
-        self._cube_bits = max(2, (max(size) - 1).bit_length() - _MOST_CUBES)
+        self._one_in = 1 << max(0, (count // GeometryTuning.sample).bit_length() - 1)
+        self._cube_bits = max(2, (max(size) - 1).bit_length() - GeometryTuning.cube_bits)
         self._codes: list[np.ndarray] = []
 
     def add(self, block: GridPoints) -> None:
@@ -48,8 +58,8 @@ class GeometrySample:
     @cached_property
     def voxels(self) -> np.ndarray:
         """Occupied voxels of the sample, int32 [N, 3]."""
-        codes = np.unique(np.concatenate(self._codes)).astype(np.int64)
-        return np.stack([codes >> 42, codes >> 21 & _MASK, codes & _MASK], 1).astype(np.int32)
+        codes, mask = np.unique(np.concatenate(self._codes)).astype(np.int64), (1 << MAX_DEPTH) - 1
+        return np.stack([codes >> 2 * MAX_DEPTH, codes >> MAX_DEPTH & mask, codes & mask], 1).astype(np.int32)
 
     @cached_property
     def voxels_per_cube(self) -> float:
@@ -68,7 +78,7 @@ class GeometrySample:
         coder = SliceCoder()
         coder.build(voxels, max(1, *bits))
         sizes = [len(coder.encode_geometry(tools, split_axes(bits))) for tools in (without, with_planes)]
-        return sizes[1] < (1 - PLANES_GAIN) * sizes[0]
+        return sizes[1] < (1 - GeometryTuning.planes_gain) * sizes[0]
 
 
 def split_axes(bits: Sequence[int]) -> tuple[int, ...]:
@@ -87,9 +97,9 @@ def geometry_parameters(settings: CodecSettings, sample: GeometrySample) -> Geom
     """The parameter set of a stream."""
     boundary = settings.neighbour_boundary
     if boundary is None:
-        boundary = 8 if sample.voxels_per_cube > DENSE_POINTS_PER_CUBE else 0
+        boundary = 8 if sample.voxels_per_cube > GeometryTuning.dense else 0
     without = _parameters(settings, boundary, False)
-    if settings.planes is False or (settings.planes is None and sample.voxels_per_cube > PLANES_POINTS_PER_CUBE):
+    if settings.planes is False or (settings.planes is None and sample.voxels_per_cube > GeometryTuning.planes):
         return without
     near = 8 if settings.neighbour_boundary is None else boundary
     with_planes = _parameters(settings, near, True)

@@ -20,10 +20,18 @@ from scipy.spatial import cKDTree
 
 from ggslam.errors import InputError
 from ggslam.geometry.normals import estimate_normals
+from ggslam.system.tuning import Tuning
 
-_CHUNK = 1 << 17
-_TIES = 8
-"""Neighbours looked at for equal distances: a voxel's centre between coarser voxels has at most 8."""
+
+class CloudMetricTuning(Tuning):
+    """How two clouds are compared."""
+
+    points_at_once = 1 << 17
+    """Points that are compared at a time."""
+    ties = 8
+    """Neighbours that are looked at for equal distances: between coarser voxels a centre has at most 8."""
+
+
 _RGB_TO_YUV = np.array(
     [[0.2126, 0.7152, 0.0722], [-0.2126 / 1.8556, -0.7152 / 1.8556, 0.5], [0.5, -0.7152 / 1.5748, -0.0722 / 1.5748]]
 )
@@ -147,7 +155,7 @@ class CloudPair:
 
 def _neighbours(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances [N, k], ascending, and indices [N, k] of the nearest `others`."""
-    count = min(_TIES, len(others))
+    count = min(CloudMetricTuning.ties, len(others))
     distances, index = cKDTree(others).query(points, count, workers=-1)
     return distances.reshape(-1, count), index.reshape(-1, count)
 

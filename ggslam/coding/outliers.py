@@ -3,7 +3,7 @@
 
 Without a voxel size the encoder divides a cloud's longest side into 2^bits voxels; a single point at 5 km would make
 those of a room 5 m wide. So the side of the cloud's bulk counts, which hardly any point lies outside of. Points beyond
-are coded on the same grid, as far as it can reach (`GRID_BITS`), and left out where it cannot.
+are coded on the same grid, as far as it can reach (`MAX_DEPTH`), and left out where it cannot.
 """
 
 from __future__ import annotations
@@ -13,17 +13,27 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ggslam.coding.quantization import GRID_BITS
+from ggslam.coding.geometry_syntax import MAX_DEPTH
 from ggslam.coding.settings import CodecSettings
+from ggslam.system.plurals import agreeing, counted
+from ggslam.system.tuning import Tuning
 
-SAMPLED = 1 << 18
-"""Points that tell where most of them lie."""
-_SHARE, _FEWEST, _MOST_SHARE = 1e-3, 4, 0.04
-"""Points passed over at each end of an axis: a share of them, but so many at least, and no more than another share."""
-_FAR = 2.0
-"""A cloud has outliers if it is so many times as long as its bulk."""
-_FINE_BITS = 16
-"""Bits of the bulk's side that are fine enough: finer voxels are made larger before points are left out."""
+
+class OutlierTuning(Tuning):
+    """When points are far from all others."""
+
+    sample = 1 << 18
+    """Points that tell where most of them lie."""
+    share = 1e-3
+    """Share of the points that is passed over at each end of an axis."""
+    min_points = 4
+    """Fewest points that are passed over."""
+    max_share = 0.04
+    """Largest share of the points that is passed over."""
+    far = 2.0
+    """A cloud has outliers if it is so many times as long as its bulk."""
+    fine_bits = 16
+    """Bits of the bulk's side beyond which voxels are made larger before points are left out."""
 
 
 @dataclass
@@ -68,18 +78,14 @@ class Reach:
         notes = []
         if self.left_out:
             notes.append(
-                f"left out {_number(self.left_out, what)} far outside the others ({at}; the others span {side:.4g}): "
+                f"left out {counted(self.left_out, what)} far outside the others ({at}; the others span {side:.4g}): "
                 "the grid does not reach so far"
             )
         if self.far > self.left_out:
-            lie = "lies" if self.far - self.left_out == 1 else "lie"
-            few = _number(self.far - self.left_out, what)
+            lie = agreeing(self.far - self.left_out, "lies", "lie")
+            few = counted(self.far - self.left_out, what)
             notes.append(f"{few} {lie} far outside the others ({at}); the voxels are those that suit the others")
         return notes
-
-
-def _number(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def reach_of(
@@ -98,7 +104,7 @@ def reach_of(
     samples, corners = [], []
     for part in parts:
         if len(part):
-            samples.append(part[:: max(1, (len(part) if count is None else count) // SAMPLED)])
+            samples.append(part[:: max(1, (len(part) if count is None else count) // OutlierTuning.sample)])
             corners += [part.min(0), part.max(0)]
     if not samples:
         return Reach(settings)
@@ -112,13 +118,16 @@ def reach_of(
 def _choose(bulk: np.ndarray, whole: float, settings: CodecSettings, integers: bool, finest: float) -> Reach:
     """For a cloud whose longest side is `whole`."""
     side = float(np.ptp(bulk, axis=0).max())
-    if side <= 0 or whole <= _FAR * side:
+    if side <= 0 or whole <= OutlierTuning.far * side:
         named = integers or settings.voxel_size is not None
         fine = finest > whole / ((1 << settings.geometry_bits) - 1)
         return Reach(replace(settings, voxel_size=finest) if fine and not named else settings)
-    voxel, most = settings.voxel_size or (1.0 if integers else None), (1 << GRID_BITS) - 2
+    voxel, most = settings.voxel_size or (1.0 if integers else None), (1 << MAX_DEPTH) - 2
     if voxel is None:
-        voxel, finer = side / ((1 << settings.geometry_bits) - 1), max(0, settings.geometry_bits - _FINE_BITS)
+        voxel, finer = (
+            side / ((1 << settings.geometry_bits) - 1),
+            max(0, settings.geometry_bits - OutlierTuning.fine_bits),
+        )
         needed = whole * settings.geometry_scale / most
         voxel = max(needed if voxel < needed <= voxel * (1 << finer) else voxel, finest)
         settings = replace(settings, voxel_size=voxel)
@@ -134,6 +143,6 @@ def _choose(bulk: np.ndarray, whole: float, settings: CodecSettings, integers: b
 def bulk_of(sample: np.ndarray) -> np.ndarray:
     """Lowest and highest coordinates float64 [2, 3] of points [N, 3] but the outermost few along each axis."""
     count = len(sample)
-    passed = min(max(_FEWEST, int(_SHARE * count)), int(_MOST_SHARE * count))
+    passed = min(max(OutlierTuning.min_points, int(OutlierTuning.share * count)), int(OutlierTuning.max_share * count))
     ordered = np.partition(sample, (passed, count - 1 - passed), axis=0)
     return np.stack([ordered[passed], ordered[count - 1 - passed]]).astype(np.float64)

@@ -13,19 +13,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Final
 
 import numpy as np
 
+from ggslam.coding.geometry_syntax import MAX_DEPTH
 from ggslam.coding.grid_points import GridPoints
 from ggslam.errors import ConfigError
+from ggslam.system.tuning import Tuning
 
-GRID_BITS = 21
-ROUNDING = 1e-3
-"""Voxels that a coordinate may lie below a voxel's face and still count as in it: points that lay on faces once stay
-apart, whichever way their coordinates were rounded."""
-_MAX_FIELD = (1 << 32) - 2
-_LEAST_VOXEL = 1e-6
-"""Metres, of a cloud without extent."""
+
+class QuantizationTuning(Tuning):
+    """How positions are rounded to the grid."""
+
+    rounding = 1e-3
+    """Voxels that a coordinate may lie below a voxel's face: points on faces stay apart however they were rounded."""
+    min_voxel_m = 1e-6
+    """Voxel of a cloud without extent, in metres."""
+
+
+_MAX_FIELD: Final = (1 << 32) - 2
+"""Largest numerator and denominator of a scale: fields have 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,7 @@ class Quantization:
         """Points [N, 3] seen on this grid."""
         size = self.size or (1 << 31,) * 3
         exact = self.scale == 1 and np.issubdtype(points.dtype, np.integer)
-        return GridPoints(points, self.scale, 0.5 + ROUNDING, self.origin, size, exact)
+        return GridPoints(points, self.scale, 0.5 + QuantizationTuning.rounding, self.origin, size, exact)
 
     def restore(self, grid: np.ndarray) -> np.ndarray:
         """Positions float64 [N, 3] of grid positions."""
@@ -137,19 +145,21 @@ def choose_quantization(
     integers = np.issubdtype(points.dtype, np.integer)
     if voxel_size is None:
         longest = float((high / 2 - low / 2).max()) * 2
-        least = max(_LEAST_VOXEL, float(np.abs([low, high]).max()) * 2.0**-50)  # of points all at one place
+        least = max(
+            QuantizationTuning.min_voxel_m, float(np.abs([low, high]).max()) * 2.0**-50
+        )  # of points all at one place
         voxel_size = 1.0 if integers else longest / ((1 << bits) - 1) if longest else least
         if not 1e-12 <= voxel_size <= 1e12:
             raise ConfigError(f"positions that span {longest:g} fit on no grid: name a voxel size")
     scale = geometry_scale / voxel_size
     with np.errstate(over="ignore", invalid="ignore"):
-        first, last = (np.floor(corner * scale + 0.5 + ROUNDING) for corner in (low, high))
+        first, last = (np.floor(corner * scale + 0.5 + QuantizationTuning.rounding) for corner in (low, high))
     if not np.isfinite(first).all() or not np.isfinite(last).all() or np.abs([first, last]).max() >= 1 << 52:
         raise ConfigError(f"voxels of {1 / scale:g} are too small for positions up to {np.abs([low, high]).max():g}")
     extent = (last - first).astype(np.int64) + 1
-    if extent.max() > 1 << GRID_BITS:
+    if extent.max() > 1 << MAX_DEPTH:
         raise ConfigError(
-            f"the grid is {extent.max()} voxels long, more than 2^{GRID_BITS}: choose larger voxels "
+            f"the grid is {extent.max()} voxels long, more than 2^{MAX_DEPTH}: choose larger voxels "
             f"(now {1 / scale:g}) or a smaller geometry scale"
         )
     x, y, z = (int(v) for v in first)

@@ -5,17 +5,34 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import Final
 
 from ggslam.coding.bits import BitReader, BitWriter
 from ggslam.errors import FormatError
+from ggslam.system.tuning import Tuning
 
 KNOWN_LABELS = ("color", "reflectance", "opacity", "frame_index", "frame_number", "material", "normal")
-MAX_ATTRIBUTES = 255
-"""Attributes of a stream that are supported."""
-CICP_PARAMETER, SCALING_PARAMETER = 2, 3
-MATRIX_IDENTITY, MATRIX_BT709, MATRIX_YCGCO = 0, 1, 8
-AXIS_ORDERS = ((2, 1, 0), (0, 1, 2), (0, 2, 1), (2, 0, 1), (2, 1, 0), (1, 2, 0), (1, 0, 2), (0, 1, 2))
-"""By the number in the stream: which of the coded axes are x, y and z."""
+
+
+class SequenceLimits(Tuning):
+    """A limit on hostile streams."""
+
+    max_attributes = 255
+    """Most attributes of a stream."""
+
+
+CICP_PARAMETER: Final = 2
+"""Number of the attribute parameter that tells the colour matrix."""
+SCALING_PARAMETER: Final = 3
+"""Number of the attribute parameter that tells offset and scale."""
+MATRIX_IDENTITY: Final = 0
+"""Colour matrix G, B, R (ISO/IEC 23091-2)."""
+MATRIX_BT709: Final = 1
+"""Colour matrix of BT.709."""
+MATRIX_YCGCO: Final = 8
+"""Colour matrix YCgCo."""
+AXIS_ORDERS: Final = ((2, 1, 0), (0, 1, 2), (0, 2, 1), (2, 0, 1), (2, 1, 0), (1, 2, 0), (1, 0, 2), (0, 1, 2))
+"""Which of the coded axes are x, y and z, by the number in the stream."""
 _SECOND_EDITION = "a damaged stream, or one of a draft of the second edition, which is not supported"
 
 
@@ -137,7 +154,7 @@ class SequenceParameters:
         metres = r.flag()
         global_scale = _read_global_scale(r)
         count = r.ue()
-        if count > MAX_ATTRIBUTES:
+        if count > SequenceLimits.max_attributes:
             raise FormatError(f"the sequence parameter set lists {count} attributes: {_SECOND_EDITION}")
         parameters = SequenceParameters(
             tuple(_read_attribute(r) for _ in range(count)), unique, offset, offset_scale, size,

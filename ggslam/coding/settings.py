@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from ggslam.system.settings import Conflict, setting, settings_class
 Split = Literal["count", "interval", "cube"]
 ColorSpace = Literal["ycbcr", "identity", "none"]
 Duplicates = Literal["merge", "keep"]
-LEVEL_LIMIT = 1_100_000
+LEVEL_LIMIT: Final = 1_100_000
 """Points per slice that the levels of the first edition allow."""
 
 

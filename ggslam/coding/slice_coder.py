@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ctypes
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 
@@ -31,7 +32,8 @@ _REASONS = {
     Status.COUNT_MISMATCH: "the payload holds another number of points than its unit says",
     Status.TOO_LARGE: "the octree has more nodes than the decoder is willing to hold",
 }
-MAX_SLICE_POINTS = 1 << 24
+MAX_SLICE_POINTS: Final = 1 << 24
+"""Points of a slice: their number has 24 bits."""
 
 
 @lru_cache(maxsize=1)

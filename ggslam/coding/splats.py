@@ -19,18 +19,29 @@ import torch
 
 from ggslam.coding.cloud import PointCloud
 from ggslam.coding.least_rotations import least_rotations
-from ggslam.coding.outliers import SAMPLED, Reach, reach_of
+from ggslam.coding.outliers import OutlierTuning, Reach, reach_of
 from ggslam.coding.settings import AttributeSettings, CodecSettings
 from ggslam.errors import ConfigError, FormatError
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-POSITION_BITS = 18
-VALUE_BITS = 12
-_LEVELS = (1 << VALUE_BITS) - 1
+
+class SplatCodingTuning(Tuning):
+    """How Gaussians are rounded."""
+
+    position_bits = 18
+    """Bits of a coordinate."""
+    value_bits = 12
+    """Bits of all other values."""
+    sh_chroma_offset = 4
+    """Quantiser offset of the colour differences of spherical harmonics."""
+    max_rest = 4.0
+    """Largest absolute value of the higher spherical harmonics that is told apart."""
+
+
+_LEVELS = (1 << SplatCodingTuning.value_bits) - 1
 RANGES = {"sh": (-4.0, 4.0), "opacity": (-7.0, 18.0), "scale": (-26.0, 4.0), "rotation": (-1.0, 1.0)}
 """Of SH coefficients, opacity logits, natural logarithms of scales, and components of unit quaternions."""
-_SH_CHROMA_OFFSET = 4
-_WIDEST_REST = 4.0
 BIRTH = "birth"
 """Attribute: number of the keyframe that inserted a Gaussian, plus 1; 0: unknown."""
 
@@ -84,7 +95,8 @@ def splat_attributes(
     quaternions = torch.nn.functional.normalize(gaussians.quaternions.detach(), dim=1).cpu().numpy()
     quaternions, scales = least_rotations(quaternions, gaussians.log_scales.detach().cpu().numpy())
     sh = gaussians.sh.detach().cpu().numpy()
-    out = {f"sh_{k}": _levels(sh[:, k] * (_WIDEST_REST / rest if k else 1), "sh") for k in range(sh.shape[1])}
+    stretch = SplatCodingTuning.max_rest / rest
+    out = {f"sh_{k}": _levels(sh[:, k] * (stretch if k else 1), "sh") for k in range(sh.shape[1])}
     out["opacity"] = _levels(gaussians.opacity_logits.detach().cpu().numpy(), "opacity")
     out["scale"] = _levels(scales, "scale")
     out["rotation"] = _levels(quaternions[:, 1:], "rotation")
@@ -122,16 +134,20 @@ def splat_settings(
             chosen[name] = AttributeSettings(lossless=True)
         elif name.startswith("sh_"):
             degree = int(np.sqrt(int(name[3:])))
-            wider = round(6 * np.log2(_WIDEST_REST / rest)) if degree else 0  # steps of the same length
+            wider = round(6 * np.log2(SplatCodingTuning.max_rest / rest)) if degree else 0  # steps of the same length
             chosen[name] = AttributeSettings(
-                qps.sh[degree] + wider, _SH_CHROMA_OFFSET, VALUE_BITS, color_space="none", label="color"
+                qps.sh[degree] + wider,
+                SplatCodingTuning.sh_chroma_offset,
+                SplatCodingTuning.value_bits,
+                color_space="none",
+                label="color",
             )
         else:
             qp = {"opacity": qps.opacity, "scale": qps.scale}.get(name, qps.rotation)
-            chosen[name] = AttributeSettings(qp, 0, VALUE_BITS, color_space="none")
-    metadata = {"preset": "splat"} | ({"rest_range": rest} if rest != _WIDEST_REST else {})
+            chosen[name] = AttributeSettings(qp, 0, SplatCodingTuning.value_bits, color_space="none")
+    metadata = {"preset": "splat"} | ({"rest_range": rest} if rest != SplatCodingTuning.max_rest else {})
     return replace(
-        settings, geometry_bits=POSITION_BITS, duplicates="keep", attributes=chosen, metadata=metadata
+        settings, geometry_bits=SplatCodingTuning.position_bits, duplicates="keep", attributes=chosen, metadata=metadata
     )
 
 
@@ -142,7 +158,7 @@ def means_of(gaussians: GaussianMap) -> np.ndarray:
 
 def splat_reach(blocks: Callable[[], Iterable[GaussianMap]], count: int, settings: CodecSettings, rate: str) -> Reach:
     """What of a map to code, and on which voxels: see `reach_of`. They are as fine as its Gaussians are small, by the
-    middle one of their axes, but no finer than `POSITION_BITS` make them.
+    middle one of their axes, but no finer than `SplatCodingTuning.position_bits` make them.
 
     Args:
         blocks: gives the parts of the map, as often as it is called.
@@ -156,7 +172,7 @@ def splat_reach(blocks: Callable[[], Iterable[GaussianMap]], count: int, setting
 
 def finest_voxel(blocks: Iterable[GaussianMap], count: int, rate: str) -> float:
     """Edge of the voxels that are fine enough for `count` Gaussians, metres: a part of the middle axis of most."""
-    step = max(1, count // SAMPLED)
+    step = max(1, count // OutlierTuning.sample)
     sizes = [np.median(block.log_scales[::step].detach().cpu().numpy(), axis=1) for block in blocks if len(block)]
     size = float(np.exp(np.median(np.concatenate(sizes).astype(np.float64)))) if sizes else 0.0
     return RATES[rate].voxel * size if np.isfinite(size) else 0.0
@@ -191,15 +207,15 @@ def gaussians_of(cloud: PointCloud) -> GaussianMap:
         object_id=torch.from_numpy(values["object_id"].astype(np.int32)) if "object_id" in values else None,
     )  # fmt: skip
     out.sh[rows] = torch.stack([_values(values[name], "sh") for name in coefficients], 1)
-    out.sh[rows, 1:] *= _told_range(cloud) / _WIDEST_REST
+    out.sh[rows, 1:] *= _told_range(cloud) / SplatCodingTuning.max_rest
     if BIRTH in values:
         out.birth_keyframe[rows] = torch.from_numpy(values[BIRTH].astype(np.int32) - 1)
     return out
 
 
 def _told_range(cloud: PointCloud) -> float:
-    told = cloud.metadata.get("rest_range", _WIDEST_REST)
-    if not isinstance(told, (int, float)) or not 0 < told <= _WIDEST_REST:
+    told = cloud.metadata.get("rest_range", SplatCodingTuning.max_rest)
+    if not isinstance(told, (int, float)) or not 0 < told <= SplatCodingTuning.max_rest:
         raise FormatError("the range of the SH coefficients is damaged")
     return float(told)
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,12 +18,21 @@ from ggslam.coding.sequence_parameters import MATRIX_BT709, MATRIX_IDENTITY, MAT
 from ggslam.coding.slice_coder import MAX_SLICE_POINTS
 from ggslam.coding.user_data import read_user_data, version_of
 from ggslam.errors import FormatError
+from ggslam.system.tuning import Tuning
 
-# An adaptive bin costs at least 0.0056 bits, and a point of a slice without duplicates at least a bin: no stream can
-# say more than 1,431 points a byte. Counts of duplicates are not bounded so, which the first summand allows for.
-_FREE_POINTS = 1 << 20
-_POINTS_PER_BYTE = 1536
-_UNSPECIFIED = 2  # of a colour matrix
+
+class StreamLimits(Tuning):
+    """Limits on hostile streams."""
+
+    free_points = 1 << 20
+    """Points that a stream of any size may claim; they may be duplicates."""
+    points_per_byte = 1536
+    """Points per byte beyond them: an adaptive bin costs at least 0.0056 bits and a point at least one bin, so that a
+    byte holds at most 1,431."""
+
+
+_UNSPECIFIED: Final = 2
+"""Colour matrix that is not said (ISO/IEC 23091-2)."""
 
 
 @dataclass
@@ -144,7 +153,7 @@ def read_stream(data: bytes | memoryview) -> CodedStream:
     if parser.sequence is None or not parser.slices:
         raise FormatError("the stream holds no slice")
     points = sum(units.header.points for units in parser.slices)
-    if points > _FREE_POINTS + _POINTS_PER_BYTE * len(data):
+    if points > StreamLimits.free_points + StreamLimits.points_per_byte * len(data):
         raise FormatError(f"a stream of {len(data)} bytes cannot hold {points} points")
     for units in parser.slices:
         missing = set(range(len(parser.sequence.attributes))) - set(units.attributes)

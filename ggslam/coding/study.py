@@ -25,13 +25,22 @@ from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.settings import CodecSettings
 from ggslam.errors import ConfigError
 from ggslam.geometry.normals import estimate_normals
+from ggslam.system.tuning import Tuning
 
 Result = TypeVar("Result")
-FINEST_QP = 4
-REPEATS = 3
-"""Times each step is coded: the shortest time counts, and the mean energy."""
-QPS = (4, 10, 16, 22, 28, 34, 40, 46)
-SCALES = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0)
+
+
+class StudyTuning(Tuning):
+    """What a study of rates measures."""
+
+    finest_qp = 4
+    """Quantiser of attributes while geometry is varied."""
+    repeats = 3
+    """Times each step is coded: the shortest time counts, and the mean energy."""
+    qps = (4, 10, 16, 22, 28, 34, 40, 46)
+    """Quantisers of attributes."""
+    scales = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0)
+    """Scales of the grid."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +118,14 @@ def on_grid(points: np.ndarray, colors: np.ndarray, settings: CodecSettings) -> 
     return GridCloud(grid[starts], np.rint(sums / counts).astype(np.uint8), quantization)
 
 
-def sweep_steps(kinds: Sequence[str], qps: Sequence[int] = QPS, scales: Sequence[float] = SCALES) -> list[SweepStep]:
+def sweep_steps(
+    kinds: Sequence[str], qps: Sequence[int] = StudyTuning.qps, scales: Sequence[float] = StudyTuning.scales
+) -> list[SweepStep]:
     """The steps of the sweeps `kinds`, of "qp" and "geometry"."""
     steps = [SweepStep("qp", qp, 1.0) for qp in qps] if "qp" in kinds else []
-    return steps + ([SweepStep("geometry", FINEST_QP, scale) for scale in scales] if "geometry" in kinds else [])
+    return steps + (
+        [SweepStep("geometry", StudyTuning.finest_qp, scale) for scale in scales] if "geometry" in kinds else []
+    )
 
 
 def run_sweep(
@@ -138,7 +151,7 @@ def run_sweep(
             encode = partial(encode_cloud, cloud.grid, {"color": cloud.colors}, _settings(settings, step))
             encoded, encode_s = _measure(encode)
         decoded, decode_s = _measure(partial(decode_cloud, encoded.data, settings.threads))
-        joules = None if energy.joules is None else energy.joules / REPEATS
+        joules = None if energy.joules is None else energy.joules / StudyTuning.repeats
         color, d1, d2 = quality.of(decoded, step)
         report = encoded.report
         yield StudyRow(
@@ -148,9 +161,9 @@ def run_sweep(
 
 
 def _measure(call: Callable[[], Result]) -> tuple[Result, float]:
-    """What the call returns, and its shortest time of `REPEATS`, seconds."""
+    """What the call returns, and its shortest time of `StudyTuning.repeats`, seconds."""
     times = []
-    for _ in range(REPEATS):
+    for _ in range(StudyTuning.repeats):
         start = time.perf_counter()
         result = call()
         times.append(time.perf_counter() - start)

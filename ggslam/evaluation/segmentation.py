@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -19,8 +19,8 @@ from scipy.optimize import linear_sum_assignment
 
 from ggslam.errors import InputError
 
-FOUND_IOU = 0.5
-"""An object is found if its mask has more than this IoU; no two masks can then claim the same object."""
+FOUND_IOU: Final = 0.5
+"""An object counts as found above this IoU, as in panoptic quality: no two masks can claim the same object."""
 
 
 @dataclass(frozen=True)

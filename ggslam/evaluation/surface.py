@@ -9,8 +9,14 @@ import numpy as np
 
 from ggslam.evaluation.geometry import ThresholdScore, threshold_score
 from ggslam.geometry.clouds import Points, as_cloud, nearest_points
+from ggslam.system.tuning import Tuning
 
-SURFACE_THRESHOLDS_M = (0.01, 0.02)
+
+class SurfaceScoreTuning(Tuning):
+    """What surfaces are scored at."""
+
+    thresholds_m = (0.01, 0.02)
+    """Distances of the F-score, in metres."""
 
 
 @dataclass(frozen=True)
@@ -56,5 +62,5 @@ def score_surface(points: Points, surface: Points, normals: np.ndarray, spacing:
     back, _ = nearest_points(surface, points, None, seed)
     return SurfaceScores(
         float(np.median(distance)), float(np.quantile(distance, 0.95)),
-        tuple(threshold_score(t, distance, back) for t in SURFACE_THRESHOLDS_M), len(points),
+        tuple(threshold_score(t, distance, back) for t in SurfaceScoreTuning.thresholds_m), len(points),
     )  # fmt: skip

@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import Final
 
 import numpy as np
 
 from ggslam.errors import InputError
 from ggslam.scene.poses import fit_similarity, inverse
 
-FEWEST_POSES = 3
-"""Fewer positions than this can be laid upon anything."""
+FEWEST_POSES: Final = 3
+"""Positions that a rigid alignment needs."""
 
 
 @dataclass(frozen=True)

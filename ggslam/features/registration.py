@@ -18,11 +18,18 @@ from ggslam.features.orb import Landmarks
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import fit_similarity, inverse
 from ggslam.system.settings import setting, tuning_class
+from ggslam.system.tuning import Tuning
 
-FEWEST = 6
-"""Matches below which nothing is tried."""
-_ALIKE_CONSTANT, _ALIKE_SHARE = 0.03, 0.1
-"""Two matched points lie as far apart in both views, to so many metres plus this share."""
+
+class RegistrationTuning(Tuning):
+    """Pose from matched features."""
+
+    min_matches = 6
+    """Fewest matches of a pose."""
+    alike_m = 0.03
+    """Largest difference of the distance of two points between views, in metres..."""
+    alike_share = 0.1
+    """...plus this share of the distance."""
 
 
 @tuning_class(frozen=True)
@@ -116,14 +123,16 @@ def register(old: Landmarks, new: Landmarks, camera: Camera, settings: Registrat
     """
     matches = match(old, new, settings)
     nothing = Registration(np.eye(4), matches, np.zeros(len(matches), bool))
-    hypotheses = _hypotheses(matches, settings) if len(matches) >= FEWEST else np.zeros((0, 4, 4))
+    hypotheses = (
+        _hypotheses(matches, settings) if len(matches) >= RegistrationTuning.min_matches else np.zeros((0, 4, 4))
+    )
     if not len(hypotheses):
         return nothing
     agreeing = matches.agree(hypotheses, camera, settings, slack=2.0)
     best = int(agreeing.sum(1).argmax())
     T, inliers = hypotheses[best], agreeing[best]
     for _ in range(3):
-        if inliers.sum() < FEWEST:
+        if inliers.sum() < RegistrationTuning.min_matches:
             return nothing
         T = _refine(T, matches, inliers, camera)
         inliers = matches.agree(T, camera, settings)
@@ -135,7 +144,9 @@ def _hypotheses(matches: Matches, settings: RegistrationSettings) -> np.ndarray:
     triples = np.random.default_rng(0).integers(0, len(matches), (settings.hypotheses, 3))
     a, b = matches.old[triples], matches.new[triples]
     sides, others = (np.linalg.norm(p - np.roll(p, 1, 1), axis=2) for p in (a, b))
-    alike = np.abs(sides - others) < _ALIKE_SHARE * np.maximum(sides, others) + _ALIKE_CONSTANT
+    alike = (
+        np.abs(sides - others) < RegistrationTuning.alike_share * np.maximum(sides, others) + RegistrationTuning.alike_m
+    )
     chosen = alike.all(1) & (sides.min(1) > 0.1)  # a small triangle says little about rotation
     a, b = a[chosen], b[chosen]
     return fit_similarity(b, a)[0]

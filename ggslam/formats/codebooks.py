@@ -10,10 +10,20 @@ import warnings
 import numpy as np
 from scipy.cluster.vq import kmeans2, vq
 
-_SCALAR_STEPS = 300
-_COARSE_STEPS, _FINE_STEPS = 6, 5
-_SAMPLE = 1 << 16
-"""Rows that the coarse clusters of a palette are learned from."""
+from ggslam.system.tuning import Tuning
+
+
+class CodebookTuning(Tuning):
+    """How codebooks are learned."""
+
+    scalar_steps = 300
+    """Most rounds of k-means for a codebook of numbers."""
+    coarse_steps = 6
+    """Rounds of k-means for the coarse clusters of a palette."""
+    fine_steps = 5
+    """Rounds of k-means within a coarse cluster."""
+    sample = 1 << 16
+    """Rows that the coarse clusters are learned from."""
 
 
 def scalar_codebook(values: np.ndarray, size: int = 256) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +65,7 @@ def _lloyd(ordered: np.ndarray, size: int) -> np.ndarray:
         heapq.heappush(cells, cell(first, cut))
         heapq.heappush(cells, cell(cut, last))
     starts, centres = np.sort([first for _, first, _ in cells]), np.zeros(size)
-    for _ in range(_SCALAR_STEPS):
+    for _ in range(CodebookTuning.scalar_steps):
         ends = np.append(starts, len(ordered))
         counts = np.diff(ends)
         centres = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), centres)
@@ -79,8 +89,12 @@ def vector_palette(rows: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]
     if len(rows) <= size:
         return rows, np.arange(len(rows))
     random = np.random.default_rng(0)
-    sample = rows if len(rows) <= _SAMPLE else rows[np.sort(random.choice(len(rows), _SAMPLE, replace=False))]
-    coarse = _kmeans(sample, math.isqrt(size), _COARSE_STEPS, random)
+    sample = (
+        rows
+        if len(rows) <= CodebookTuning.sample
+        else rows[np.sort(random.choice(len(rows), CodebookTuning.sample, replace=False))]
+    )
+    coarse = _kmeans(sample, math.isqrt(size), CodebookTuning.coarse_steps, random)
     cluster, distance = vq(rows, coarse, check_finite=False)
     members = np.split(np.argsort(cluster, kind="stable"), np.cumsum(np.bincount(cluster, minlength=len(coarse)))[:-1])
     errors = np.array([np.square(distance[index], dtype=np.float64).sum() for index in members])
@@ -89,7 +103,7 @@ def vector_palette(rows: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]
     for index, count in zip(members, entries.tolist(), strict=True):
         if not len(index):
             continue
-        fine = _kmeans(rows[index], min(count, len(index)), _FINE_STEPS, random)
+        fine = _kmeans(rows[index], min(count, len(index)), CodebookTuning.fine_steps, random)
         labels[index] = used + vq(rows[index], fine, check_finite=False)[0]
         palette.append(fine)
         used += len(fine)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -17,9 +18,11 @@ from ggslam.formats.writer import PosedViews, Takes, Writer
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, matrix_to_quaternion
 from ggslam.system.atomic import make_empty_folder, make_folder, write_bytes, write_text
+from ggslam.system.plurals import counted
 
 MODEL = "sparse/0"
-_PINHOLE = 1
+_PINHOLE: Final = 1
+"""Number of COLMAP's camera model PINHOLE."""
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track_length", "<u8")])
 
 
@@ -83,7 +86,7 @@ def _write(folder: Path, posed: PosedViews) -> str:
         posed.cloud.points, posed.cloud.colors,
     )  # fmt: skip
     write_text(folder / MODEL / "test.txt", "".join(f"{v.name}\n" for v in views if v.held_out))
-    return f"wrote {folder}: {posed.text(views)}, {len(posed.cloud)} points, COLMAP"
+    return f"wrote {folder}: {posed.text(views)}, {counted(len(posed.cloud), 'point')}, COLMAP"
 
 
 WRITER = Writer("colmap", (), Takes.VIEWS, "images, poses and points, a COLMAP folder", _write)

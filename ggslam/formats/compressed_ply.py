@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -23,14 +24,23 @@ from ggslam.formats.ply import write_ply
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
+from ggslam.system.tuning import Tuning
 
-CHUNK = 256
-"""Gaussians that share their corners."""
-SH_REACH = 4.0
-"""Spherical harmonics are bytes, steps of 1/32 between minus and plus this."""
-_BLENDED = 16
-"""Gaussians that a pixel shows, about: with so many, what is chosen is what brings pictures of a trained map nearer."""
-_LOG_SCALE_REACH = 20.0
+CHUNK: Final = 256
+"""Gaussians that share their corners in the format."""
+SH_REACH: Final = 4.0
+"""Spherical harmonics are bytes in steps of 1/32 from minus to plus this."""
+
+
+class CompressedPlyTuning(Tuning):
+    """How values are rounded to bytes."""
+
+    blended = 16
+    """Neighbours whose mean error is kept small: a pixel shows about so many Gaussians."""
+    max_log_scale = 20.0
+    """Largest absolute log scale that is written."""
+
+
 _CORNERS = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
 
 
@@ -66,7 +76,7 @@ def write_compressed_ply(path: str | Path, gaussians: GaussianMap) -> int:
 
 def _pack(columns: SplatColumns, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The elements `chunk` and `vertex`."""
-    log_scales = columns.log_scales[order].clip(-_LOG_SCALE_REACH, _LOG_SCALE_REACH)
+    log_scales = columns.log_scales[order].clip(-CompressedPlyTuning.max_log_scale, CompressedPlyTuning.max_log_scale)
     colors = 0.5 + SH_C0 * columns.sh[order, 0]
     opacity = 0.5 + 0.5 * np.tanh(0.5 * columns.logits[order].astype(np.float64))
     starts = np.arange(0, len(order), CHUNK)
@@ -116,7 +126,7 @@ def harmonics_worth_storing(higher: np.ndarray) -> np.ndarray:
     harmonics of a trained map have. A pixel shows many Gaussians, though. If neighbours are rounded up and down by
     chance, in proportion to how near a number is to both middles, their mean comes back; if each is rounded to the
     nearest, neighbours that are alike all err alike. Of each degree that rounding is taken whose error is less, and of
-    all degrees as many as leave the least error, both measured on means of `_BLENDED` neighbours.
+    all degrees as many as leave the least error, both measured on means of `CompressedPlyTuning.blended` neighbours.
 
     Args:
         higher: float32 [N, K, 3] without the base colour, neighbours in space following one another.
@@ -139,8 +149,8 @@ def harmonics_worth_storing(higher: np.ndarray) -> np.ndarray:
 
 
 def _error_of_means(errors: np.ndarray) -> float:
-    """Squares of means of `_BLENDED` neighbours, summed; [N, k, 3]."""
-    starts = np.arange(0, len(errors), _BLENDED)
+    """Squares of means of `CompressedPlyTuning.blended` neighbours, summed; [N, k, 3]."""
+    starts = np.arange(0, len(errors), CompressedPlyTuning.blended)
     counts = np.diff(np.append(starts, len(errors)))[:, None, None]
     return float(np.square(np.add.reduceat(errors, starts) / counts).sum())
 

@@ -15,24 +15,30 @@ import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.linear_light import vertex_colors
-from ggslam.formats.splat_columns import SplatColumns
+from ggslam.formats.splat_columns import MAX_FLOAT_ID, SplatColumns
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.system.atomic import atomic_write
 
 _EXTENSION = "KHR_gaussian_splatting"
-_FLOAT, _USHORT, _ARRAY_BUFFER, _POINTS = 5126, 5123, 34962, 0
+_FLOAT: Final = 5126
+"""OpenGL's number of float32."""
+_USHORT: Final = 5123
+"""OpenGL's number of uint16."""
+_ARRAY_BUFFER: Final = 34962
+"""OpenGL's number of a buffer of vertex attributes."""
+_POINTS: Final = 0
+"""glTF's drawing mode for points."""
 _WIDEST_CORNER = [[-1.2345678901234567e-308] * 3] * 2
 """As long as corners get in JSON."""
-_LARGEST_FILE = 2**32 - 1
-_LARGEST_ID = 2**24
-"""Up to here float32 holds whole numbers; glTF has no attributes of 32-bit integers."""
+_LARGEST_FILE: Final = 2**32 - 1
+"""Largest file in bytes: GLB counts them in 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -158,8 +164,8 @@ def _columns(path: str | Path, gaussians: GaussianMap, with_objects: bool) -> di
     out |= dict(zip(_harmonics(gaussians.sh_degree), columns.sh.transpose(1, 0, 2), strict=True))
     if with_objects:
         ids = columns.object_id
-        if len(ids) and (ids.min() < 0 or ids.max() > _LARGEST_ID):
-            raise FormatError(f"{path}: object ids are 0 to {_LARGEST_ID} in glTF, found {ids.min()} to {ids.max()}")
+        if len(ids) and (ids.min() < 0 or ids.max() > MAX_FLOAT_ID):
+            raise FormatError(f"{path}: object ids are 0 to {MAX_FLOAT_ID} in glTF, found {ids.min()} to {ids.max()}")
         out["_FEATURE_ID_0"] = ids
     return out
 

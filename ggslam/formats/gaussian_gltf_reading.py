@@ -23,14 +23,23 @@ from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
 from ggslam.formats.spz_reading import spz_columns
 from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, member, open_untrusted, read_untrusted
+from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import FileTuning, member, open_untrusted, read_untrusted
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = "KHR_gaussian_splatting_compression_spz_2"
 _SPZ_NAMES = (_SPZ, "KHR_gaussian_splatting_compression_spz", "KHR_spz_gaussian_splats_compression")
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_MOST_NODES = 100_000
+
+
+class GltfTuning(Tuning):
+    """A limit on damaged files."""
+
+    max_nodes = 100_000
+    """Most nodes of a scene."""
+
+
 _DAMAGE = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError, struct.error)
 
 
@@ -112,7 +121,7 @@ def _open(path: Path) -> _Document:
             binary = data[start + 8 : start + 8 + size] if kind == b"BIN\0" else b""
     else:
         text = data
-    if len(text) > MAX_TEXT_BYTES:
+    if len(text) > FileTuning.max_text_bytes:
         raise ValueError("its JSON part is too large")
     gltf = json.loads(text)
     buffers = [_buffer(path, buffer, binary) for buffer in gltf.get("buffers", [])]
@@ -133,7 +142,7 @@ def _primitives(gltf: dict[str, Any]) -> list[tuple[np.ndarray, dict[str, Any], 
     nodes, found = gltf.get("nodes", []), list[tuple[np.ndarray, dict[str, Any], dict[str, Any]]]()
     scenes = gltf.get("scenes") or [{"nodes": list(range(len(nodes)))}]
     waiting = [(np.eye(4), number) for number in scenes[gltf.get("scene", 0)].get("nodes", [])]
-    for _ in range(_MOST_NODES):
+    for _ in range(GltfTuning.max_nodes):
         if not waiting:
             return found
         T, number = waiting.pop()

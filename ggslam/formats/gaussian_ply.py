@@ -19,18 +19,26 @@ import torch
 
 from ggslam.errors import FormatError, InputError
 from ggslam.formats.ply import read_ply, write_ply_parts
+from ggslam.formats.splat_columns import MAX_FLOAT_ID
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import write_bytes
+from ggslam.system.plurals import counted
+from ggslam.system.tuning import Tuning
 
 EXTRAS = ("object_id", "identity")
 _MEANS, _NORMALS = ["x", "y", "z"], ["nx", "ny", "nz"]
 _COLORS = [f"f_dc_{i}" for i in range(3)]
 _SCALES, _ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
-_LARGEST_ID = 2**24
-"""Up to here float32 holds whole numbers."""
-_BLOCK = 1 << 16
-"""Rows that are made at a time: a large map is not in memory twice."""
+
+
+class PlyTuning(Tuning):
+    """How a PLY is written."""
+
+    rows_at_once = 1 << 16
+    """Rows that are built at a time, so that a large map is not in memory twice."""
+
+
 _REQUIRED = [*_MEANS, *_COLORS, "opacity", *_SCALES, *_ROTATIONS]
 
 
@@ -75,8 +83,8 @@ def write_gaussian_parts(
         raise InputError(f"unknown extra properties {sorted(unknown)}, expected some of {EXTRAS}")
     empty = GaussianMap(like.sh_degree, like.features.shape[1], with_moments=False)
     rows = (
-        _vertices(path, part, extra, slice(begin, min(begin + _BLOCK, len(part))))
-        for part in parts for begin in range(0, len(part), _BLOCK)
+        _vertices(path, part, extra, slice(begin, min(begin + PlyTuning.rows_at_once, len(part))))
+        for part in parts for begin in range(0, len(part), PlyTuning.rows_at_once)
     )  # fmt: skip
     write_ply_parts(path, "vertex", count, rows, _vertices(path, empty, extra).dtype, comments)
 
@@ -99,8 +107,8 @@ def _vertices(
     _add(columns, _ROTATIONS, quaternions)
     if "object_id" in extra:
         ids = gaussians.object_id[rows_of_map]
-        if count and int(ids.abs().max()) > _LARGEST_ID:
-            raise FormatError(f"{path}: object ids are at most {_LARGEST_ID} in a PLY of Gaussians")
+        if count and int(ids.abs().max()) > MAX_FLOAT_ID:
+            raise FormatError(f"{path}: object ids are at most {MAX_FLOAT_ID} in a PLY of Gaussians")
         _add(columns, ["object_id"], ids[:, None].float())
     if "identity" in extra:
         _add(columns, [f"identity_{i}" for i in range(gaussians.features.shape[1])], gaussians.features[rows_of_map])
@@ -213,7 +221,7 @@ def _write(path: Path, splats: Splats) -> str:
         classifier = path.with_name(f"{path.stem}_classifier.npz")
         write_bytes(classifier, splats.classifier().to_bytes())
         beside = f" with object ids and identities, and {classifier.name}"
-    return f"wrote {path}: {splats.count} Gaussians{splats.note or beside}"
+    return f"wrote {path}: {counted(splats.count, 'Gaussian')}{splats.note or beside}"
 
 
 WRITER = Writer(

@@ -19,11 +19,11 @@ import torch
 
 from ggslam.errors import FormatError
 from ggslam.formats.gaussian_ply import object_ids
-from ggslam.formats.gaussian_rows import BLOCK, GaussianRows
-from ggslam.formats.positions import COARSE, coordinate_step
+from ggslam.formats.gaussian_rows import GaussianRows, GaussianRowsTuning
+from ggslam.formats.positions import PositionTuning, coordinate_step
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_reader import SplatFile, SplatReader, properties_of_ply
-from ggslam.formats.splat_repair import THINNER, SplatFaults, columns_of, logits_of, map_of_columns, mend
+from ggslam.formats.splat_repair import RepairTuning, SplatFaults, columns_of, logits_of, map_of_columns, mend
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 
 _BYTES = ("red", "green", "blue")
@@ -105,7 +105,7 @@ class SplatLayout:
         """What some rows say, of which the first has the number `first` in the file."""
         sizes = _stack(vertex, self.scales)
         if len(self.scales) == 2:
-            sizes = np.column_stack([sizes, sizes.max(1) - THINNER])
+            sizes = np.column_stack([sizes, sizes.max(1) - RepairTuning.thinner])
         logits = vertex["opacity"].astype(np.float32)
         if self.has_filter:
             sizes, logits = apply_filter(sizes, logits, vertex[_FILTER].astype(np.float64))
@@ -174,8 +174,8 @@ class PlyGaussianRows(GaussianRows):
         self._open(Path(path))
         self._layout = SplatLayout.of(self.path, self._raw(0, 0))
         self._faults, bad = SplatFaults(), [np.empty(0, np.int64)]
-        for start in range(0, self._row_count(), BLOCK):
-            columns = self._columns(start, min(BLOCK, self._row_count() - start))
+        for start in range(0, self._row_count(), GaussianRowsTuning.rows_at_once):
+            columns = self._columns(start, min(GaussianRowsTuning.rows_at_once, self._row_count() - start))
             bad.append(start + np.flatnonzero(~mend(columns, self._faults)))
         self._bad = np.concatenate(bad)
         self.like = self._map(0, 0)
@@ -189,15 +189,16 @@ class PlyGaussianRows(GaussianRows):
         Raises:
             FormatError: the file cannot be read any more.
         """
-        if count <= BLOCK:
+        if count <= GaussianRowsTuning.rows_at_once:
             begin = self._row_in_file(start) if count else 0
             return self._map(begin, self._row_in_file(start + count - 1) + 1 - begin if count else 0)
         like = self.like
         out = GaussianMap(like.sh_degree, like.feature_channels, with_moments=False)
         out.growth = 0.0
         out.reserve(count)
-        for first in range(start, start + count, BLOCK):  # so that columns of all are not there beside the map
-            part = self.read(first, min(BLOCK, start + count - first))
+        step = GaussianRowsTuning.rows_at_once  # so that columns of all are not in memory beside the map
+        for first in range(start, start + count, step):
+            part = self.read(first, min(step, start + count - first))
             out.append(part.take(torch.arange(len(part))))
         return out
 
@@ -245,7 +246,7 @@ def _refuse_far(path: Path, vertex: np.ndarray) -> None:
         return
     typical = float(np.nanmax(np.median(np.abs(doubles), axis=1)))  # some may be anywhere
     step = coordinate_step(typical)
-    if step > COARSE:
+    if step > PositionTuning.coarse_m:
         raise FormatError(
             f"{path}: its Gaussians lie {typical:.0f} m from zero, in double precision; maps are in single precision, "
             f"with steps of {step:.3g} m there: subtract an offset first"

@@ -14,9 +14,14 @@ from ggslam.formats.gaussian_ply import gaussians_of_vertices
 from ggslam.formats.ply import read_ply
 from ggslam.formats.ply_rows import PlyRows
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-BLOCK = 1 << 15
-"""Gaussians that are in memory at a time while a file is gone through."""
+
+class GaussianRowsTuning(Tuning):
+    """How a file is read from start to end."""
+
+    rows_at_once = 1 << 15
+    """Gaussians that are in memory at a time."""
 
 
 class GaussianRows:
@@ -64,13 +69,14 @@ class GaussianRows:
         return gaussians_of_vertices(self.path, self._raw(start, count), with_moments=False, first=start)
 
     def blocks(self) -> Iterator[GaussianMap]:
-        """All Gaussians in their order, `BLOCK` at a time; errors as of `read`."""
-        for number in range(-(-len(self) // BLOCK)):
+        """All Gaussians in their order, `rows_at_once` at a time; errors as of `read`."""
+        for number in range(-(-len(self) // GaussianRowsTuning.rows_at_once)):
             yield self.block(number)
 
     def block(self, number: int) -> GaussianMap:
         """The Gaussians of a block, counted from 0; errors as of `read`."""
-        return self.read(number * BLOCK, min(BLOCK, len(self) - number * BLOCK))
+        first, most = number * GaussianRowsTuning.rows_at_once, GaussianRowsTuning.rows_at_once
+        return self.read(first, min(most, len(self) - first))
 
     def _raw(self, start: int, count: int) -> np.ndarray | None:
         if self._rows is not None:

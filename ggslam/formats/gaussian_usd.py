@@ -24,12 +24,18 @@ from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.atomic import atomic_write, make_folder
 from ggslam.system.hidden_folder import hidden_beside
+from ggslam.system.tuning import Tuning
 
 USD_ENDINGS = (".usd", ".usda", ".usdc", ".usdz")
 PRIM = "/map/gaussians"
 COLOR_SPACE = "srgb_rec709_display"
-_REACH = 3.0
-"""Standard deviations that the extent of the prim is to hold."""
+
+
+class UsdTuning(Tuning):
+    """How large the prim is said to be."""
+
+    sigmas = 3.0
+    """Standard deviations of each Gaussian that the extent of the prim includes."""
 
 
 def usd_package(path: str | Path, verb: str = "write") -> ModuleType:
@@ -119,7 +125,7 @@ def _stage(pxr: ModuleType, columns: SplatColumns, sh_degree: int, objects: Mapp
 def _extent(columns: SplatColumns, scales: np.ndarray) -> np.ndarray:
     """Corners float32 [2, 3] of the box that the Gaussians reach to."""
     R = quaternion_to_matrix(columns.quaternions.astype(np.float64))
-    reach = _REACH * np.sqrt((R**2 @ (scales.astype(np.float64) ** 2)[:, :, None])[:, :, 0])
+    reach = UsdTuning.sigmas * np.sqrt((R**2 @ (scales.astype(np.float64) ** 2)[:, :, None])[:, :, 0])
     return np.stack([(columns.means - reach).min(0), (columns.means + reach).max(0)]).astype(np.float32)
 
 

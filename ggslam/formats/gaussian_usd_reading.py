@@ -15,9 +15,17 @@ from ggslam.formats.gaussian_usd import USD_ENDINGS, usd_package
 from ggslam.formats.splat_columns import UPRIGHT, SplatColumns
 from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logarithms_of, logits_of
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import member, open_untrusted
 
-_MOST_LAYERS = 1000
+
+class UsdLimitTuning(Tuning):
+    """A limit on damaged files."""
+
+    max_layers = 1000
+    """Most layers of a stage."""
+
+
 _Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation from x right, z up, y forward to x right, y down, z forward."""
 
@@ -68,8 +76,8 @@ def _check_layers(pxr: ModuleType, path: Path) -> None:
         if name in seen:
             continue
         seen.add(name)
-        if len(seen) > _MOST_LAYERS:
-            raise ValueError(f"it has more than {_MOST_LAYERS} layers")
+        if len(seen) > UsdLimitTuning.max_layers:
+            raise ValueError(f"it has more than {UsdLimitTuning.max_layers} layers")
         if not pxr.Ar.IsPackageRelativePath(name):  # a layer inside a .usdz is in a file that was looked at
             open_untrusted(member(path.parent, name)).close()
         layer = pxr.Sdf.Layer.FindOrOpen(name)

@@ -6,12 +6,14 @@ Both directions run in the compiled core (ggslam/native/src/codec/lzf_api.cpp) a
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from ggslam.native.loader import load_library
 
-_MOST_GROWTH = 88
-"""Three bytes of a match stand for at most 264."""
+_MOST_GROWTH: Final = 88
+"""Largest growth of LZF: three bytes of a match stand for at most 264."""
 _REASONS = {
     -1: "the compressed data end within a match",
     -2: "a match begins before the data",

@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,10 +20,11 @@ from ggslam.formats.point_ply import write_metric_points
 from ggslam.formats.writer import PosedViews, Takes, Writer
 from ggslam.scene.camera import Camera
 from ggslam.system.atomic import make_empty_folder, write_text
+from ggslam.system.plurals import counted
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-MOST_DEPTH = 65.535
-"""Metres; what is farther has no depth in a 16-bit image of millimetres."""
+MOST_DEPTH: Final = 65.535
+"""Largest depth in metres that a 16-bit image of millimetres holds; farther pixels have none."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def _write(folder: Path, posed: PosedViews) -> str:
         TransformsFrame(f"images/{v.name}", f"depth/{v.name}", v.T_world_camera, v.held_out, v.camera) for v in views
     ]
     write_transforms(folder / "transforms.json", frames, "points.ply")
-    return f"wrote {folder}: {posed.text(views)} with depth, {len(posed.cloud)} points, nerfstudio"
+    return f"wrote {folder}: {posed.text(views)} with depth, {counted(len(posed.cloud), 'point')}, nerfstudio"
 
 
 WRITER = Writer("nerfstudio", (), Takes.VIEWS, "images, depth, poses and points, a nerfstudio folder", _write)

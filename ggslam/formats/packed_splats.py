@@ -14,6 +14,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import Final
 
 import numpy as np
 
@@ -24,8 +25,8 @@ from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import write_bytes
 
-SPZ_REACH = 2048.0
-"""Metres: positions in SPZ are 24 bits with 12 behind the point."""
+SPZ_REACH: Final = 2048.0
+"""Metres that SPZ's positions reach: 24 bits, 12 of them behind the point."""
 
 
 def spz_packages(path: str | Path, version: int = 3) -> tuple[ModuleType, ModuleType | None]:

@@ -18,9 +18,17 @@ from ggslam.formats import lzf
 from ggslam.formats.text_numbers import fit, parse_numbers
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.atomic import write_bytes
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted, read_untrusted
 
-_MAXIMUM_HEADER_BYTES = 1 << 16
+
+class PcdTuning(Tuning):
+    """A limit on damaged files."""
+
+    max_header_bytes = 1 << 16
+    """Largest header, in bytes."""
+
+
 _KEYWORDS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 _SIZES = {"I": (1, 2, 4, 8), "U": (1, 2, 4, 8), "F": (4, 8)}
 
@@ -69,7 +77,7 @@ def read_viewpoint(path: str | Path) -> np.ndarray | None:
     """
     path = Path(path)
     with open_untrusted(path) as file:
-        lines, _ = _header_lines(file.read(_MAXIMUM_HEADER_BYTES), path)
+        lines, _ = _header_lines(file.read(PcdTuning.max_header_bytes), path)
     words = lines.get("VIEWPOINT")
     if words is None:
         return None
@@ -160,7 +168,7 @@ def _header_lines(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
     lines: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in lines:
-        end = data.find(b"\n", at, _MAXIMUM_HEADER_BYTES)
+        end = data.find(b"\n", at, PcdTuning.max_header_bytes)
         words = data[at : max(end, 0)].decode("latin-1").split()
         if words and not words[0].startswith("#"):
             if words[0] not in _KEYWORDS:

@@ -10,8 +10,16 @@ from typing import BinaryIO
 import numpy as np
 
 from ggslam.errors import FormatError
+from ggslam.system.tuning import Tuning
 
-MAXIMUM_HEADER_BYTES = 1 << 20
+
+class PlyHeaderTuning(Tuning):
+    """A limit on damaged files."""
+
+    max_header_bytes = 1 << 20
+    """Largest header, in bytes."""
+
+
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 """PLY encodings and numpy's sign of their byte order."""
 
@@ -94,7 +102,7 @@ def _header_lines(file: BinaryIO, path: Path) -> tuple[list[str], int]:
     """The lines up to `end_header`, and how many bytes they take."""
     lines: list[str] = []
     size = 0
-    while size < MAXIMUM_HEADER_BYTES:
+    while size < PlyHeaderTuning.max_header_bytes:
         raw = file.readline(4096)
         size += len(raw)
         line = raw.decode("latin-1").rstrip("\r\n")
@@ -105,7 +113,7 @@ def _header_lines(file: BinaryIO, path: Path) -> tuple[list[str], int]:
         if line.strip() == "end_header":
             return lines, size
         lines.append(line)
-    raise FormatError(f"{path}: no 'end_header' within the first {MAXIMUM_HEADER_BYTES} bytes")
+    raise FormatError(f"{path}: no 'end_header' within the first {PlyHeaderTuning.max_header_bytes} bytes")
 
 
 def _parse_line(line: str, header: Header) -> None:

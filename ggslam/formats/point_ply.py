@@ -22,6 +22,8 @@ from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.formats.writer import SurfacePoints, Takes, Writer
 from ggslam.system.atomic import make_folder, write_failure
+from ggslam.system.plurals import counted
+from ggslam.system.tuning import Tuning
 
 __all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "grid_positions", "read_points", "sample_points",
            "write_grid_points", "write_metric_points", "write_points", "write_points_in_parts"]  # fmt: skip
@@ -29,11 +31,19 @@ __all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "grid_positions", "read_poi
 METRIC_FILE, GRID_FILE = "points.ply", "points_grid.ply"
 _COLORS = ("red", "green", "blue")
 _METRIC, _GRID = "x y z are metres", "x y z are grid coordinates; metres = origin + voxel_size * (x, y, z)"
-_ROWS_AT_ONCE = 1 << 15
+
+
+class PointPlyTuning(Tuning):
+    """How a point cloud is written."""
+
+    rows_at_once = 1 << 15
+    """Points that are in memory at a time."""
+    max_centre_error = 0.01
+    """Distance from a voxel's centre that single precision explains, in voxels."""
+
+
 _OFFSETS = ("offset_x", "offset_y", "offset_z")
 """Fields of the rows that wait in the temporary file."""
-_AT_CENTRE = 0.01
-"""Voxels: a point that is no farther from the centre of its voxel may be off it by single precision alone."""
 
 
 def write_points(folder: str | Path, cloud: VoxelCloud) -> None:
@@ -93,7 +103,7 @@ def _gather_rows(raw: IO[bytes], clouds: Iterable[VoxelCloud]) -> tuple[VoxelClo
 def _read_back(raw: IO[bytes], whole: VoxelCloud, dtype: np.dtype) -> Iterator[VoxelCloud]:
     corner = np.rint(whole.origin / whole.voxel_size).astype(np.int64)
     raw.seek(0)
-    while len(rows := np.frombuffer(raw.read(_ROWS_AT_ONCE * dtype.itemsize), dtype)):
+    while len(rows := np.frombuffer(raw.read(PointPlyTuning.rows_at_once * dtype.itemsize), dtype)):
         grid = np.stack([rows[name] for name in "xyz"], 1).astype(np.int64) - corner
         colors = np.stack([rows[name] for name in _COLORS], 1)
         ids = None if whole.object_id is None else rows["object_id"]
@@ -127,7 +137,7 @@ def read_points(path: str | Path) -> VoxelCloud:
     colors = np.stack([vertex[name] for name in _COLORS], 1).astype(np.uint8)
     object_id = vertex["object_id"].astype(np.int32) if "object_id" in (vertex.dtype.names or ()) else None
     offsets = None if _is_grid(ply.comments, position) else ((position - origin) / voxel_size - grid).astype(np.float32)
-    if offsets is not None and np.abs(offsets).max(initial=0) < _AT_CENTRE:
+    if offsets is not None and np.abs(offsets).max(initial=0) < PointPlyTuning.max_centre_error:
         offsets = None
     return VoxelCloud(grid, colors, object_id, voxel_size, origin, offsets)
 
@@ -195,7 +205,7 @@ def _write(folder: Path, points: SurfacePoints) -> str:
     make_folder(folder)
     count = write_points_in_parts(folder, points.clouds)
     names = f"{METRIC_FILE} and {GRID_FILE}"
-    return f"wrote {folder}/{names}: {count} points on a {points.voxel_size:g} m grid"
+    return f"wrote {folder}/{names}: {counted(count, 'point')} on a {points.voxel_size:g} m grid"
 
 
 WRITER = Writer("points", (), Takes.POINTS, "coloured points, PLY in metres and in cells of a grid", _write)

@@ -14,21 +14,26 @@ from ggslam.formats.cubes_to_come import CubesToCome
 from ggslam.formats.surface_discs import SurfaceDiscs, disc_samples
 from ggslam.formats.voxel_cloud import BITS, VoxelCloud, VoxelSums, cloud_of_sums, pack, unpack
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-_CHUNK = 300_000
-"""Samples held in memory at a time..."""
-_SMALL_CHUNK = 40_000
-"""...and where memory is scarce (a sample takes some 350 bytes)."""
-_FEW = 50_000
-"""Voxels that are sampled, where Gaussians come in parts, before one looks which are finished."""
-_BLOCK_EDGE = 0.25
-"""Metres: how finely it is known where parts to come reach."""
-_MOST_CUBES = 1 << 16
-"""Of such blocks, that one Gaussian may reach into for it to be known which: 10 m in each direction."""
-USUAL_VOXEL = 0.01
-"""Metres."""
-_MOST_SAMPLES = 250
-"""Of a Gaussian, on average, in voxels that go with the map; a room's has 40 to 120 in voxels of 1 cm."""
+
+class PointSamplingTuning(Tuning):
+    """How Gaussians are sampled to a point cloud."""
+
+    samples_at_once = 300_000
+    """Samples in memory at a time."""
+    few_samples_at_once = 40_000
+    """The same where memory is scarce; a sample takes about 350 bytes."""
+    voxels_before_check = 50_000
+    """Voxels that are sampled before finished ones are looked for, where Gaussians come in parts."""
+    block_edge_m = 0.25
+    """Side of the blocks that tell where later parts reach, in metres."""
+    max_blocks = 1 << 16
+    """Most blocks that one Gaussian may reach into to be counted in them: 10 m in each direction."""
+    voxel_m = 0.01
+    """Side of a voxel where none is given, in metres."""
+    max_samples = 250
+    """Most samples of a Gaussian on average in voxels chosen for the map; a room has 40 to 120 at 1 cm."""
 
 
 def sample_points(
@@ -103,10 +108,16 @@ def sample_parts(
     for number in order:
         part = parts[number].load()
         for discs in SurfaceDiscs.of(part, minimum_opacity).cut(axis):
-            pending.append(_add_samples(VoxelSums.empty(), part, discs, voxel_size, with_object_id, _SMALL_CHUNK))
+            pending.append(
+                _add_samples(
+                    VoxelSums.empty(), part, discs, voxel_size, with_object_id, PointSamplingTuning.few_samples_at_once
+                )
+            )
             to_come.is_done(done)
             done, sampled = done + 1, sampled + len(pending[-1].key)
-            if sampled < max(_FEW, len(waiting.key)) and not to_come.all_done:  # joining costs as much as what waits
+            if (
+                sampled < max(PointSamplingTuning.voxels_before_check, len(waiting.key)) and not to_come.all_done
+            ):  # joining costs as much as what waits
                 continue
             waiting, pending, sampled = VoxelSums.of([waiting, *pending]), [], 0
             finished = to_come.are_done(pack(unpack(waiting.key) // _cube_edge(voxel_size)))
@@ -119,9 +130,11 @@ def voxel_size_for(parts: Sequence[MapPart], minimum_opacity: float = 0.3) -> fl
     """Edge of voxels that suits a map, a whole number of centimetres: 1, and more where Gaussians are much larger than
     a room's, in halls or where depth has a wrong unit. A cloud of those in voxels of 1 cm takes the time and the disk
     of hundreds of rooms."""
-    size, mean = 0.0, 2.0 * _MOST_SAMPLES
-    while mean > _MOST_SAMPLES:
-        size = USUAL_VOXEL * max(1, math.ceil(size / USUAL_VOXEL * math.sqrt(mean / _MOST_SAMPLES)))
+    size, mean = 0.0, 2.0 * PointSamplingTuning.max_samples
+    while mean > PointSamplingTuning.max_samples:
+        size = PointSamplingTuning.voxel_m * max(
+            1, math.ceil(size / PointSamplingTuning.voxel_m * math.sqrt(mean / PointSamplingTuning.max_samples))
+        )
         samples = gaussians = 0
         for part in parts:
             discs = SurfaceDiscs.of(part.load(), minimum_opacity)
@@ -133,7 +146,7 @@ def voxel_size_for(parts: Sequence[MapPart], minimum_opacity: float = 0.3) -> fl
 
 def _cube_edge(voxel_size: float) -> int:
     """Of the cubes that finished space is counted in, voxels."""
-    return max(1, round(_BLOCK_EDGE / voxel_size))
+    return max(1, round(PointSamplingTuning.block_edge_m / voxel_size))
 
 
 def _cubes(discs: SurfaceDiscs, voxel_size: float) -> np.ndarray | None:
@@ -142,7 +155,7 @@ def _cubes(discs: SurfaceDiscs, voxel_size: float) -> np.ndarray | None:
     reach = np.sqrt(((discs.axes * discs.reach[:, None, :]) ** 2).sum(2)) + voxel_size
     edge = voxel_size * _cube_edge(voxel_size)
     low, high = (np.floor((discs.means + side * reach) / edge).astype(np.int64) for side in (-1, 1))
-    if ((high - low + 1.0).prod(1)).max(initial=0) > _MOST_CUBES:
+    if ((high - low + 1.0).prod(1)).max(initial=0) > PointSamplingTuning.max_blocks:
         return None
     few = ((high - low) <= 1).all(1)
     corners = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -155,7 +168,7 @@ def _cubes(discs: SurfaceDiscs, voxel_size: float) -> np.ndarray | None:
 
 def _add_samples(
     merged: VoxelSums, gaussians: GaussianMap, discs: SurfaceDiscs, voxel_size: float, with_object_id: bool,
-    chunk: int = _CHUNK,
+    chunk: int = PointSamplingTuning.samples_at_once,
 ) -> VoxelSums:  # fmt: skip
     """The sums with those of samples of a map, of which `chunk` are in memory at a time."""
     pending, waiting = [], 0

@@ -10,10 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import NoPointsError
+from ggslam.system.tuning import Tuning
 
 _log = logging.getLogger(__name__)
-COARSE = 1e-3
-"""Metres: steps of coordinates above this are said."""
+
+
+class PositionTuning(Tuning):
+    """When rounded positions are reported."""
+
+    coarse_m = 1e-3
+    """Step of coordinates above which a note says so, in metres."""
 
 
 def placed_rows(path: str | Path, points: np.ndarray, tell: bool = True) -> np.ndarray | slice:
@@ -55,7 +61,7 @@ def rounded_words(points: np.ndarray) -> str:
     """What is said of finite positions [n, 3] in single precision that are too far from zero for it; else empty."""
     farthest = float(np.median(np.abs(points), axis=0).max(initial=0))  # some may be anywhere
     step = coordinate_step(farthest)
-    if step <= COARSE:
+    if step <= PositionTuning.coarse_m:
         return ""
     return (
         f"its coordinates reach {farthest:.0f} and are in single precision, which has steps of {step:.3g} there: "

@@ -8,12 +8,21 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import FormatError
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted
 
-_WIDEST = 8
-_LOOKED_AT = 1 << 20
-_CLEAR, _NOISE = 0.05, 20.0
-"""Share of the variance that says something, and the most of what chance gives, in columns over rows."""
+
+class RawPointsTuning(Tuning):
+    """How the columns of a file without a header are found."""
+
+    max_columns = 8
+    """Most columns."""
+    max_numbers = 1 << 20
+    """Most numbers that are looked at."""
+    min_share = 0.05
+    """Smallest share of the variance that shows columns."""
+    noise = 20.0
+    """The same in multiples of columns over rows, which is what chance gives."""
 
 
 def read_raw_points(path: str | Path, columns: int | None = None) -> np.ndarray:
@@ -59,17 +68,17 @@ def _told_columns(numbers: np.ndarray) -> int | None:
     """How many numbers a point has, by the share of the magnitudes' variance (of their ranks) that lies between the
     columns of a table of so many: nothing in a table of the wrong width, in which every column holds all kinds of
     numbers. None if no width stands out, as in small files."""
-    magnitudes = np.abs(numbers[:_LOOKED_AT])
-    magnitudes = magnitudes[: len(magnitudes) // _WIDEST * _WIDEST]
+    magnitudes = np.abs(numbers[:RawPointsTuning.max_numbers])
+    magnitudes = magnitudes[: len(magnitudes) // RawPointsTuning.max_columns * RawPointsTuning.max_columns]
     if not np.isfinite(magnitudes).any():
         return None
     ranks = np.searchsorted(np.sort(magnitudes), magnitudes) / max(1, len(magnitudes))
     spread = ranks.var()
     best, most = None, 0.0
-    for width in range(3, _WIDEST + 1):
+    for width in range(3, RawPointsTuning.max_columns + 1):
         if len(numbers) % width == 0 and spread > 0:
             rows = ranks[: len(ranks) // width * width].reshape(-1, width)
             share = rows.mean(0).var() / spread
-            if share > max(_CLEAR, _NOISE * width / len(rows)) and share > 1.2 * most:
+            if share > max(RawPointsTuning.min_share, RawPointsTuning.noise * width / len(rows)) and share > 1.2 * most:
                 best, most = width, share
     return best

@@ -19,7 +19,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -31,13 +31,28 @@ from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import make_folder, write_bytes
+from ggslam.system.tuning import Tuning
 
 META = "meta.json"
-LARGEST_COUNT = 16380**2
-"""Gaussians that WebP images have pixels for."""
-_LARGEST_ID = 2**24 - 1
-_LEAST_PALETTE, _LARGEST_PALETTE, _ROWS_AN_ENTRY = 4096, 65536, 4
-_PALETTE_COLUMNS = 64
+LARGEST_COUNT: Final = 16380**2
+"""Most Gaussians of a file: WebP images have at most 16383 rows and columns."""
+_LARGEST_ID: Final = 2**24 - 1
+"""Largest object id: a pixel of the image of ids holds 24 bits."""
+
+
+class SogTuning(Tuning):
+    """How large a palette is."""
+
+    min_palette = 4096
+    """Fewest entries, unless there are fewer Gaussians."""
+    max_palette = 65536
+    """Most entries."""
+    rows_per_entry = 4
+    """Gaussians per entry between these limits."""
+
+
+PALETTE_COLUMNS: Final = 64
+"""Palette entries in a row of the image of the palette."""
 _LOSSLESS = [cv2.IMWRITE_WEBP_QUALITY, 101]
 
 
@@ -153,12 +168,12 @@ def _harmonics(images: _Images, higher: np.ndarray) -> dict[str, Any]:
     """Stores the higher spherical harmonics [N, K, 3]; returns their entry of `meta.json`."""
     count, coefficients = higher.shape[:2]
     rows = np.ascontiguousarray(higher.reshape(count, -1))
-    most = max(_LEAST_PALETTE, count // _ROWS_AN_ENTRY)
-    palette, labels = vector_palette(rows, min(_LARGEST_PALETTE, most))
+    most = max(SogTuning.min_palette, count // SogTuning.rows_per_entry)
+    palette, labels = vector_palette(rows, min(SogTuning.max_palette, most))
     table, entries = scalar_codebook(palette.reshape(-1, 3))
-    height = math.ceil(len(palette) / _PALETTE_COLUMNS)
+    height = math.ceil(len(palette) / PALETTE_COLUMNS)
     files = [
-        images.add("shN_centroids.webp", entries, _PALETTE_COLUMNS * coefficients, height),
+        images.add("shN_centroids.webp", entries, PALETTE_COLUMNS * coefficients, height),
         images.add("shN_labels.webp", _bytes_of(labels, 3)),
     ]
     bands = math.isqrt(coefficients + 1) - 1

@@ -20,19 +20,26 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats.compressed_ply_reading import quaternions_of_smallest
 from ggslam.formats.gaussian_usd import USD_ENDINGS
-from ggslam.formats.sog import LARGEST_COUNT, META
+from ggslam.formats.sog import LARGEST_COUNT, META, PALETTE_COLUMNS
 from ggslam.formats.splat_columns import SplatColumns, check_count
 from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
 from ggslam.system.images import claimed_size, decode_image
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, is_plain_name, member, read_untrusted
+from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import FileTuning, is_plain_name, member, read_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, open_zip, read_member
 
 LEVELS = "lod-meta.json"
 """Index of a streamed SOG."""
-_PALETTE_COLUMNS = 64
-_MOST_SPARE = 1 << 20
-"""Pixels that an image may have beyond twice those that are needed."""
+
+
+class SogLimitTuning(Tuning):
+    """A limit on damaged files."""
+
+    max_spare_pixels = 1 << 20
+    """Pixels that an image may have beyond twice those that are needed."""
+
+
 _DAMAGE = (*ZIP_DAMAGE, KeyError, IndexError, TypeError, RecursionError)
 Files = Callable[[str, int], bytes]
 """Gives a file by name, of at most so many bytes."""
@@ -62,7 +69,7 @@ def read_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
 def read_streamed_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
     """The finest level of a streamed SOG, of which `path` is the index; see `read_sog`."""
     try:
-        index = json.loads(read_untrusted(path, MAX_TEXT_BYTES))
+        index = json.loads(read_untrusted(path, FileTuning.max_text_bytes))
         pieces: set[tuple[int, int, int]] = set()
         waiting = [index["tree"]]
         while waiting:
@@ -89,17 +96,17 @@ def read_streamed_sog(path: Path) -> tuple[SplatColumns, dict[int, str] | None]:
 
 
 def _decode(read: Files) -> tuple[SplatColumns, dict[int, str] | None]:
-    meta = json.loads(read(META, MAX_TEXT_BYTES))
+    meta = json.loads(read(META, FileTuning.max_text_bytes))
     if meta.get("version") != 2:
         raise ValueError(f"version {meta.get('version', 1)}, expected 2")
     count = int(meta["count"])
     if not 0 < count <= LARGEST_COUNT:
         raise ValueError(f"it says that it has {count} Gaussians")
     # Positions hardly pack; the other images may be of one colour.
-    check_count(count, 8 * sum(len(read(str(name), MAX_IMAGE_BYTES)) for name in meta["means"]["files"][:2]))
+    check_count(count, 8 * sum(len(read(str(name), FileTuning.max_image_bytes)) for name in meta["means"]["files"][:2]))
 
     def pixels(part: str, number: int = 0, size: int = count) -> np.ndarray:
-        return _pixels(read(str(meta[part]["files"][number]), MAX_IMAGE_BYTES), size)
+        return _pixels(read(str(meta[part]["files"][number]), FileTuning.max_image_bytes), size)
 
     quats = pixels("quats")
     if quats[:, 3].min(initial=255) < 252:
@@ -135,7 +142,7 @@ def _harmonics(meta: Any, table: np.ndarray, pixels: Callable[..., np.ndarray]) 
     coefficients, entries = {1: 3, 2: 8, 3: 15}[int(meta["bands"])], int(meta["count"])
     if not 0 < entries <= 1 << 16:
         raise ValueError(f"a palette of {entries} colours")
-    rows = _PALETTE_COLUMNS * coefficients * math.ceil(entries / _PALETTE_COLUMNS)
+    rows = PALETTE_COLUMNS * coefficients * math.ceil(entries / PALETTE_COLUMNS)
     palette = table[pixels("shN", 0, rows)[: entries * coefficients, :3]].reshape(entries, coefficients, 3)
     labels = pixels("shN", 1)
     return palette[labels[:, 0] | labels[:, 1] << 8]
@@ -153,7 +160,7 @@ def _pixels(data: bytes, count: int) -> np.ndarray:
     size = claimed_size(data)
     if size is None or data[12:16] not in (b"VP8L", b"VP8X"):
         raise ValueError("no WebP image that is lossless")
-    if not count <= size[0] * size[1] <= 2 * count + _MOST_SPARE:
+    if not count <= size[0] * size[1] <= 2 * count + SogLimitTuning.max_spare_pixels:
         raise ValueError(f"an image of {size[0]}x{size[1]} pixels for {count} numbers")
     image = decode_image("WebP", data, cv2.IMREAD_UNCHANGED)
     if image.ndim != 3 or image.dtype != np.uint8:

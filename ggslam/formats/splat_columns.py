@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -14,19 +15,28 @@ from ggslam.errors import FormatError
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.harmonics import harmonic_rotations
 from ggslam.scene.poses import left_multiplication, matrix_to_quaternion
+from ggslam.system.tuning import Tuning
 
 UPRIGHT = np.diag([1.0, -1.0, -1.0])
 """Rotation from x right, y down, z forward to y up, z backwards; its own inverse."""
 
 
-_STRETCH = 1e-3
-MOST_SPARE = 1 << 20
-"""Gaussians that a file of any size may hold; beyond them, as many as it has bytes."""
+MAX_FLOAT_ID: Final = 2**24
+"""Largest object id where ids are stored as float32, which holds whole numbers up to here."""
+
+
+class SplatTuning(Tuning):
+    """Limits on files and poses."""
+
+    max_stretch = 1e-3
+    """Largest deviation of a rotation from an orthogonal matrix."""
+    max_spare = 1 << 20
+    """Gaussians that a file of any size may claim; larger files may claim as many as they have bytes."""
 
 
 def check_count(count: int, held: int) -> None:
     """Raises ValueError if a file of `held` bytes claims, or repeats, more Gaussians than it can hold."""
-    if count > max(MOST_SPARE, held):
+    if count > max(SplatTuning.max_spare, held):
         raise ValueError(f"it claims {count:,} Gaussians, which {held:,} bytes cannot hold")
 
 
@@ -106,7 +116,7 @@ class SplatColumns:
             raise ValueError("Gaussians are mirrored or flattened, which is not read")
         scale = float(np.cbrt(size))
         R = T[:3, :3] / scale
-        if np.abs(R @ R.T - np.eye(3)).max() > _STRETCH:
+        if np.abs(R @ R.T - np.eye(3)).max() > SplatTuning.max_stretch:
             raise ValueError("Gaussians are stretched along one axis, which is not read")
         self.move(R, T[:3, 3], scale)
 

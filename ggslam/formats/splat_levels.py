@@ -15,18 +15,25 @@ from scipy.spatial import cKDTree
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.scene.gaussian_map import SH_C0
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
+from ggslam.system.tuning import Tuning
 
-_NEIGHBOURS = 8
-"""Nearest Gaussians that one may be merged with."""
-_COLOR_WEIGHT = 10.0
-"""Of a squared difference of colours (0 to 1), against one of positions in units of the pair's size."""
-_MATCHINGS = 6
-_SPREAD = 1.6
-"""By this the distance of merged Gaussians counts more in their variance than a sum of both would have it: Gaussians of
-the right variance fall off too fast to leave no gaps to the next. Chosen by `scripts/benchmarks/bench_levels.py`."""
-_MOST_OPAQUE = 0.99
-_LEAST_VARIANCE = 1e-12
-"""Square metres."""
+
+class LevelTuning(Tuning):
+    """How Gaussians are merged to a coarser level."""
+
+    neighbours = 8
+    """Nearest Gaussians that one may be merged with."""
+    color_weight = 10.0
+    """Weight of a squared difference of colours (0 to 1), against one of positions in units of the pair's size."""
+    rounds = 6
+    """Rounds in which pairs are found for a halving."""
+    spread = 1.6
+    """Factor of the distance's share in the merged variance: with 1 gaps would show between Gaussians. Chosen by
+    `scripts/benchmarks/bench_levels.py`."""
+    max_opacity = 0.99
+    """Largest opacity of a merged Gaussian."""
+    min_variance = 1e-12
+    """Smallest variance of a merged Gaussian, in square metres."""
 
 
 def coarser(columns: SplatColumns, count: int) -> SplatColumns:
@@ -51,7 +58,7 @@ def coarser(columns: SplatColumns, count: int) -> SplatColumns:
 def _neighbours(columns: SplatColumns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs of Gaussians near each other, each once, int64 [P] twice, and what it costs to merge them, float64 [P]."""
     count = len(columns)
-    _, near = cKDTree(columns.means).query(columns.means, k=min(_NEIGHBOURS + 1, count))
+    _, near = cKDTree(columns.means).query(columns.means, k=min(LevelTuning.neighbours + 1, count))
     own = np.repeat(np.arange(count), near.shape[1])
     low, high = np.minimum(own, near.reshape(-1)), np.maximum(own, near.reshape(-1))
     keys = np.unique((low * count + high)[low != high])
@@ -60,7 +67,7 @@ def _neighbours(columns: SplatColumns) -> tuple[np.ndarray, np.ndarray, np.ndarr
     weight = -np.expm1(-_optical_depth(columns.logits)) * area
     apart = np.square(columns.means[one].astype(np.float64) - columns.means[other]).sum(1) / (area[one] + area[other])
     color = np.square(SH_C0 * (columns.sh[one, 0].astype(np.float64) - columns.sh[other, 0])).sum(1)
-    cost = weight[one] * weight[other] / (weight[one] + weight[other]) * (apart + _COLOR_WEIGHT * color)
+    cost = weight[one] * weight[other] / (weight[one] + weight[other]) * (apart + LevelTuning.color_weight * color)
     return one, other, cost
 
 
@@ -72,7 +79,7 @@ def _cheapest_pairs(
     order = np.argsort(cost, kind="stable")
     one, other, rank = one[order], other[order], np.arange(len(order))
     free, chosen = np.ones(count, bool), []
-    for _ in range(_MATCHINGS):
+    for _ in range(LevelTuning.rounds):
         still = free[one] & free[other]
         one, other, rank = one[still], other[still], rank[still]
         best = np.full(count, len(order))
@@ -106,10 +113,10 @@ def merge(columns: SplatColumns, groups: np.ndarray) -> SplatColumns:
 
     means = mean(ordered.means.astype(np.float64))
     offsets = ordered.means - means.repeat(sizes, 0)
-    spread = _covariances(ordered) + _SPREAD * offsets[:, :, None] * offsets[:, None, :]
+    spread = _covariances(ordered) + LevelTuning.spread * offsets[:, :, None] * offsets[:, None, :]
     variances, axes = np.linalg.eigh(mean(spread))
-    log_scales = 0.5 * np.log(variances.clip(_LEAST_VARIANCE))
-    opacity = (-np.expm1(-total / _area(log_scales))).clip(1e-6, _MOST_OPAQUE)
+    log_scales = 0.5 * np.log(variances.clip(LevelTuning.min_variance))
+    opacity = (-np.expm1(-total / _area(log_scales))).clip(1e-6, LevelTuning.max_opacity)
     heaviest = np.lexsort([-weight, groups[order]])[starts]
     return SplatColumns(
         means.astype(np.float32), log_scales.astype(np.float32), _quaternions(axes).astype(np.float32),

@@ -10,13 +10,22 @@ import torch
 
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-LARGEST_LOGIT = 13.8
-"""Of an opacity of 0.999999: infinite logits, of what is wholly opaque or transparent, become this or its opposite."""
-THINNER = np.float32(np.log(1000.0))
-"""Logarithm of how many times thinner than wide a flat Gaussian is."""
-_LEAST_LOG_SCALE = np.float32(-20.0)
-_LEAST_NORM = 1e-6
+
+class RepairTuning(Tuning):
+    """What damaged numbers are replaced with."""
+
+    max_logit = 13.8
+    """Logit of an opacity of 0.999999; infinite logits become this or its negative."""
+    thinner = np.float32(np.log(1000.0))
+    """Logarithm of how many times thinner than wide a flat Gaussian becomes."""
+    min_log_scale = np.float32(-20.0)
+    """Smallest log scale of a flat Gaussian."""
+    min_norm = 1e-6
+    """Smallest norm of a quaternion that has a direction."""
+
+
 _POSITION, _SIZE, _TURN = "position is no number", "size is infinite or zero", "quaternion is zero or no number"
 _OPACITY, _COLOR = "opacity is no number", "colour is no number"
 _FLAT, _ENDLESS = "thickness of zero, now a thousandth of the width", "infinite logit of opacity, now +-13.8"
@@ -57,7 +66,7 @@ def mend(columns: SplatColumns, faults: SplatFaults) -> np.ndarray:
     flat &= ~np.isnan(log_scales).any(1)
     reasons = {
         _POSITION: ~np.isfinite(columns.means).all(1), _SIZE: ~np.isfinite(log_scales).all(1) & ~flat,
-        _TURN: ~(np.isfinite(norms) & (norms > _LEAST_NORM)), _OPACITY: np.isnan(columns.logits),
+        _TURN: ~(np.isfinite(norms) & (norms > RepairTuning.min_norm)), _OPACITY: np.isnan(columns.logits),
         _COLOR: ~np.isfinite(columns.sh[:, 0]).all(1),
     }  # fmt: skip
     keep = np.ones(len(columns), bool)
@@ -68,7 +77,7 @@ def mend(columns: SplatColumns, faults: SplatFaults) -> np.ndarray:
     _flatten(columns, flat & keep, faults)
     endless = np.isinf(columns.logits)
     _count(faults.bounded, _ENDLESS, endless & keep)
-    columns.logits[endless] = np.sign(columns.logits[endless]) * LARGEST_LOGIT
+    columns.logits[endless] = np.sign(columns.logits[endless]) * RepairTuning.max_logit
     strange = ~np.isfinite(columns.sh).all((1, 2))
     _count(faults.bounded, _STRANGE, strange & keep)
     columns.sh[~np.isfinite(columns.sh)] = 0
@@ -79,7 +88,9 @@ def _flatten(columns: SplatColumns, flat: np.ndarray, faults: SplatFaults) -> No
     _count(faults.bounded, _FLAT, flat)
     sizes = columns.log_scales[flat]
     widest = np.where(np.isneginf(sizes), -np.inf, sizes).max(1, initial=-np.inf)
-    columns.log_scales[flat] = np.maximum(sizes, np.maximum(widest - THINNER, _LEAST_LOG_SCALE)[:, None])
+    columns.log_scales[flat] = np.maximum(
+        sizes, np.maximum(widest - RepairTuning.thinner, RepairTuning.min_log_scale)[:, None]
+    )
 
 
 def _count(counter: Counter[str], name: str, rows: np.ndarray) -> None:
@@ -98,7 +109,7 @@ def map_of_columns(columns: SplatColumns, features: np.ndarray | None = None) ->
     out = GaussianMap(degree, 0 if features is None else features.shape[1], with_moments=False)
     growth, out.growth = out.growth, 0.0
     unit = columns.quaternions.astype(np.float64)
-    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), _LEAST_NORM)
+    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), RepairTuning.min_norm)
     as_tensor = torch.from_numpy
     out.insert(
         as_tensor(np.ascontiguousarray(columns.means)), as_tensor(unit.astype(np.float32)),
@@ -112,11 +123,11 @@ def map_of_columns(columns: SplatColumns, features: np.ndarray | None = None) ->
 
 
 def logits_of(opacities: np.ndarray) -> np.ndarray:
-    """Logits float32 of opacities; of 0 and less, and of 1 and more, those of `LARGEST_LOGIT`; NaN of NaN."""
+    """Logits float32 of opacities; of 0 and less, and of 1 and more, those of `RepairTuning.max_logit`; NaN of NaN."""
     with np.errstate(divide="ignore", invalid="ignore"):
         values = np.clip(np.asarray(opacities, np.float64), 0.0, 1.0)
         logits = np.log(values) - np.log1p(-values)
-    return np.clip(logits, -LARGEST_LOGIT, LARGEST_LOGIT).astype(np.float32)
+    return np.clip(logits, -RepairTuning.max_logit, RepairTuning.max_logit).astype(np.float32)
 
 
 def logarithms_of(sizes: np.ndarray) -> np.ndarray:

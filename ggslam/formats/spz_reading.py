@@ -12,6 +12,7 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -21,13 +22,23 @@ from ggslam.formats.optional_package import package_for
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted
 
 MAGIC = b"NGSP"
-_HEADER = 16
-_COLOR_SCALE = 0.15
-_MAX_EXPANDED, _MAX_RATIO = 64 << 20, 64
-"""What a file may expand to whatever its size; beyond it at most so many times that size."""
+_HEADER: Final = 16
+"""Bytes of SPZ's header."""
+_COLOR_SCALE: Final = 0.15
+"""SPZ's factor of colours before they are rounded to bytes."""
+
+
+class SpzTuning(Tuning):
+    """Limits on damaged files."""
+
+    max_expanded_bytes = 64 << 20
+    """Bytes that a file of any size may expand to."""
+    max_ratio = 64
+    """Largest expansion of larger files."""
 
 
 def read_spz(path: Path) -> SplatColumns:
@@ -112,7 +123,7 @@ def _checked_widths(version: int, count: int, degree: int, held: int) -> list[in
     if degree > 3:
         raise ValueError(f"harmonics of degree {degree}, expected 0 to 3")
     widths = _widths(version, degree)
-    if count * sum(widths) > max(_MAX_EXPANDED, _MAX_RATIO * held):
+    if count * sum(widths) > max(SpzTuning.max_expanded_bytes, SpzTuning.max_ratio * held):
         raise ValueError(f"it claims {count} Gaussians, which {held:,} bytes cannot hold")
     return widths
 

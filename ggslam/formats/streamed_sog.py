@@ -26,16 +26,29 @@ from ggslam.formats.splat_levels import coarser
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.atomic import make_empty_folder, write_text
+from ggslam.system.plurals import counted
+from ggslam.system.tuning import Tuning
 
 INDEX = "lod-meta.json"
-LEVEL_RATIO = 4
-"""How many Gaussians of a level one of the next stands for."""
-COARSEST, MOST_LEVELS = 4096, 8
-"""Levels are added until one has so few Gaussians."""
-LEAF, LEAF_EXTENT, LEAF_LEAST = 1 << 15, 4.0, 1 << 11
-"""A leaf holds at most so many Gaussians, and is at most so many metres wide unless it holds fewer than the last."""
-CHUNK = 1 << 18
-"""Gaussians of a SOG, about."""
+
+
+class StreamedSogTuning(Tuning):
+    """How a map is cut into levels and chunks."""
+
+    level_ratio = 4
+    """Gaussians of a level that one of the next level stands for."""
+    coarsest = 4096
+    """Gaussians of the coarsest level: levels are added until one has so few."""
+    max_levels = 8
+    """Most levels."""
+    leaf = 1 << 15
+    """Most Gaussians of a leaf."""
+    leaf_extent_m = 4.0
+    """Longest side of a leaf, in metres."""
+    leaf_min = 1 << 11
+    """Gaussians up to which a leaf may be longer."""
+    chunk = 1 << 18
+    """Gaussians of a SOG folder, about."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +79,10 @@ def write_streamed_sog(
         RunFolderError: a file cannot be written.
     """
     folder = Path(folder)
-    levels = 1 + min(MOST_LEVELS - 1, max(0, math.ceil(math.log(max(count, 1) / COARSEST, LEVEL_RATIO))))
+    levels = 1 + min(
+        StreamedSogTuning.max_levels - 1,
+        max(0, math.ceil(math.log(max(count, 1) / StreamedSogTuning.coarsest, StreamedSogTuning.level_ratio))),
+    )
     writer = _Writer(folder, levels, objects, done)
     tree = writer.tree_of_parts(list(parts))
     if tree is None:
@@ -139,11 +155,13 @@ class _Writer:
 
     def _tree(self, columns: SplatColumns) -> dict[str, Any]:
         extent = float(np.ptp(columns.means, axis=0).max())
-        if len(columns) > LEAF or (extent > LEAF_EXTENT and len(columns) > LEAF_LEAST):
+        if len(columns) > StreamedSogTuning.leaf or (
+            extent > StreamedSogTuning.leaf_extent_m and len(columns) > StreamedSogTuning.leaf_min
+        ):
             return _above([self._tree(columns.take(half)) for half in _halves(columns.means)])
         lods, bounds, whole = {}, [], len(columns)
         for number in range(len(self.levels)):
-            columns = coarser(columns, math.ceil(whole / LEVEL_RATIO**number))
+            columns = coarser(columns, math.ceil(whole / StreamedSogTuning.level_ratio**number))
             lods[str(number)] = self._put(number, columns)
             bounds.append(_box_of(columns))
         return {"bound": _union(bounds), "lods": lods}
@@ -157,7 +175,7 @@ class _Writer:
         place = {"file": level.file, "offset": level.rows, "count": len(columns)}
         level.gathered.append(columns.take(morton_order(columns.means)))
         level.rows += len(columns)
-        if level.rows >= CHUNK:
+        if level.rows >= StreamedSogTuning.chunk:
             self._write(level)
         return place
 
@@ -220,8 +238,7 @@ def _write(path: Path, splats: Splats) -> str:
         folder, cells, splats.count, splats.names, lambda done: splats.done(done, len(cells))
     )  # fmt: skip
     levels = " + ".join(map(str, size.counts))
-    files = f"{size.chunks} SOG{'s' * (size.chunks != 1)}"
-    return f"wrote {folder / INDEX}: {levels} Gaussians in {files}, {size.bytes / 1e6:.1f} MB"
+    return f"wrote {folder / INDEX}: {levels} Gaussians in {counted(size.chunks, 'SOG')}, {size.bytes / 1e6:.1f} MB"
 
 
 WRITER = Writer(

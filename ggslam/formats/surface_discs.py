@@ -10,13 +10,18 @@ import numpy as np
 
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.system.tuning import Tuning
 
-_SECTION = 0.5
-"""Metres along the map that are sampled together where memory is scarce."""
-_SPACING = 0.7
-"""Distance of samples in voxels; below 1/sqrt(2) a lattice turned in its plane still meets every voxel of the plane."""
-_MOST_STEPS = 40
-"""Most samples from the centre outwards along one axis; larger Gaussians are sampled more thinly."""
+
+class DiscTuning(Tuning):
+    """How Gaussians are sampled."""
+
+    section_m = 0.5
+    """Length along the map that is sampled together where memory is scarce, in metres."""
+    spacing = 0.7
+    """Distance of samples, in voxels; below 1/sqrt(2) a lattice turned in its plane meets every voxel of it."""
+    max_steps = 40
+    """Most samples from the centre outwards along an axis; larger Gaussians are sampled more thinly."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ class SurfaceDiscs:
 
     def steps(self, voxel_size: float) -> tuple[np.ndarray, np.ndarray]:
         """Of each, how many samples go outwards along either axis, int64 [N, 2], and how far apart, metres [N, 2]."""
-        step = np.maximum(_SPACING * voxel_size, self.reach / _MOST_STEPS)
+        step = np.maximum(DiscTuning.spacing * voxel_size, self.reach / DiscTuning.max_steps)
         return np.floor(self.reach / step).astype(np.int64), step
 
     def counts(self, voxel_size: float) -> np.ndarray:
@@ -58,7 +63,7 @@ class SurfaceDiscs:
 
     def cut(self, axis: int) -> list[SurfaceDiscs]:
         """Their sections along an axis of the world, in its direction; at least one, perhaps empty."""
-        section = np.floor(self.means[:, axis] / _SECTION)
+        section = np.floor(self.means[:, axis] / DiscTuning.section_m)
         cut = []
         for chosen in (section == number for number in np.unique(section)):
             arrays = (self.used, self.opacity, self.means, self.scales, self.axes, self.reach)

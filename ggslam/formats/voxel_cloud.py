@@ -5,13 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-BITS = 21
-"""Bits per axis of the packed voxel number."""
-_INSIDE = 0.499
-"""Voxels: a point is no farther from the middle of its voxel along an axis, so that rounding finds the voxel again."""
+from ggslam.system.tuning import Tuning
+
+BITS: Final = 21
+"""Bits per axis of a packed voxel number: three axes fit 63 bits."""
+
+
+class VoxelCloudTuning(Tuning):
+    """Where points lie in their voxels."""
+
+    max_offset = 0.499
+    """Largest distance of a point from its voxel's centre along an axis, in voxels: rounding finds the voxel again."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +153,8 @@ def cloud_of_sums(
     lattice, offsets = unpack(key[starts[kept]]), None
     if sums.position is not None:
         position = (np.add.reduceat(sums.position[order], starts) / weight[:, None])[kept]
-        offsets = (position / voxel_size - lattice).clip(-_INSIDE, _INSIDE).astype(np.float32)
+        most = VoxelCloudTuning.max_offset
+        offsets = (position / voxel_size - lattice).clip(-most, most).astype(np.float32)
     corner = lattice.min(0)
     return VoxelCloud(
         grid=(lattice - corner).astype(np.int32),

@@ -24,6 +24,7 @@ from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.system.plurals import counted
 
 
 class Takes(Enum):
@@ -74,8 +75,8 @@ class Splats:
     def text(self, path: Path, with_ids: bool = False, size: int | None = None) -> str:
         """What was written into a file, for people; `size` is in bytes, None: the file's."""
         size = path.stat().st_size if size is None else size
-        ids = "" if self.names is None or not with_ids else f" with the ids of {_objects(len(self.names))}"
-        return f"wrote {path}: {self.count} Gaussians{self.note}{ids}, {size / 1e6:.1f} MB"
+        ids = "" if self.names is None or not with_ids else f" with the ids of {counted(len(self.names), 'object')}"
+        return f"wrote {path}: {counted(self.count, 'Gaussian')}{self.note}{ids}, {size / 1e6:.1f} MB"
 
 
 @dataclass(frozen=True)
@@ -94,8 +95,8 @@ class SurfaceMesh:
 
     def text(self, path: Path) -> str:
         """What was written into a file, for people."""
-        size = f"{len(self.vertices)} vertices, {len(self.triangles)} triangles"
-        return f"wrote {path}: {size}, {self.objects} objects, from {self.origin}"
+        size = f"{counted(len(self.vertices), 'vertex', 'vertices')}, {counted(len(self.triangles), 'triangle')}"
+        return f"wrote {path}: {size}, {counted(self.objects, 'object')}, from {self.origin}"
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ class PosedViews:
         """What was written, for people."""
         held_out = sum(view.held_out for view in views)
         sizes = dict.fromkeys(f"{view.camera.width}x{view.camera.height}" for view in views)
-        return f"{len(views)} images of {', '.join(sizes)} ({held_out} held out)"
+        return f"{counted(len(views), 'image')} of {', '.join(sizes)} ({held_out} held out)"
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,3 @@ class Writer:
             raise FormatError(f"{path}: a file of the format {self.name} ends in {suffixes}{other}")
         if self.check is not None:
             self.check(path)
-
-
-def _objects(count: int) -> str:
-    return f"{count} object{'s' * (count != 1)}"

@@ -15,9 +15,14 @@ from scipy.spatial import cKDTree
 
 from ggslam.errors import InputError
 from ggslam.scene.poses import transform_points
+from ggslam.system.tuning import Tuning
 
-MOST_QUERIES = 500_000
-"""Of larger clouds a random sample of this many points is looked up, always among all points of the other."""
+
+class CloudTuning(Tuning):
+    """Comparison of point clouds."""
+
+    max_queries = 500_000
+    """Most points of a cloud that are looked up in another. Of a larger cloud, a random sample is."""
 
 
 class Cloud:
@@ -54,7 +59,7 @@ class Cloud:
 
     def queries(self, seed: int) -> np.ndarray:
         """Row numbers of the points that are looked up in another cloud."""
-        return self.sample(MOST_QUERIES, seed)
+        return self.sample(CloudTuning.max_queries, seed)
 
 
 Points = np.ndarray | Cloud
@@ -82,7 +87,7 @@ def overlap(
         source, target: [N, 3] and [M, 3] metres.
         max_distance: metres up to which points are partners.
         T_target_source: [4, 4]; None: both are in one frame.
-        seed: of the sample of a source of more than `MOST_QUERIES` points.
+        seed: of the sample of a source of more than `CloudTuning.max_queries` points.
 
     Raises:
         InputError: a cloud is empty or not finite, or the distance is not positive.

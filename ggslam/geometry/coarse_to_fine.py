@@ -21,25 +21,33 @@ from ggslam.geometry.normals import estimate_normals
 from ggslam.geometry.surface_distances import LazyNormals, surface_distances
 from ggslam.geometry.thinning import thinned_points
 from ggslam.scene.poses import separation, transform_points
+from ggslam.system.tuning import Tuning
 
-FINE_STEPS = (0.25, 0.10)
-"""Metres: distances of the pairs of dense clouds before the last."""
-COARSE_STEPS = (2.0, 1.0, 0.5)
-"""Metres, of pairs of the thinned clouds."""
-_COARSE_VOXEL = 0.25
-"""Metres, of the thinned clouds."""
-_FINEST = 0.05
-"""Metres: the last pairs of dense clouds are no farther apart, however far partners may be that count as overlap: many
-pairs that are nearly right would outweigh those that are."""
-_SPARSE, _ACROSS = 1.5, 2.0
-"""A cloud is sparse where the fourth nearest point is this many voxels away after thinning; pairs then may be so many
-times as far apart as that."""
-_THICKNESS, _WIDTH = 0.1, 0.05
-"""Of what counts as a plane in a sparse cloud, see `estimate_normals`."""
-_KERNELS = (0.8, 0.4, 0.2)
-"""Sizes of the robust kernel of sparse clouds, in voxels of their normals, one after the other."""
-_SAME = 0.2
-"""Share of the last distance by which two results may differ and still be one."""
+
+class CoarseToFineTuning(Tuning):
+    """Steps of a registration that starts a metre off."""
+
+    fine_m = (0.25, 0.10)
+    """Largest distances of pairs of dense clouds, in metres, before the last step."""
+    coarse_m = (2.0, 1.0, 0.5)
+    """Largest distances of pairs of thinned clouds, in metres."""
+    coarse_voxel_m = 0.25
+    """Voxel of the thinned clouds, in metres."""
+    max_last_m = 0.05
+    """Largest distance of the last pairs, in metres, whatever the overlap distance is: many loose pairs outweigh good
+    ones."""
+    sparse_voxels = 1.5
+    """Distance of the fourth nearest point, in voxels, from which a cloud counts as sparse."""
+    sparse_distance = 2.0
+    """Largest distance of pairs of sparse clouds, in multiples of that distance."""
+    plane_thickness = 0.1
+    """Largest thickness of a plane in a sparse cloud, see `estimate_normals`."""
+    plane_width = 0.05
+    """Smallest width of a plane in a sparse cloud, see `estimate_normals`."""
+    kernels = (0.8, 0.4, 0.2)
+    """Sizes of the robust kernel of sparse clouds, in voxels of their normals, one pass each."""
+    same_share = 0.2
+    """Largest difference of two results that are the same, as a share of the last pair distance."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +70,12 @@ class TargetSurface:
     def of(target: Points, max_distance: float) -> TargetSurface:
         """How a cloud is to be taken, if points `max_distance` metres apart are partners. Raises InputError if it is
         empty or not finite, or the distance is not positive."""
-        cloud, distance = as_cloud(target), min(_FINEST, check_distance(max_distance))
+        cloud, distance = as_cloud(target), min(CoarseToFineTuning.max_last_m, check_distance(max_distance))
         spacing = point_spacing(cloud, distance)
-        if spacing <= _SPARSE * distance:
+        if spacing <= CoarseToFineTuning.sparse_voxels * distance:
             return TargetSurface(cloud, LazyNormals(cloud), distance, None)
-        apart = _ACROSS * spacing
-        voxel = max(_COARSE_VOXEL, apart)
+        apart = CoarseToFineTuning.sparse_distance * spacing
+        voxel = max(CoarseToFineTuning.coarse_voxel_m, apart)
         return TargetSurface(cloud, LazyNormals(cloud, _sparse_normals(cloud, voxel)), apart, voxel)
 
 
@@ -96,7 +104,7 @@ def register_coarse_to_fine(
     except InputError as error:
         problem = error
     coarse = _coarse(source, surface.cloud, start, max_distance, seed)
-    same = _SAME * surface.pair_distance
+    same = CoarseToFineTuning.same_share * surface.pair_distance
     if coarse is not None and not (found and _far_apart(source, coarse, found[0].T_target_source) <= same):
         try:
             found.append(_fine(source, surface, coarse, seed))
@@ -107,7 +115,7 @@ def register_coarse_to_fine(
         raise problem
 
     def error_of(one: CloudRegistration) -> float:
-        T, cut = one.T_target_source, FINE_STEPS[0]
+        T, cut = one.T_target_source, CoarseToFineTuning.fine_m[0]
         off = surface_distances(source, surface.cloud, surface.pair_distance, cut, T, seed, surface.normals)
         return float((np.minimum(off, cut) ** 2).mean())
 
@@ -129,26 +137,28 @@ def _sparse_normals(cloud: Cloud, voxel: float) -> np.ndarray:
     plane."""
     thinned = thinned_points(cloud.points, voxel)
     tree = cKDTree(thinned)
-    normals = estimate_normals(thinned, tree=tree, thickness=_THICKNESS, width=_WIDTH)
+    normals = estimate_normals(
+        thinned, tree=tree, thickness=CoarseToFineTuning.plane_thickness, width=CoarseToFineTuning.plane_width
+    )
     return normals[tree.query(cloud.points, workers=-1)[1]]
 
 
 def _fine(source: Cloud, surface: TargetSurface, start: np.ndarray, seed: int) -> CloudRegistration:
     """ICP of all points."""
     if surface.voxel is None:
-        steps = [*(max(surface.pair_distance, step) for step in FINE_STEPS), surface.pair_distance]
+        steps = [*(max(surface.pair_distance, step) for step in CoarseToFineTuning.fine_m), surface.pair_distance]
         return register(source, surface.cloud, None, steps, start, seed=seed)
     thinned = Cloud(thinned_points(source.points, 0.4 * surface.voxel))
     normals = surface.normals.of(np.arange(len(surface.cloud)))
-    reach, sizes = 2 * surface.voxel, [size * surface.voxel for size in _KERNELS]
+    reach, sizes = 2 * surface.voxel, [size * surface.voxel for size in CoarseToFineTuning.kernels]
     return register(thinned, surface.cloud, normals, [reach] * len(sizes), start, seed=seed, kernels=sizes)
 
 
 def _coarse(source: Cloud, target: Cloud, start: np.ndarray, farthest: float, seed: int) -> np.ndarray | None:
     """T_target_source by the thinned clouds, pairs being `farthest` metres apart at first if that is more than usual;
     None if nothing holds them."""
-    steps = [farthest] * (farthest > COARSE_STEPS[0]) + list(COARSE_STEPS)
-    one, other = (thinned_points(cloud.points, _COARSE_VOXEL) for cloud in (source, target))
+    steps = [farthest] * (farthest > CoarseToFineTuning.coarse_m[0]) + list(CoarseToFineTuning.coarse_m)
+    one, other = (thinned_points(cloud.points, CoarseToFineTuning.coarse_voxel_m) for cloud in (source, target))
     try:
         return register(one, other, None, steps, start, sample=20_000, seed=seed).T_target_source
     except InputError:

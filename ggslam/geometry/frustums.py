@@ -10,11 +10,16 @@ from itertools import pairwise
 import numpy as np
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-_AT_ONCE = 1 << 18
-"""Pairs of a camera and a box that are tested at a time: with few, the test itself takes little memory."""
-_TILES_AT_ONCE = 1 << 13
-"""As many pairs of a tile and a box."""
+
+class FrustumTuning(Tuning):
+    """Test of boxes against views."""
+
+    pairs_at_once = 1 << 18
+    """Pairs of a camera and a box tested in one batch."""
+    tile_pairs_at_once = 1 << 13
+    """Pairs of a tile and a box tested in one batch."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class Frustums:
         """
         middle, half = (low + high) / 2, (high - low) / 2
         seen = np.ones((len(self.normals), len(low)), bool)
-        step = max(1, _AT_ONCE // max(1, len(low)))
+        step = max(1, FrustumTuning.pairs_at_once // max(1, len(low)))
         for begin in range(0, len(seen), step):
             part = slice(begin, begin + step)
             for plane in range(6):
@@ -67,7 +72,7 @@ class Frustums:
     ) -> None:
         """Of the boxes that whole views reach those stay in `seen` that one of their tiles does."""
         cameras, boxes = np.nonzero(seen)
-        step = max(1, _TILES_AT_ONCE // tiles[0].shape[1])
+        step = max(1, FrustumTuning.tile_pairs_at_once // tiles[0].shape[1])
         for begin in range(0, len(cameras), step):
             k, m = cameras[begin : begin + step], boxes[begin : begin + step]
             normals = tiles[0][k]

@@ -17,11 +17,16 @@ from ggslam.errors import InputError
 from ggslam.geometry.clouds import Cloud, Overlap, Points, as_cloud, check_distance, overlap
 from ggslam.geometry.surface_distances import LazyNormals
 from ggslam.scene.poses import orthonormalize, se3_exp, transform_points, translation, turning_angle
+from ggslam.system.tuning import Tuning
 
-FEWEST_MATCHES = 10
-"""Fewer pairs of points than this leave a pose open."""
-SMALL_STEP = 3e-5
-"""Metres and radians: ICP ends at a smaller step."""
+
+class IcpTuning(Tuning):
+    """Point-to-plane ICP."""
+
+    min_pairs = 10
+    """Fewest pairs of points that determine a pose."""
+    min_step = 3e-5
+    """Step, in metres and radians, below which ICP ends."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ def register(
             step = _step(transform_points(chosen, T), target, normals, distance, size, centre)
             T = orthonormalize(translation(centre) @ se3_exp(step) @ translation(-centre) @ T)
             made += 1
-            if np.abs(step).max() < SMALL_STEP:
+            if np.abs(step).max() < IcpTuning.min_step:
                 converged = True
                 break
     middle = source.points.mean(0, keepdims=True)
@@ -101,8 +106,8 @@ def _step(
     distances. About an origin far away, turning and moving could not be told apart."""
     apart, nearest = target.tree.query(moved, distance_upper_bound=distance, workers=-1)
     pairs = np.isfinite(apart)
-    if pairs.sum() < FEWEST_MATCHES:
-        raise InputError(f"expected at least {FEWEST_MATCHES} points within {distance} m of the target, found "
+    if pairs.sum() < IcpTuning.min_pairs:
+        raise InputError(f"expected at least {IcpTuning.min_pairs} points within {distance} m of the target, found "
                          f"{int(pairs.sum())} of {len(moved)}")  # fmt: skip
     p, q, n = moved[pairs], target.points[nearest[pairs]], normals.of(nearest[pairs])
     J = np.concatenate([n, np.cross(p - centre, n)], 1)

@@ -11,14 +11,22 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 16
-"""Points from which a normal is estimated, the point itself included."""
-_CHUNK = 1 << 17
+from ggslam.system.tuning import Tuning
+
+
+class NormalTuning(Tuning):
+    """Estimation of normals."""
+
+    neighbours = 16
+    """Points that a normal is estimated from, with the point itself."""
+    chunk = 1 << 17
+    """Points whose normals are estimated in one batch."""
 
 
 def estimate_normals(
-    points: np.ndarray, rows: np.ndarray | None = None, neighbours: int = NEIGHBOURS, tree: cKDTree | None = None,
-    workers: int = -1, beside: np.ndarray | None = None, thickness: float | None = None, width: float | None = None,
+    points: np.ndarray, rows: np.ndarray | None = None, neighbours: int = NormalTuning.neighbours,
+    tree: cKDTree | None = None, workers: int = -1, beside: np.ndarray | None = None, thickness: float | None = None,
+    width: float | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Unit normals float64 [n, 3] of points [N, 3], the direction of least variance among each point's nearest
     neighbours; their sign is arbitrary.
@@ -40,8 +48,8 @@ def estimate_normals(
     tree = cKDTree(places) if tree is None else tree
     rows, count = np.arange(len(points)) if rows is None else rows, min(neighbours, len(points))
     normals = np.empty((len(rows), 3))
-    for start in range(0, len(rows), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(rows), NormalTuning.chunk):
+        part = slice(start, start + NormalTuning.chunk)
         near = points[tree.query(places[rows[part]], count, workers=workers)[1].reshape(-1, count)]
         offsets = near - near.mean(1, keepdims=True)
         variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))

@@ -11,14 +11,22 @@ import math
 
 import numpy as np
 
-NEAR_M, FAR_M = 1.0, 4.0
-"""Median depths between which a scene is of the usual size."""
-LARGEST_ROOM = 1.5
-"""Scale up to which surfaces are fused as in a room: a median depth of 6 m."""
-_REACH_M = 10.0
-"""Depth that is fused into points with voxels of 1 cm, for each centimetre of their voxels..."""
-_LEAST_REACH_M = 30.0
-"""...and in rooms, where some views go through a door and along a corridor."""
+from ggslam.system.tuning import Tuning
+
+
+class SceneSizeTuning(Tuning):
+    """Usual sizes of scenes."""
+
+    near_m = 1.0
+    """Smallest median depth of a scene of usual size, in metres."""
+    far_m = 4.0
+    """Largest median depth of a scene of usual size, in metres."""
+    max_room_scale = 1.5
+    """Largest scale at which surfaces are fused as in a room: a median depth of 6 m."""
+    reach_m = 10.0
+    """Depth that is fused with voxels of 1 cm, in metres. It grows with the voxels..."""
+    min_reach_m = 30.0
+    """...from this much, in metres, for views through doors and along corridors."""
 
 
 def scene_scale(depth: np.ndarray) -> float:
@@ -32,17 +40,17 @@ def scene_scale(depth: np.ndarray) -> float:
 
 
 def scale_of_depth(median: float) -> float:
-    """1 for a median depth from `NEAR_M` to `FAR_M` metres, else the median over the nearer of these."""
-    return median / min(max(median, NEAR_M), FAR_M)
+    """Median depth over the nearest usual one (`near_m` to `far_m` of `SceneSizeTuning`), so 1 for usual scenes."""
+    return median / min(max(median, SceneSizeTuning.near_m), SceneSizeTuning.far_m)
 
 
 def voxel_times(scale: float) -> int:
     """How many times a room's voxels those of a surface are in a scene of this scale: a whole number, so that grids of
-    several runs fit each other; 1 up to `LARGEST_ROOM`."""
-    return 1 if scale <= LARGEST_ROOM else math.ceil(scale)
+    several runs fit each other; 1 up to `SceneSizeTuning.max_room_scale`."""
+    return 1 if scale <= SceneSizeTuning.max_room_scale else math.ceil(scale)
 
 
 def surface_reach(times: float) -> float:
     """Metres up to which depth is fused into points whose voxels are so many times a room's. What is farther away shows
     itself in pixels many voxels apart, and takes more memory than all that is nearer."""
-    return max(_LEAST_REACH_M, _REACH_M * times)
+    return max(SceneSizeTuning.min_reach_m, SceneSizeTuning.reach_m * times)

@@ -11,14 +11,20 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-_STRONG = 0.2
-"""Share by which inverse depth changes across an outline that tells how sharp outlines are."""
-_LEAST_STEP = 0.04
-"""Share by which inverse depth changes across a slope that counts."""
-_BETWEEN = 0.15
-"""On a slope inverse depth lies off both of its ends, by this share of the change."""
-_BEYOND = 0.3
-"""Beyond both ends it changes by less than this share; on a plane it would be a half."""
+from ggslam.system.tuning import Tuning
+
+
+class SoftEdgeTuning(Tuning):
+    """Depth between two surfaces."""
+
+    min_outline_change = 0.2
+    """Smallest relative change of inverse depth across an outline that tells how sharp outlines are."""
+    min_slope_change = 0.04
+    """Smallest relative change of inverse depth across a slope."""
+    min_distance = 0.15
+    """Smallest distance of a slope's inverse depth from either end, as a share of the change."""
+    max_change_beyond = 0.3
+    """Largest change of inverse depth beyond either end, as a share of the change. On a plane it is a half."""
 
 
 def soft_edges(depth: np.ndarray, reach: int) -> np.ndarray:
@@ -54,7 +60,9 @@ def _sharpness(inverse: np.ndarray, reach: int) -> np.ndarray:
         return np.zeros(0, np.float32)
     inside = slice(reach, len(inverse) - reach)
     change = np.abs(inverse[2 * reach :] - inverse[: -2 * reach])
-    strong = (change > _STRONG * inverse[inside]) & (minimum_filter1d(inverse, 2 * reach + 1, 0)[inside] > 0)
+    strong = (change > SoftEdgeTuning.min_outline_change * inverse[inside]) & (
+        minimum_filter1d(inverse, 2 * reach + 1, 0)[inside] > 0
+    )
     steps = np.abs(np.diff(inverse, axis=0, append=inverse[-1:]))  # from each row to the next
     largest = maximum_filter1d(steps, 2 * reach, 0)[inside]
     return (largest[strong] / change[strong]).clip(0, 1)
@@ -68,8 +76,10 @@ def _slopes(inverse: np.ndarray, reach: int) -> np.ndarray:
         padded[far + k : far + k + len(inverse)] for k in (-far, -reach, 0, reach, far)
     )
     step = np.abs(after - before)
-    between = np.minimum(np.abs(here - before), np.abs(here - after)) > _BETWEEN * step
+    between = np.minimum(np.abs(here - before), np.abs(here - after)) > SoftEdgeTuning.min_distance * step
     inside = (here - before) * (after - here) > 0
-    beyond = np.maximum(np.abs(before - before_far), np.abs(after - after_far)) < _BEYOND * step
+    beyond = (
+        np.maximum(np.abs(before - before_far), np.abs(after - after_far)) < SoftEdgeTuning.max_change_beyond * step
+    )
     seen = np.minimum(np.minimum(before_far, before), np.minimum(after, after_far)) > 0
-    return seen & inside & between & beyond & (step > _LEAST_STEP * here)
+    return seen & inside & between & beyond & (step > SoftEdgeTuning.min_slope_change * here)

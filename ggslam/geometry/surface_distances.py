@@ -14,8 +14,14 @@ from ggslam.geometry.clouds import Cloud, Points, as_cloud
 from ggslam.geometry.normals import estimate_normals
 from ggslam.geometry.thinning import thinned_rows
 from ggslam.scene.poses import transform_points
+from ggslam.system.tuning import Tuning
 
-_SAMPLE = 20_000
+
+class SurfaceDistanceTuning(Tuning):
+    """Measurement of distances to a surface."""
+
+    sample = 20_000
+    """Most points that the spacing of a cloud is measured on."""
 
 
 class LazyNormals:
@@ -59,7 +65,7 @@ def surface_distances(
     """
     source, target = as_cloud(source), as_cloud(target)
     points = source.points[thinned_rows(source.points, voxel)]
-    points = points[Cloud(points).sample(_SAMPLE, seed)]
+    points = points[Cloud(points).sample(SurfaceDistanceTuning.sample, seed)]
     moved = points if T_target_source is None else transform_points(points, T_target_source)
     apart, nearest = target.tree.query(moved, workers=-1)
     near = apart <= reach

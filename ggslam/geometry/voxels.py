@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
-_BITS, _OFFSET = 21, 1 << 20
+_BITS: Final = 21
+"""Bits of a voxel coordinate in a key of 64 bits."""
+_OFFSET: Final = 1 << 20
+"""Added to voxel coordinates to make them positive."""
 
 
 def voxel_keys(points: np.ndarray, voxel: float) -> np.ndarray:

@@ -17,9 +17,14 @@ from scipy.spatial import cKDTree
 
 from ggslam.submaps.cell_keys import CellKey, Grid
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.tuning import Tuning
 
-_BEYOND = 1.01
-"""A cell's points lie this many times farther from its centre than its corners if a sensor recorded it."""
+
+class CoverageTuning(Tuning):
+    """What a map in memory can contain."""
+
+    min_beyond = 1.01
+    """Distance of a cell's points from its centre, relative to its corners', from which a sensor recorded the cell."""
 
 
 class Coverage(Protocol):
@@ -118,7 +123,7 @@ def coverage_of(
     """
     grid = Grid(settings.spacing, settings.axes)
     corner = settings.spacing / 2 * np.sqrt(grid.spans.sum())
-    recorded = [key for key, reach in reaches.items() if reach > _BEYOND * corner]
+    recorded = [key for key, reach in reaches.items() if reach > CoverageTuning.min_beyond * corner]
     cut = [key for key in reaches if key not in set(recorded)]
     if not recorded:
         return _cut(cut, grid, settings, position)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ggslam.localization.surface import Surface
 from ggslam.scene.poses import inverse
 from ggslam.tracking.gicp import GicpTarget
 
-ANY_NORMAL = -2.0
+ANY_NORMAL: Final = -2.0
 """A cosine that any two normals exceed."""
 
 Item = TypeVar("Item", contravariant=True)

@@ -21,30 +21,45 @@ from ggslam.localization.near import Near
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import load_points
 from ggslam.submaps.settings import GridAxes
+from ggslam.system.tuning import Tuning
 
-_THINNED = 0.25
-"""Edge in metres of the cubes of which one point each is held."""
-_SLICES = 3
-"""Cubes above one another, of a column, that make something that stands upright."""
-_FINEST, _COARSEST = 0.25, 1.0
-_ACROSS = 60
-"""Pixels that the scan's reach has."""
-_REACH_PERCENTILE = 90
-"""Of what stands in the scan, seen from above, so much is used, the nearest."""
-_LARGEST = 3000
-"""Pixels along a side of the map's picture at most; of larger maps they are coarser."""
-_TURNS = 120
-_THROUGH = 0.3
-"""What a pixel counts that the scan looks through, to one that fits."""
-_SECTORS = 360
-_HEADROOM, _LEVEL = 0.3, 1.0
-"""Metres of free space above a sensor; floors nearer to each other in height are one."""
-_FLOORS = 3
-_COLUMN = 0.5
-_BESIDE = 10.0
-"""Metres beside all that a map holds within which a sensor may stand."""
-_AROUND = (0.75, 3.0, 8.0)
-"""Metres within which floors are looked for: a scanner sees none below itself."""
+
+class MapPictureTuning(Tuning):
+    """Search for a scan in the map seen from above."""
+
+    cube_m = 0.25
+    """Edge, in metres, of the cubes that keep one point each."""
+    min_cubes = 3
+    """Fewest cubes of a column that count as something upright."""
+    min_pixel_m = 0.25
+    """Smallest pixel of the picture in metres."""
+    max_pixel_m = 1.0
+    """Largest pixel of the picture in metres, except in maps above `max_side`."""
+    reach_pixels = 60
+    """Pixels that the reach of the scan covers."""
+    reach_percentile = 90
+    """Percentage of the scan's upright points, the closest ones, that are used."""
+    max_side = 3000
+    """Most pixels along a side of the picture. Larger maps get coarser pixels."""
+    turns = 120
+    """Headings that are tried."""
+    through_penalty = 0.3
+    """Penalty of a pixel that the scan looks through, where a matching pixel scores 1."""
+    sectors = 360
+    """Sectors around the scan in which free space is measured."""
+    headroom_m = 0.3
+    """Free height above a sensor in metres."""
+    same_floor_m = 1.0
+    """Difference in height, in metres, below which two floors are the same."""
+    max_floors = 3
+    """Most floors that are tried at a place."""
+    column_m = 0.5
+    """Side, in metres, of the columns in which floors are searched."""
+    beside_m = 10.0
+    """Distance from the map, in metres, within which a sensor may stand."""
+    around_m = (0.75, 3.0, 8.0)
+    """Radii, in metres, in which floors are searched, one after the other: a scanner does not see the floor below
+    it."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +107,11 @@ class MapPicture:
         standing = points[between(points, floor)][:, :2]
         if not len(standing) or not len(self):
             return
-        places = np.unique(np.floor(standing / _THINNED).astype(np.int64), axis=0) * _THINNED
-        reach = float(np.percentile(np.linalg.norm(places, axis=1), _REACH_PERCENTILE))
-        picture = self._of(float(np.clip(reach / _ACROSS, _FINEST, _COARSEST)))
+        cube = MapPictureTuning.cube_m
+        places = np.unique(np.floor(standing / cube).astype(np.int64), axis=0) * cube
+        reach = float(np.percentile(np.linalg.norm(places, axis=1), MapPictureTuning.reach_percentile))
+        pixel = reach / MapPictureTuning.reach_pixels
+        picture = self._of(float(np.clip(pixel, MapPictureTuning.min_pixel_m, MapPictureTuning.max_pixel_m)))
         best, turn = _scores(picture, standing, reach)
         if self._near is not None:
             best[~_pixels_near(picture, self._near, self._axes)] = -np.inf
@@ -108,7 +125,7 @@ class MapPicture:
 
     def _of(self, pixel: float) -> _Picture:
         extent = np.ptp(self._points[:, :2], axis=0).max()
-        pixel = max(pixel, float(extent) / _LARGEST)
+        pixel = max(pixel, float(extent) / MapPictureTuning.max_side)
         if self._picture is None or not 0.7 < self._picture.pixel / pixel < 1.4:
             self._picture = _picture_of(self._points, pixel)
         return self._picture
@@ -116,20 +133,22 @@ class MapPicture:
     def _floors(self, position: np.ndarray, height: float) -> list[float]:
         """Heights of what has room for a sensor above it, around a position [2], the lowest first."""
         away = np.abs(self._points[:, :2] - position).max(1)
-        for radius in _AROUND:
+        for radius in MapPictureTuning.around_m:
             around = self._points[away < radius]
-            covered, bare = _floors_of(around, height + _HEADROOM)
+            covered, bare = _floors_of(around, height + MapPictureTuning.headroom_m)
             # What has nothing above it is a roof if there is a floor below it.
-            floors = np.sort(np.append(covered, bare[bare < covered.min(initial=np.inf) + _LEVEL]))
+            highest = covered.min(initial=np.inf) + MapPictureTuning.same_floor_m
+            floors = np.sort(np.append(covered, bare[bare < highest]))
             if len(floors):
-                new = np.append(True, np.diff(floors) > _LEVEL)
-                return [float(np.median(level)) for level in np.split(floors, np.nonzero(new)[0][1:])][:_FLOORS]
+                new = np.append(True, np.diff(floors) > MapPictureTuning.same_floor_m)
+                levels = np.split(floors, np.nonzero(new)[0][1:])[: MapPictureTuning.max_floors]
+                return [float(np.median(level)) for level in levels]
         return []
 
 
 def _floors_of(points: np.ndarray, room: float) -> tuple[np.ndarray, np.ndarray]:
     """Heights of points [n, 3] with so much room below the next one in their column, and of those with none above."""
-    columns = np.floor(points[:, :2] / _COLUMN).astype(np.int64)
+    columns = np.floor(points[:, :2] / MapPictureTuning.column_m).astype(np.int64)
     order = np.lexsort((points[:, 2], columns[:, 1], columns[:, 0]))
     columns, z = columns[order], points[order, 2]
     last = np.append((columns[1:] != columns[:-1]).any(1), True)[: len(z)]
@@ -151,7 +170,7 @@ def picture_of_store(store: GridStore, near: Near | None = None, reach: float = 
         if near is not None:
             points = points[near.allows(points, axes, reach)]
         chunks.append(_thin(points))
-    if near is not None and not any(near.allows(points, axes, _BESIDE).any() for points in chunks):
+    if near is not None and not any(near.allows(points, axes, MapPictureTuning.beside_m).any() for points in chunks):
         chunks = chunks[:1]
     return MapPicture(_thin(np.concatenate(chunks) @ level_axes(axes)), axes, damaged, near)
 
@@ -160,7 +179,7 @@ def _thin(points: np.ndarray) -> np.ndarray:
     points = points[np.isfinite(points).all(1)]
     if not len(points):
         return points
-    cubes = np.floor(points / _THINNED).astype(np.int64)
+    cubes = np.floor(points / MapPictureTuning.cube_m).astype(np.int64)
     cubes -= cubes.min(0)
     span = cubes.max(0) + 1
     _, first = np.unique((cubes[:, 0] * span[1] + cubes[:, 1]) * span[2] + cubes[:, 2], return_index=True)
@@ -171,14 +190,22 @@ def _picture_of(points: np.ndarray, pixel: float) -> _Picture:
     corner = points[:, :2].min(0)
     at = np.floor((points[:, :2] - corner) / pixel).astype(np.int64)
     size = (int(at[:, 0].max()) + 1, int(at[:, 1].max()) + 1)
-    heights = np.floor((points[:, 2] - points[:, 2].min()) / _THINNED).astype(np.int64)
+    heights = np.floor((points[:, 2] - points[:, 2].min()) / MapPictureTuning.cube_m).astype(np.int64)
     place = at[:, 0] * size[1] + at[:, 1]
     held = np.unique(place * (heights.max() + 1) + heights) // (heights.max() + 1)
-    image = (np.bincount(held, minlength=size[0] * size[1]) >= _SLICES).reshape(size).astype(np.float32)
+    upright = np.bincount(held, minlength=size[0] * size[1]) >= MapPictureTuning.min_cubes
+    image = upright.reshape(size).astype(np.float32)
     soft = np.maximum(image, 0.5 * ndimage.maximum_filter(image, 3))
     # What is correlated reaches over the border; it may wrap around into the empty part.
-    padded = tuple(fft.next_fast_len(side + int(_COARSEST * 120 / pixel), real=True) for side in size)
+    reach = int(MapPictureTuning.max_pixel_m * 120 / pixel)
+    padded = tuple(fft.next_fast_len(side + reach, real=True) for side in size)
     return _Picture(fft.rfft2(soft, padded, workers=-1), corner, pixel, size, (padded[0], padded[1]))
+
+
+def _sectors(azimuth: np.ndarray) -> np.ndarray:
+    """The sector, int64, of each azimuth in radians."""
+    count = MapPictureTuning.sectors
+    return np.floor(azimuth / (2 * np.pi) % 1.0 * count).astype(np.int64) % count
 
 
 def _scores(picture: _Picture, standing: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -186,21 +213,21 @@ def _scores(picture: _Picture, standing: np.ndarray, reach: float) -> tuple[np.n
     distance = np.linalg.norm(standing, axis=1)
     standing, distance = standing[distance < reach], distance[distance < reach]
     half = int(np.ceil(reach / picture.pixel)) + 1
-    nearest = np.full(_SECTORS, np.inf)
+    nearest = np.full(MapPictureTuning.sectors, np.inf)
     azimuth = np.arctan2(standing[:, 1], standing[:, 0])
-    np.minimum.at(nearest, np.floor(azimuth / (2 * np.pi) % 1.0 * _SECTORS).astype(np.int64) % _SECTORS, distance)
+    np.minimum.at(nearest, _sectors(azimuth), distance)
     # Where nothing was measured nobody knows whether something stands.
     nearest = np.where(np.isfinite(nearest), nearest, 0.0)
     x, y = np.mgrid[-half : half + 1, -half : half + 1] * picture.pixel
     away, direction = np.hypot(x, y), np.arctan2(y, x)
     best = np.full(picture.size, -np.inf, np.float32)
     turn = np.zeros(picture.size, np.float32)
-    for angle in np.arange(_TURNS) * (2 * np.pi / _TURNS):
+    for angle in np.arange(MapPictureTuning.turns) * (2 * np.pi / MapPictureTuning.turns):
         at = np.rint(standing @ about_z(angle)[:2, :2].T / picture.pixel).astype(np.int64) + half
         kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
         kernel[at[:, 0], at[:, 1]] = 1.0
-        seen = nearest[np.floor((direction - angle) / (2 * np.pi) % 1.0 * _SECTORS).astype(np.int64) % _SECTORS]
-        kernel[(kernel == 0) & (away < seen - 1.5 * picture.pixel)] = -_THROUGH
+        seen = nearest[_sectors(direction - angle)]
+        kernel[(kernel == 0) & (away < seen - 1.5 * picture.pixel)] = -MapPictureTuning.through_penalty
         kernel /= max(1, (kernel > 0).sum())
         spectrum = fft.rfft2(kernel, picture.padded, workers=-1)
         score = fft.irfft2(picture.spectrum * spectrum.conj(), picture.padded, workers=-1)

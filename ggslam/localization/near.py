@@ -9,9 +9,14 @@ import numpy as np
 
 from ggslam.errors import ConfigError
 from ggslam.submaps.settings import GridAxes
+from ggslam.system.tuning import Tuning
 
-_SIGMAS = 3.0
-"""Standard deviations within which places are looked at."""
+
+class NearTuning(Tuning):
+    """Search around a given position."""
+
+    sigmas = 3.0
+    """Radius of the search in standard deviations of the position."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +36,11 @@ class Near:
         """Which of positions [n, 3] are within three standard deviations, or `further` metres beyond, bool [n]; `axes`:
         of the map's grid."""
         spanned = [0, 1, 2] if len(self.position) == 3 else [0, 2] if axes == "xz" else [0, 1]
-        return np.linalg.norm(positions[:, spanned] - np.array(self.position), axis=1) <= _SIGMAS * self.sigma + further
+        reach = NearTuning.sigmas * self.sigma + further
+        return np.linalg.norm(positions[:, spanned] - np.array(self.position), axis=1) <= reach
 
     def __str__(self) -> str:
-        return f"within {_SIGMAS * self.sigma:g} m of ({', '.join(f'{value:g}' for value in self.position)})"
+        return f"within {NearTuning.sigmas * self.sigma:g} m of ({', '.join(f'{value:g}' for value in self.position)})"
 
 
 def parse_near(text: str) -> Near:

@@ -25,6 +25,7 @@ from ggslam.scene.camera import Camera
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 from ggslam.system.array_forms import Form, PoseForm, check_arrays
+from ggslam.system.tuning import Tuning
 
 PLACES = "places.npz"
 _FORMS = {
@@ -36,8 +37,13 @@ _FORMS = {
 }  # fmt: skip
 _NAMES = ("poses", "counts", "codes", "descriptors", "points", "camera")
 _CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
-_SAME = 1e-3
-"""Share of the image width by which the intrinsics of two cameras that are the same may differ."""
+
+
+class StoredPlaceTuning(Tuning):
+    """Cameras of stored places."""
+
+    same_camera = 1e-3
+    """Largest difference of the intrinsics of equal cameras, as a share of the image width."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +154,7 @@ def _choose(arrays: Mapping[str, np.ndarray], views: np.ndarray) -> Mapping[str,
 
 def _check_camera(store: GridStore, key: CellKey, found: np.ndarray, camera: Camera) -> None:
     expected = np.array([getattr(camera, name) for name in _CAMERA], float)
-    if (np.abs(found - expected) > _SAME * camera.width).any():
+    if (np.abs(found - expected) > StoredPlaceTuning.same_camera * camera.width).any():
         seen, own = (f"{int(c[0])}x{int(c[1])} pixels, fx {c[2]:.1f}" for c in (found, expected))
         raise ConfigError(
             f"{store.path}: cell {key}: its places were seen by a camera of {seen}, the images have {own}; see `scale`"

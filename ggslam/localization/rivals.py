@@ -16,20 +16,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.localization.scan_alignment import ScanMatch
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import AlignmentStatus
 
-_STEP = 2.5
-"""Starts lie so many of the target's voxels apart: from half of that an alignment converges."""
-_MARGIN = 0.02
-"""Shares of points that match which differ by less do not tell two places apart."""
-_BETTER = 0.012
-"""A place where so many more match is the better one: more than chance makes of thousands of points."""
-_FAR_MARGIN = 0.06
-"""The map in memory lies around the scan's place; around one some way off, so much more may match."""
-_ROUNDS = 4
-"""A better place is looked around from, too, so many times at most."""
-_NEAR = 2.5
-"""A rival within so many steps means that the direction is not seen at all; beyond it, that the scene repeats."""
+
+class RivalTuning(Tuning):
+    """When a scan matches at several places."""
+
+    step_voxels = 2.5
+    """Distance between starts in voxels. An alignment converges from half of it."""
+    margin = 0.02
+    """Difference of the shares of matched points below which two places cannot be told apart."""
+    better = 0.012
+    """Difference of these shares from which the other place is the better one, beyond chance."""
+    far_margin = 0.06
+    """Margin for places far off, near the edge of the map in memory."""
+    rounds = 4
+    """Most times that the search is repeated around a better place."""
+    near_steps = 2.5
+    """Distance, in steps, up to which a rival means that a direction is not observed. Beyond it, the scene repeats."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,7 @@ def look_around(
     placed: Settled,
     centre: np.ndarray,
     span: float,
-    rounds: int = _ROUNDS,
+    rounds: int = RivalTuning.rounds,
 ) -> tuple[ScanMatch, Rival | None]:
     """The best match at or along a line through a place, and what rivals it.
 
@@ -89,27 +94,27 @@ def look_around(
 def _one_round(
     match: ScanMatch, aligned: Aligned, settled: Settled, placed: Settled, centre: np.ndarray, span: float
 ) -> tuple[ScanMatch | None, Rival | None]:
-    step = _STEP * match.target.voxel
+    step = RivalTuning.step_voxels * match.target.voxel
     better, rival = None, None
     seen = [match.pose[:3, 3]]
     for shift in _shifts(match.pose[:3, 3] - centre, match.weakest, step, span):
         start = match.pose
         start[:3, 3] += shift * match.weakest
-        far = abs(shift) > _NEAR * step
+        far = abs(shift) > RivalTuning.near_steps * step
         other = aligned(start)
-        if not _rivals(other, match, seen, step, _FAR_MARGIN if far else _MARGIN):
+        if not _rivals(other, match, seen, step, RivalTuning.far_margin if far else RivalTuning.margin):
             continue
         other = placed(other) if far else settled(other)
-        if not _rivals(other, match, seen, step, _MARGIN):
+        if not _rivals(other, match, seen, step, RivalTuning.margin):
             seen += [other.pose[:3, 3]] if far else []
             continue
         seen.append(other.pose[:3, 3])
-        if other.found.overlap > (better or match).found.overlap + (0.0 if better else _BETTER):
+        if other.found.overlap > (better or match).found.overlap + (0.0 if better else RivalTuning.better):
             better = other
         elif rival is None:
             away = other.pose[:3, 3] - match.pose[:3, 3]
             distance = float(np.linalg.norm(away))
-            rival = Rival(away / distance, distance, distance < _NEAR * step)
+            rival = Rival(away / distance, distance, distance < RivalTuning.near_steps * step)
     return better, rival
 
 

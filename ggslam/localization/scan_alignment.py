@@ -22,34 +22,43 @@ from ggslam.localization.surface import SCAN_TARGET, Surface
 from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import orthonormalize, rotation_about, separation, transform_points
 from ggslam.system.settings import setting, settings_class, tuning_class
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, align
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.scan_points import ScanSettings, scan_points
 from ggslam.tracking.settings import AlignSettings, DepthNoise, TargetSettings
-from ggslam.tracking.surface import FLATNESS, quaternions_from_normals
+from ggslam.tracking.surface import SurfaceTuning, quaternions_from_normals
 
-_OPACITY_LOGIT = 3.0
-_KERNEL = 0.6
-"""Width of a search's kernel, in voxels."""
-_OWN_COARSE = 4
-"""A target's coarse voxels are so many times as wide as its fine ones."""
-_ITERATIONS = 30
-_SMALL = 1e-3
-"""Metres and radians of the last step of a search's stage."""
-_ACROSS = np.cos(np.radians(60))
-"""A surface whose normal is within this of a direction lies across it."""
-_VOXEL_SIGMAS = 8
-"""Surfaces of a map are known to a voxel's edge over this at best, which counts where a map is sparse."""
-_PLAIN_OVERLAP = 0.9
-"""Where so much matches, a pose is believed though nothing tells of a direction of motion, which is then reported."""
-_PROMISING = 0.35
-"""Share of what must match that sparse points must reach: more of them than of all points are far or seldom seen."""
-_REPEATS = 4
-"""Alignments from where the last one ended."""
-_SETTLED = 0.002
-"""Metres: a match that moves less has settled."""
-_AROUND = (0.5, -0.5)
-"""Shares of the reach by which further starts lie beside the guess, along two directions on the ground."""
+
+class ScanAlignmentTuning(Tuning):
+    """Alignment of scans."""
+
+    opacity_logit = 3.0
+    """Opacity of the map's points, as a logit."""
+    kernel_voxels = 0.6
+    """Width of the robust kernel of a search, in voxels."""
+    coarse_voxels = 4
+    """Width of a target's coarse voxels, in fine ones."""
+    max_iterations = 30
+    """Most iterations of a stage of a search."""
+    min_step = 1e-3
+    """Last step of a stage, in metres and radians."""
+    voxel_sigmas = 8
+    """Standard deviations in a voxel's edge, at least: sparse maps know their surfaces no better."""
+    plain_overlap = 0.9
+    """Overlap from which a pose is accepted with an unobserved direction, which is then reported."""
+    promising_share = 0.35
+    """Share of the required overlap that thinned points must reach: more of them are far away or seldom seen."""
+    max_repeats = 4
+    """Most alignments, each from the result of the one before."""
+    settled_m = 0.002
+    """Shift of an alignment, in metres, below which it has converged."""
+    around = (0.5, -0.5)
+    """Further starts beside the guess along two horizontal directions, as shares of the reach."""
+    min_across = np.cos(np.radians(60))
+    """Cosine of the angle to a direction within which a normal's surface lies across that direction."""
+
+
 
 
 @tuning_class(frozen=True)
@@ -101,7 +110,7 @@ class ScanMatch:
         normals = self._normals
         if not len(normals):
             return 0.0
-        across = int((np.abs(normals @ self.weakest) > _ACROSS).sum())
+        across = int((np.abs(normals @ self.weakest) > ScanAlignmentTuning.min_across).sum())
         return across / max(1, across + self.counted - len(normals))
 
     @cached_property
@@ -164,7 +173,7 @@ class ScanAligner:
     @property
     def span(self) -> float:
         """Metres that a start may be off for the search to find the place."""
-        return self._search.reach * (1 + max(_AROUND))
+        return self._search.reach * (1 + max(ScanAlignmentTuning.around))
 
     def source(self, points: np.ndarray) -> ScanSource:
         """The points of a scan [n, 3] as `fine` and `search` want them."""
@@ -178,13 +187,13 @@ class ScanAligner:
     def settle(self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch) -> ScanMatch:
         """Aligns again from a match while that still moves it: an alignment that begins far off ends short of the
         pose, with the points that the map can contain from where it began."""
-        for _ in range(_REPEATS):
+        for _ in range(ScanAlignmentTuning.max_repeats):
             again = self.fine(source, surface, target, match.pose)
             if again.found.status is AlignmentStatus.LOST or again.found.overlap < match.found.overlap:
                 break
             moved, _ = separation(match.pose, again.pose)
             match = again
-            if moved < _SETTLED:
+            if moved < ScanAlignmentTuning.settled_m:
                 break
         return match
 
@@ -192,7 +201,7 @@ class ScanAligner:
         """Whether a pose is believed that nothing but the match speaks for; `share`: of what must match."""
         if match.found.status is AlignmentStatus.LOST or match.found.overlap < share * min_overlap:
             return False
-        return self.is_told(match, share) or match.found.overlap >= max(_PLAIN_OVERLAP, min_overlap)
+        return self.is_told(match, share) or match.found.overlap >= max(ScanAlignmentTuning.plain_overlap, min_overlap)
 
     def is_told(self, match: ScanMatch, share: float = 1.0) -> bool:
         """Whether enough of what tells one place from another matches, along all directions of motion."""
@@ -212,7 +221,7 @@ class ScanAligner:
             for level in levels:
                 T = self._stage(source.sparse, surface, level, T)
             sparse = self._last_stage(source.sparse, surface, target, T)
-            if self.is_right(sparse, min_overlap, _PROMISING):
+            if self.is_right(sparse, min_overlap, ScanAlignmentTuning.promising_share):
                 found = self.at_place(source, surface, target, sparse.pose)
                 if self.is_right(found, min_overlap):
                     return found
@@ -230,7 +239,10 @@ class ScanAligner:
         """The guess, turned and moved over the ground, nearest first."""
         turns = [np.eye(3), *(rotation_about(up, sign * self._search.turn_deg) for sign in (1, -1))]
         across = np.linalg.svd(up[None])[2][1:]
-        shifts = [np.zeros(3), *(share * self._search.reach * axis for axis in across for share in _AROUND)]
+        shifts = [
+            np.zeros(3),
+            *(share * self._search.reach * axis for axis in across for share in ScanAlignmentTuning.around),
+        ]
         for shift in shifts:
             for turn in turns:
                 T = guess.copy()
@@ -238,10 +250,11 @@ class ScanAligner:
                 yield T
 
     def _stage(self, points: FramePoints, surface: Surface, level: GicpTarget, guess: np.ndarray) -> np.ndarray:
+        tuning = ScanAlignmentTuning
         settings = replace(
-            self._settings, min_normal_dot=ANY_NORMAL, coarse_iterations=0, fine_iterations=_ITERATIONS,
-            kernel_constant=_KERNEL * level.voxel, kernel_sigmas=0.0, translation_tolerance=_SMALL,
-            rotation_tolerance=_SMALL,
+            self._settings, min_normal_dot=ANY_NORMAL, coarse_iterations=0, fine_iterations=tuning.max_iterations,
+            kernel_constant=tuning.kernel_voxels * level.voxel, kernel_sigmas=0.0,
+            translation_tolerance=tuning.min_step, rotation_tolerance=tuning.min_step,
         )  # fmt: skip
         points = _rows(points, surface.covers(transform_points(points.points.astype(float), guess)))
         if len(points) < settings.min_matches:
@@ -255,9 +268,11 @@ class ScanAligner:
         """On the target's own voxels, the coarse ones with a kernel of their size; then again with the points that the
         map can contain from there."""
         width = self._settings.kernel_constant + self._settings.kernel_sigmas * self._sigma_of(target)
+        tuning = ScanAlignmentTuning
+        factor = min(100.0, tuning.kernel_voxels * tuning.coarse_voxels * target.voxel / width)
         settings = replace(
-            self._settings, min_normal_dot=ANY_NORMAL, coarse_iterations=_ITERATIONS,
-            coarse_kernel_factor=min(100.0, _KERNEL * _OWN_COARSE * target.voxel / width),
+            self._settings, min_normal_dot=ANY_NORMAL, coarse_iterations=tuning.max_iterations,
+            coarse_kernel_factor=factor,
         )  # fmt: skip
         found = self._match(points, surface, target, guess, settings)
         return self._match(points, surface, target, found.pose, replace(self._settings, min_normal_dot=ANY_NORMAL))
@@ -273,13 +288,13 @@ class ScanAligner:
         return ScanMatch(found, len(counted), len(points), target, limit)
 
     def _sigma_of(self, target: GicpTarget) -> float:
-        return max(self._sigma, target.voxel / _VOXEL_SIGMAS)
+        return max(self._sigma, target.voxel / ScanAlignmentTuning.voxel_sigmas)
 
     def _levels(self, target: GicpTarget) -> tuple[list[GicpTarget], np.ndarray]:
         """Targets of wide voxels, the widest first, made of the target's coarse ones; and the most common normal."""
         if self._pyramid is None or self._pyramid[0] is not target:
             voxels, levels, width = target.voxels(1), [], self._search.reach
-            while width > 1.2 * _OWN_COARSE * target.voxel:
+            while width > 1.2 * ScanAlignmentTuning.coarse_voxels * target.voxel:
                 levels.append(_wider(voxels, width, target.origin, self._context))
                 width /= 2
             self._pyramid = target, levels, _directions(voxels["normals"])[:, 2]
@@ -292,8 +307,9 @@ def _wider(
     """Voxels of a target that counts from an origin [3], gathered in wider ones, `width` metres."""
     means = np.ascontiguousarray(voxels["means"])
     turns = np.ascontiguousarray(quaternions_from_normals(_unit(voxels["normals"])), np.float32)
-    flat = np.log(width * np.array([1, 1, FLATNESS])).astype(np.float32)
-    log_scales, logits = np.tile(flat, (len(means), 1)), np.full(len(means), _OPACITY_LOGIT, np.float32)
+    flat = np.log(width * np.array([1, 1, SurfaceTuning.flatness])).astype(np.float32)
+    log_scales = np.tile(flat, (len(means), 1))
+    logits = np.full(len(means), ScanAlignmentTuning.opacity_logit, np.float32)
     settings: TargetSettings = replace(SCAN_TARGET, voxel=width)
     target = GicpTarget.from_arrays(means, turns, log_scales, logits, settings, context)
     target.origin = origin

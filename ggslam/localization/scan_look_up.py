@@ -29,26 +29,6 @@ from ggslam.submaps.settings import GridAxes
 from ggslam.system.settings import setting, settings_class, tuning_class
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus
 
-_TURNS_DEG = np.arange(-9.0, 10.0, 3.0)
-_PICTURE = 160
-"""Pixels along a side of a picture from above, which is padded to `_PADDED`."""
-_PADDED = 256
-_GOOD = 0.9
-_FLOORS = 4
-"""A candidate may stand on several floors."""
-_STEEP = 0.7
-"""Surfaces are upright whose normals are less steep than this sine."""
-_ON_SURFACE = 0.4
-"""Edges of a voxel that a point may be off the plane through the nearest one's mean."""
-_LEAST = 30
-"""Points that tell whether a scan fits at least."""
-_DIRECTIONS, _ELEVATIONS = 180, 90
-_INSIDE = 0.5
-"""Share of what stands in the scan that is enough, of what the map can contain."""
-_SQUARE = 0.5
-_STRANGE = 0.2
-"""Where no more than this fits, the scan may have other axes."""
-_RING = np.radians(0.5)
 _NO_FLOOR = "the scan shows no floor (the sensor's z axis has to point up)"
 
 
@@ -74,6 +54,34 @@ class ScanLookUpTuning:
     """With fewer places `few_fit` applies."""
     few_fit: float = setting(0.75, 0, 1)
     """Least share of upright structure on surfaces of the map if there are few places."""
+    picture = 160
+    """Side, in pixels, of a picture from above."""
+    padded = 256
+    """Side, in pixels, of the padded picture."""
+    good_score = 0.9
+    """Score from which a place is confirmed without trying the rest."""
+    max_floors = 4
+    """Most floors of a candidate place."""
+    max_upright_sine = 0.7
+    """Largest vertical component of the unit normal of an upright surface."""
+    on_surface_voxels = 0.4
+    """Largest distance of a point from a surface, in voxels."""
+    min_points = 30
+    """Fewest points that tell whether a scan matches."""
+    directions = 180
+    """Columns of the image of directions around a sensor."""
+    elevations = 90
+    """Rows of that image."""
+    sufficient_inside = 0.5
+    """Share of the scan's upright points inside the map from which all of the score counts."""
+    square_m = 0.5
+    """Side, in metres, of the squares in which upright points are counted."""
+    strange_fit = 0.2
+    """Best fit below which the scan probably has other axes."""
+    turns_deg = np.arange(-9.0, 10.0, 3.0)
+    """Headings, in degrees from a guess, at which pictures are compared."""
+    max_ring_rad = np.radians(0.5)
+    """Largest range of elevations, in radians, of a scan that consists of one ring."""
 
 
 @settings_class(frozen=True)
@@ -156,13 +164,13 @@ class _Scan:
     def structure(self) -> int:
         """Squares of half a metre that something stands in."""
         standing = self.points[between(self.points, self.floor)][:, :2]
-        return len(np.unique(np.floor(standing / _SQUARE).astype(np.int64), axis=0))
+        return len(np.unique(np.floor(standing / ScanLookUpTuning.square_m).astype(np.int64), axis=0))
 
     @property
     def is_ring(self) -> bool:
         """Whether all points lie on one cone about the sensor's axis."""
         elevation = np.arctan2(self.points[:, 2], np.hypot(self.points[:, 0], self.points[:, 1]))
-        return bool(np.ptp(np.percentile(elevation, [2, 98])) < _RING)
+        return bool(np.ptp(np.percentile(elevation, [2, 98])) < ScanLookUpTuning.max_ring_rad)
 
 
 Align = Callable[[np.ndarray], AlignmentResult]
@@ -234,12 +242,12 @@ class ScanLookUp:
         """Poses that were found, and how many places were tried."""
         assert self._places is not None
         found: list[FoundPose] = []
-        tried, left = 0, self.settings.candidates * _FLOORS
+        tried, left = 0, self.settings.candidates * ScanLookUpTuning.max_floors
         for guess in self._places.guesses(scan.points, scan.floor, self.settings.candidates, self.settings.apart):
             tried += 1
             if (pose := self._try(scan, guess, surface, align)) is not None:
                 found.append(pose)
-                if pose.score > _GOOD:  # others as good look as likely, and come soon
+                if pose.score > ScanLookUpTuning.good_score:  # others as good look as likely, and come soon
                     left = min(left, self.settings.more + 1)
             left -= 1
             if not left:
@@ -250,7 +258,8 @@ class ScanLookUp:
         limits = self.settings
         if not ranked or ranked[0].fit < limits.min_fit or ranked[0].through > limits.max_through:
             what = f"; at best {ranked[0].fit:.0%} match, {ranked[0].through:.0%} looked through" if ranked else ""
-            axes = "" if ranked and ranked[0].fit > _STRANGE else " (the sensor's z axis has to point up)"
+            fits = ranked and ranked[0].fit > ScanLookUpTuning.strange_fit
+            axes = "" if fits else " (the sensor's z axis has to point up)"
             return None, f"no place of the map looks like the scan{what}{axes}"
         best = ranked[0]
         here = _position_text(best.alignment.T_world_camera)
@@ -260,7 +269,8 @@ class ScanLookUp:
         if tried < limits.few and best.fit < limits.few_fit:
             fit = f"{best.fit:.0%} match, {limits.few_fit:.0%} needed"
             return None, f"the map has few places to compare {here} with: {fit}"
-        margin = limits.margin + limits.margin_missing * (1 - best.score * min(1.0, best.inside / _INSIDE))
+        inside = min(1.0, best.inside / ScanLookUpTuning.sufficient_inside)
+        margin = limits.margin + limits.margin_missing * (1 - best.score * inside)
         for other in ranked[1:]:
             moved, turned = separation(best.alignment.T_world_camera, other.alignment.T_world_camera)
             if (moved > 0.5 or turned > 5) and other.score > best.score - margin:
@@ -279,7 +289,7 @@ class ScanLookUp:
             return None
         T_level_scan = alignment.T_world_camera @ inverse(scan.T_scan_sensor)
         T_level_scan[:3] = self._R_world_level.T @ T_level_scan[:3]
-        upright = np.abs(normals[:, 2]) < _STEEP
+        upright = np.abs(normals[:, 2]) < ScanLookUpTuning.max_upright_sine
         standing = transform_points(scan.standing_points(surface.target.voxel), T_level_scan)
         covered = standing[surface.covers(standing @ self._R_world_level.T)]
         fit = _fit(covered, voxels[upright], normals[upright], surface.target.voxel)
@@ -303,19 +313,20 @@ class ScanLookUp:
         R, position = self._R_world_level.T @ guess[:3, :3], self._R_world_level.T @ guess[:3, 3]
         standing = points[between(points, floor)][:, :2]
         around = voxels - position
-        around = around[(np.abs(normals[:, 2]) < _STEEP) & between(around, floor)][:, :2]
+        around = around[(np.abs(normals[:, 2]) < ScanLookUpTuning.max_upright_sine) & between(around, floor)][:, :2]
         if not len(standing) or not len(around):
             return guess
         far = float(np.percentile(np.linalg.norm(standing, axis=1), 90))
         reach = float(np.clip(min(far, np.linalg.norm(around, axis=1).max()), 5.0, 60.0))
-        pixel = 2 * reach / _PICTURE
+        pixel = 2 * reach / ScanLookUpTuning.picture
         map_spectrum = np.fft.rfft2(_widen(_picture(around, reach, pixel)))
         best = (-1.0, 0.0, np.zeros(2))
-        most = int(np.clip(4.0 / pixel, 4, _PICTURE // 4))
-        for turn in np.radians(_TURNS_DEG):
+        most = int(np.clip(4.0 / pixel, 4, ScanLookUpTuning.picture // 4))
+        for turn in np.radians(ScanLookUpTuning.turns_deg):
             turned = standing @ (about_z(turn)[:2, :2] @ R[:2, :2]).T
             picture = _picture(turned, reach, pixel)
-            overlap = np.fft.irfft2(map_spectrum * np.fft.rfft2(picture).conj(), s=(_PADDED, _PADDED))
+            padded = ScanLookUpTuning.padded
+            overlap = np.fft.irfft2(map_spectrum * np.fft.rfft2(picture).conj(), s=(padded, padded))
             overlap = np.roll(overlap, (most, most), (0, 1))[: 2 * most + 1, : 2 * most + 1]
             peak = np.unravel_index(int(overlap.argmax()), overlap.shape)
             if overlap[peak] > best[0] + 1e-6:
@@ -333,8 +344,8 @@ def _position_text(T: np.ndarray) -> str:
 def _picture(points: np.ndarray, reach: float, pixel: float) -> np.ndarray:
     """Which pixels hold points [n, 2], float32 [_PADDED, _PADDED] with x along the rows."""
     at = np.floor((points + reach) / pixel).astype(np.int64)
-    at = at[((at >= 0) & (at < _PICTURE)).all(1)]
-    picture = np.zeros((_PADDED, _PADDED), np.float32)
+    at = at[((at >= 0) & (at < ScanLookUpTuning.picture)).all(1)]
+    picture = np.zeros((ScanLookUpTuning.padded, ScanLookUpTuning.padded), np.float32)
     picture[at[:, 0], at[:, 1]] = 1.0
     return picture
 
@@ -349,17 +360,17 @@ def _widen(picture: np.ndarray) -> np.ndarray:
 def _fit(standing: np.ndarray, voxels: np.ndarray, normals: np.ndarray, voxel: float) -> float:
     """Share of what stands upright in the scan that lies on surfaces of the map, given by means and normals of voxels;
     all [n, 3] in the level frame."""
-    if not len(voxels) or len(standing) < _LEAST:
+    if not len(voxels) or len(standing) < ScanLookUpTuning.min_points:
         return 0.0
     _, nearest = cKDTree(voxels).query(standing, distance_upper_bound=voxel)
     there = nearest < len(voxels)
     off = np.abs(((standing[there] - voxels[nearest[there]]) * normals[nearest[there]]).sum(1))
-    return float((off <= _ON_SURFACE * voxel).sum() / len(standing))
+    return float((off <= ScanLookUpTuning.on_surface_voxels * voxel).sum() / len(standing))
 
 
 def _through(points: np.ndarray, voxels: np.ndarray) -> float:
     """Share of a map's voxels that a scan looks through, of those in its view; both [n, 3] in the sensor's frame."""
-    seen = np.full((_ELEVATIONS, _DIRECTIONS), np.inf)
+    seen = np.full((ScanLookUpTuning.elevations, ScanLookUpTuning.directions), np.inf)
     distance = np.linalg.norm(points, axis=1)
     row, column = _direction(points)
     np.minimum.at(seen, (row, column), distance)
@@ -378,6 +389,11 @@ def _through(points: np.ndarray, voxels: np.ndarray) -> float:
 def _direction(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-    column = np.floor((azimuth / (2 * np.pi)) % 1.0 * _DIRECTIONS).astype(np.int64) % _DIRECTIONS
-    row = np.clip(np.floor((elevation / np.pi + 0.5) * _ELEVATIONS), 0, _ELEVATIONS - 1).astype(np.int64)
+    column = (
+        np.floor((azimuth / (2 * np.pi)) % 1.0 * ScanLookUpTuning.directions).astype(np.int64)
+        % ScanLookUpTuning.directions
+    )
+    row = np.clip(
+        np.floor((elevation / np.pi + 0.5) * ScanLookUpTuning.elevations), 0, ScanLookUpTuning.elevations - 1
+    ).astype(np.int64)
     return row, column

@@ -26,6 +26,7 @@ from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import GridAxes
 from ggslam.system.array_forms import Form, check_arrays
+from ggslam.system.tuning import Tuning
 
 SCAN_PLACES = "scan_places.npz"
 _FORMS = {
@@ -33,12 +34,24 @@ _FORMS = {
     "codes": Form("u1", "scans", CODE_BYTES),
 }  # fmt: skip
 _NAMES = ("positions", "floors", "codes")
-_SHIFT_RINGS, _NEAREST_RING, _FARTHEST_RING = 2, 0.8, 2.5
-"""A scan is looked up by what it would show from places in rings around the sensor, so many metres apart."""
-_SAME_TURN = 0.35
-"""Radians by which the azimuths of one guess differ at most."""
-_OTHER_TURNS = np.pi / 2, np.pi, -np.pi / 2
-"""Of the likeliest place, tried where a map has few places: what a wrong pose scores there."""
+
+
+class ScanPlaceTuning(Tuning):
+    """Places that scans are looked up among."""
+
+    rings = 2
+    """Rings around the sensor from which the scan's view is simulated."""
+    min_ring_m = 0.8
+    """Smallest distance between rings in metres."""
+    max_ring_m = 2.5
+    """Largest distance between rings in metres."""
+    same_turn_rad = 0.35
+    """Largest difference of the headings of one guess, in radians."""
+    other_turns = np.pi / 2, np.pi, -np.pi / 2
+    """Other headings of the likeliest place, in radians, tried where a map has few places: they show the score of a
+    wrong pose."""
+
+
 
 
 @dataclass(frozen=True)
@@ -99,13 +112,14 @@ class ScanPlaces:
         codes = np.array([code_of(points - offset, floor) for offset in offsets])
         numbers, _, which, turns = self._index.query(codes)
         likely = list(zip(numbers.tolist(), which.tolist(), turns.tolist(), strict=True))
-        likely += [(n, w, turn + angle) for n, w, turn in likely[:1] for angle in _OTHER_TURNS]
+        likely += [(n, w, turn + angle) for n, w, turn in likely[:1] for angle in ScanPlaceTuning.other_turns]
         chosen: list[tuple[np.ndarray, float]] = []
         for number, place, turn in likely:
             R = about_z(turn)
             position = self._R_world_level.T @ self.positions[number] - R @ offsets[place]
             position[2] += self._floors[number] - floor
-            if any(np.linalg.norm(position - p) < apart and _apart(turn, t) < _SAME_TURN for p, t in chosen):
+            same = ScanPlaceTuning.same_turn_rad
+            if any(np.linalg.norm(position - p) < apart and _apart(turn, t) < same for p, t in chosen):
                 continue
             chosen.append((position, turn))
             T = np.eye(4)
@@ -138,9 +152,13 @@ def _offsets(points: np.ndarray, floor: float) -> np.ndarray:
     """Of places around the sensor, [m, 3], farther apart where it sees farther."""
     standing = points[between(points, floor)]
     across = np.hypot(standing[:, 0], standing[:, 1])
-    step = float(np.clip(np.median(across) / 4, _NEAREST_RING, _FARTHEST_RING)) if len(across) else _NEAREST_RING
+    step = (
+        float(np.clip(np.median(across) / 4, ScanPlaceTuning.min_ring_m, ScanPlaceTuning.max_ring_m))
+        if len(across)
+        else ScanPlaceTuning.min_ring_m
+    )
     offsets = [np.zeros(3)]
-    for ring in range(1, _SHIFT_RINGS + 1):
+    for ring in range(1, ScanPlaceTuning.rings + 1):
         for angle in np.arange(6 * ring) * (2 * np.pi / (6 * ring)):
             offsets.append(ring * step * np.array([np.cos(angle), np.sin(angle), 0.0]))
     return np.array(offsets)

@@ -19,12 +19,6 @@ from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget
 from ggslam.tracking.scan_points import ScanSettings
 from ggslam.tracking.settings import AlignSettings
 
-MOST_PASSED = 7
-"""Lost scans between two that are looked up, at most."""
-_DOUBTFUL = 2.5
-"""While the motion is known, rivals are looked for only where a direction is seen by less than so many times the share
-of points under which it counts as not seen: the ends of voxels and noise tell that much along a plain corridor."""
-
 
 @tuning_class(frozen=True)
 class ScanTrackerTuning:
@@ -32,6 +26,11 @@ class ScanTrackerTuning:
 
     min_counted: int = setting(200, 6, 10**6)
     """A scan is lost if the map can contain fewer of its points."""
+    max_skipped = 7
+    """Most lost scans between two that are looked up."""
+    doubtful = 2.5
+    """Visibility of a direction, in multiples of the limit of degeneracy, below which rivals are searched although the
+    motion is known. Noise and voxels reach it in a plain corridor."""
 
 
 @settings_class(frozen=True)
@@ -100,7 +99,7 @@ class ScanTracker:
         """A match that is right, or a better one beside it; and what rivals it. Once the motion is known, it says where
         along the direction the sensor is; that nothing else does is told all the same."""
         sure, centre = self._sure, (self._pose @ self._velocity)[:3, 3]
-        if sure and match.found.visibility[0] > _DOUBTFUL * self.settings.align.degenerate_below:
+        if sure and match.found.visibility[0] > ScanTrackerTuning.doubtful * self.settings.align.degenerate_below:
             return match, None
         if not sure:
             match = self.aligner.at_place(source, surface, target, match.pose)
@@ -136,7 +135,8 @@ class ScanTracker:
         return align_at, settle, settle_there
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
-        """See `FrontEnd`. After a scan was not found, ever more are passed over, `MOST_PASSED` at most."""
+        """See `FrontEnd`. After each scan that was not found, more are skipped, at most
+        `ScanTrackerTuning.max_skipped`."""
         if self._places is None:
             return None
         if self._passes:
@@ -152,7 +152,7 @@ class ScanTracker:
         found, reason = self._places.find(item, surface, align_at)
         if found is None:
             self._passes = self._wait
-            self._wait = min(2 * self._wait + 1, MOST_PASSED)
+            self._wait = min(2 * self._wait + 1, ScanTrackerTuning.max_skipped)
             return FrontEndResult(self._pose.copy(), LocalizationStatus.LOST, 0.0, 0.0, reason)
         self._passes = self._wait = 0
         self._velocity, self._located = np.eye(4), 1

@@ -13,16 +13,23 @@ Puttkamer, IAS 1995; Röfer, IROS 2002), over layers of occupancy instead of gre
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from ggslam.localization.level import floor_height
 
-SECTORS, RINGS = 60, 20
-LAYERS = (0.3, 1.0, 2.0, 3.5)
-"""Metres above the floor at which layers begin; the last has no end. What is below is floor."""
-NEAREST, FARTHEST = 1.0, 60.0
-"""Metres from the axis of the sensor, in the horizontal plane."""
+SECTORS: Final = 60
+"""Directions of a stored view."""
+RINGS: Final = 20
+"""Rings of a stored view."""
+LAYERS: Final = (0.3, 1.0, 2.0, 3.5)
+"""Heights above the floor, in metres, at which the layers of a stored view start. The last one is open, and below the
+first is floor."""
+NEAREST: Final = 1.0
+"""Inner radius of a stored view, in metres from the sensor's axis."""
+FARTHEST: Final = 60.0
+"""Outer radius of a stored view, in metres."""
 ROWS = len(LAYERS) * RINGS
 CODE_BYTES = ROWS * SECTORS // 8
 

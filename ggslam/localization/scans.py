@@ -19,13 +19,19 @@ from ggslam.errors import NoPointsError, SequenceError
 from ggslam.formats.cloud_files import NOT_READ, read_cloud_file
 from ggslam.formats.pcd import read_viewpoint
 from ggslam.formats.trajectory import read_trajectory
+from ggslam.system.tuning import Tuning
 
 _SUFFIXES = (".bin", ".npy", ".pcd")
 _POSES = ("trajectory.txt", "groundtruth.txt", "poses.txt", "trajectory.csv", "poses.g2o")
 _BAGS = (".bag", ".mcap")
 """These may hold images."""
-_RATE = 10.0
-"""Scans per second where nothing tells times."""
+
+
+class ScanTuning(Tuning):
+    """Recordings of scans."""
+
+    rate = 10.0
+    """Assumed scans per second of a recording without times."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +133,8 @@ def _poses(folder: Path, files: list[Path]) -> tuple[np.ndarray, np.ndarray | No
             if len(found) != count:
                 raise SequenceError(f"{folder / name}: {len(found)} poses, but there are {count} scans")
             by_row = np.array_equal(found.timestamps, np.arange(count))
-            return found.timestamps / (_RATE if by_row else 1.0), found.T_world_camera
-    return np.arange(count) / _RATE, _viewpoints(files)
+            return found.timestamps / (ScanTuning.rate if by_row else 1.0), found.T_world_camera
+    return np.arange(count) / ScanTuning.rate, _viewpoints(files)
 
 
 def _viewpoints(files: list[Path]) -> np.ndarray | None:

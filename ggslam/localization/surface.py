@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -31,9 +31,10 @@ from ggslam.submaps.cells_around import CellsAround, MapStatus
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import load_points
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.settings import TargetSettings
-from ggslam.tracking.surface import FLATNESS, quaternions_from_normals
+from ggslam.tracking.surface import SurfaceTuning, quaternions_from_normals
 from ggslam.tracking.target_parts import TargetPart, composed_target
 
 NORMAL = "normal"
@@ -43,12 +44,25 @@ SCAN_TARGET = TargetSettings(voxel=0.15, neighbour_weight=0.0)
 """For scans. The map's normals are known and its points lie on surfaces, so that the scatter of neighbouring voxels
 adds nothing to a voxel's shape; without it a cell's voxels are finished when it is read, but for those that it shares
 with others."""
-_SAMPLED_CELLS, _SAMPLED_POINTS = 12, 2000
-_NEIGHBOURS = 10
-_OPACITY_LOGIT = 3.0
+
+
+class StoredSurfaceTuning(Tuning):
+    """Surfaces of a stored map."""
+
+    sampled_cells = 12
+    """Cells from which the spacing of the points is measured."""
+    sampled_points = 2000
+    """Most points of each of these cells."""
+    neighbours = 10
+    """Points that a normal is estimated from."""
+    opacity_logit = 3.0
+    """Opacity of the points, as a logit."""
+
+
 _ANYWHERE = np.array([0.36, 0.48, 0.8], np.float32)
 """Normals whose side is not known have a positive part in this direction: neighbours mostly agree, in all cells."""
-_RANK_BITS = 21
+_RANK_BITS: Final = 21
+"""Bits of a cell's coordinate in its rank of 63 bits."""
 
 
 def packed_normals(normals: np.ndarray) -> np.ndarray:
@@ -100,8 +114,9 @@ class SurfaceLoader:
         """Raises what `load_surface` raises."""
         points, normals, has_sides = load_surface(store, key, self.origin)
         turn = np.ascontiguousarray(quaternions_from_normals(normals), np.float32)
-        flat = np.log(self.settings.voxel * np.array([1, 1, FLATNESS])).astype(np.float32)
-        log_scales, opacity_logits = np.tile(flat, (len(points), 1)), np.full(len(points), _OPACITY_LOGIT, np.float32)
+        flat = np.log(self.settings.voxel * np.array([1, 1, SurfaceTuning.flatness])).astype(np.float32)
+        log_scales = np.tile(flat, (len(points), 1))
+        opacity_logits = np.full(len(points), StoredSurfaceTuning.opacity_logit, np.float32)
         rank = _rank(key)
         part = TargetPart(points, turn, log_scales, opacity_logits, self.settings, self.context, rank)
         return SurfaceCell(part, has_sides, reach_of(points + self.origin, key, store.grid))
@@ -119,22 +134,23 @@ def point_spacing(store: GridStore) -> float:
     cells are looked at."""
     keys = [key for key in store.cells() if POINTS in store.cell(key).parts]
     apart = []
-    for number in np.unique(np.linspace(0, len(keys) - 1, _SAMPLED_CELLS).round().astype(int)).tolist() if keys else []:
+    cells = np.linspace(0, len(keys) - 1, StoredSurfaceTuning.sampled_cells).round().astype(int)
+    for number in np.unique(cells).tolist() if keys else []:
         try:
             points = load_points(store, keys[number])["points"]
         except (FormatError, KeyError):  # who needs the cell says so
             continue
         if len(points) > 1:
-            few = points[:: max(1, len(points) // _SAMPLED_POINTS)]
+            few = points[:: max(1, len(points) // StoredSurfaceTuning.sampled_points)]
             apart.append(cKDTree(points).query(few, 2)[0][:, 1])
     return float(np.percentile(np.concatenate(apart), 75)) if apart else 0.0
 
 
 def surface_normals(points: np.ndarray) -> np.ndarray:
     """Unit normals float32 [n, 3] of points [n, 3] from each one's nearest neighbours, of either sign."""
-    if min(_NEIGHBOURS, len(points)) < 3:
+    if min(StoredSurfaceTuning.neighbours, len(points)) < 3:
         return np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
-    return estimate_normals(points, neighbours=_NEIGHBOURS).astype(np.float32)
+    return estimate_normals(points, neighbours=StoredSurfaceTuning.neighbours).astype(np.float32)
 
 
 class Surface(Protocol):

@@ -35,16 +35,21 @@ from ggslam.submaps.cell_points import POINTS
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.recorder import SubmapRecorder, load_points
 from ggslam.submaps.settings import GridAxes
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.points import extract_points
 from ggslam.tracking.settings import DepthNoise, PointSettings
 
-_STEP = 4
-"""Pixels of a depth image, along each axis, of which one is kept until the cell is written."""
-_BEHIND = 0.05
-"""Share of the depth, and metres, by which a point may lie behind a surface and still be part of it."""
-_MOST_VIEWS = 60
-"""Places that a cell keeps, the newest."""
+
+class VisitTuning(Tuning):
+    """Recording of visits."""
+
+    stride = 4
+    """One pixel in this many, along each axis, of a depth image is kept until a cell is written."""
+    behind = 0.05
+    """Distance behind a surface within which a point belongs to it, as a share of the depth plus the same in metres."""
+    max_views = 60
+    """Most places of a cell. The newest are kept."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,7 @@ class FrameSights:
         found = extract_points(item.depth, self.camera, self._settings, self._noise or DepthNoise(), self._context)
         place = self._places.describe(FeatureView(item.color, item.depth, T_world_sensor))
         normals = found.normals @ T_world_sensor[:3, :3].T
-        small = item.depth[::_STEP, ::_STEP].copy()
+        small = item.depth[::VisitTuning.stride, ::VisitTuning.stride].copy()
         looked_at = partial(_in_view, small, self.camera, inverse(T_world_sensor))
         points = transform_points(found.points, T_world_sensor)
         return Sight(points, normals, looked_at, StoredView(place, T_world_sensor))
@@ -130,16 +135,16 @@ class ScanSights:
 
 
 def _in_view(depth: np.ndarray, camera: Camera, T_camera_world: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether world points [n, 3] are in view of every `_STEP`-th pixel of a depth image and not behind what is there,
-    bool [n]."""
+    """Whether world points [n, 3] are in view and not behind the surface there, bool [n]. The depth image holds every
+    `VisitTuning.stride`-th pixel."""
     x, y, z = transform_points(points.astype(np.float64), T_camera_world).T
     ahead = np.where(z > 0, z, np.inf)
-    column = np.rint((x / ahead * camera.fx + camera.cx) / _STEP).astype(np.int64)
-    row = np.rint((y / ahead * camera.fy + camera.cy) / _STEP).astype(np.int64)
+    column = np.rint((x / ahead * camera.fx + camera.cx) / VisitTuning.stride).astype(np.int64)
+    row = np.rint((y / ahead * camera.fy + camera.cy) / VisitTuning.stride).astype(np.int64)
     height, width = depth.shape
     inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     there = depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    return inside & (there > 0) & (z <= there * (1 + _BEHIND) + _BEHIND)
+    return inside & (there > 0) & (z <= there * (1 + VisitTuning.behind) + VisitTuning.behind)
 
 
 class VisitRecorder:
@@ -190,12 +195,12 @@ class VisitRecorder:
         parts: dict[str, bytes] = {}
         counts: dict[str, int] = {}
         if views and camera is not None:
-            views = [*self._earlier_views(gathered.key, camera), *views][-_MOST_VIEWS:]
+            views = [*self._earlier_views(gathered.key, camera), *views][-VisitTuning.max_views:]
             parts, counts = {PLACES: stored_places_to_bytes(views, camera)}, {PLACES: len(views)}
         places = [sight.place for sight in gathered.sights if sight.place is not None]
         if places:
             earlier = load_scan_places(self._store, gathered.key) if self._has(gathered.key, SCAN_PLACES) else []
-            places = [*earlier, *places][-_MOST_VIEWS:]
+            places = [*earlier, *places][-VisitTuning.max_views:]
             parts[SCAN_PLACES], counts[SCAN_PLACES] = scan_places_to_bytes(places), len(places)
         # The cell's time is that of the last sight: T counts from then on.
         key = self._recorder.record(

@@ -19,9 +19,14 @@ from ggslam.scene.keyframe_poses import KeyframePoses
 from ggslam.system.array_forms import Form, Points64, check_indices
 from ggslam.system.savable import savable
 from ggslam.system.settings import setting, tuning_class
+from ggslam.system.tuning import Tuning
 
-_SHARE = 8
-"""Of the active keyframes so small a part is put aside at least: the cost of gathering the others goes with them."""
+
+class ActivityTuning(Tuning):
+    """Set of keyframes that the tracker uses."""
+
+    set_aside_part = 8
+    """At least one in this many active keyframes is set aside at a time: rebuilding the rest costs as much for one."""
 
 
 @tuning_class(frozen=True)
@@ -116,7 +121,7 @@ class ActiveKeyframes:
         s, before = self.settings, set(self.active)
         limit = s.forget_after * float(np.median(self._depths[-20:]))
         stale = {k for k in self.active if self._path - self._seen[k] > limit}
-        if len(stale) >= max(s.batch, len(self.active) // _SHARE):
+        if len(stale) >= max(s.batch, len(self.active) // ActivityTuning.set_aside_part):
             self.active -= stale
         if self.spare:
             spare = np.fromiter(self.spare, int, len(self.spare))
@@ -158,7 +163,7 @@ class ActiveKeyframes:
         if len(self.active) >= most:
             beside = self._beside_known()
             self.spare |= {k for k in near if beside[k]}
-        if len(self.active) > most + most // _SHARE:
+        if len(self.active) > most + most // ActivityTuning.set_aside_part:
             newest = len(self) - most // 4
             order = sorted(self.active, key=lambda k: (k >= newest, self._seen[k], -k))
             aside = set(order[: len(self.active) - most])

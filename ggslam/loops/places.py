@@ -24,9 +24,16 @@ from ggslam.loops.word_lists import WordLists
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, check_arrays
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-_SEED = 0
-_THUMBNAIL = (40, 30)
+
+class FernTuning(Tuning):
+    """Random tests of places. Places of stored maps are comparable only under the same values."""
+
+    seed = 0
+    """Seed of the random tests."""
+    thumbnail = (40, 30)
+    """Width and height, in pixels, of the images that the tests read."""
 
 
 @savable()
@@ -75,9 +82,9 @@ class PlaceIndex:
         self.camera = camera
         self.settings = s = settings or PlaceSettings()
         # RandomState's numbers are the same in every version of numpy: saved codes stay comparable.
-        random = np.random.RandomState(_SEED)
+        random = np.random.RandomState(FernTuning.seed)
         self._bits = np.stack([random.permutation(256)[: s.bits] for _ in range(s.tables)])
-        self._fern_pixels = random.randint(0, _THUMBNAIL[0] * _THUMBNAIL[1], s.ferns)
+        self._fern_pixels = random.randint(0, FernTuning.thumbnail[0] * FernTuning.thumbnail[1], s.ferns)
         self._fern_colors = random.randint(30, 226, (s.ferns, 3))
         self._fern_depths = random.uniform(s.near, s.far, s.ferns)
         self._numbers = []
@@ -206,9 +213,11 @@ class PlaceIndex:
         return np.unique(bits @ (1 << np.arange(self.settings.bits)) + tables)
 
     def _fern_codes(self, view: FeatureView) -> np.ndarray:
-        soft = cv2.resize(view.color, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+        soft = cv2.resize(view.color, FernTuning.thumbnail, interpolation=cv2.INTER_AREA)
         color = cv2.GaussianBlur(soft, (0, 0), 0.5).reshape(-1, 3)[self._fern_pixels]
-        depth = cv2.resize(view.depth, _THUMBNAIL, interpolation=cv2.INTER_NEAREST).reshape(-1)[self._fern_pixels]
+        depth = cv2.resize(view.depth, FernTuning.thumbnail, interpolation=cv2.INTER_NEAREST).reshape(-1)[
+            self._fern_pixels
+        ]
         code = (color > self._fern_colors) @ np.array([1, 2, 4]) + 8 * (depth > self._fern_depths)
         return code.astype(np.uint8)
 

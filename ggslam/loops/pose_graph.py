@@ -26,22 +26,32 @@ from ggslam.scene.keyframe_poses import KeyframePoses
 from ggslam.scene.poses import inverse, se3_log, so3_log
 from ggslam.system.array_forms import check_indices
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-_SHORTEST = 0.01
-"""Metres: standing still counts as a path of this length, so that no motion is held to be exact."""
-_RIGID_M, _RIGID_DEG = 1e-4, 1e-3
-"""Standard deviations of where the cameras of a rig are to one another."""
+
+class PoseGraphTuning(Tuning):
+    """Uncertainties of the pose graph."""
+
+    min_path_m = 0.01
+    """Shortest path between keyframes, in metres, that an uncertainty is computed from. No motion counts as exact."""
+    rig_sigma_m = 1e-4
+    """Standard deviation of the position of a rig's cameras to one another, in metres."""
+    rig_sigma_deg = 1e-3
+    """Standard deviation of the orientation of a rig's cameras to one another, in degrees."""
+    unknown_lengths = 100.0
+    """Standard deviation of an unknown motion, in lengths of that motion. Its pull is then below 0.01 mm."""
+    unknown_deg = 3600.0
+    """Standard deviation of an unknown rotation, in degrees."""
+
+
 SURE_INFORMATION = 1e6 * np.eye(6)
 """Of a motion that is sure to a millimetre and a milliradian: then drift is all that is unsure of it."""
-_ANYWHERE, _ANYWHERE_DEG = 100.0, 3600.0
-"""Standard deviations of a motion that nothing is known of: so many times its length, and ten times around. Its pull is
-then below a hundredth of a millimetre."""
 
 
 def odometry_covariance(T_i_j: np.ndarray, information: np.ndarray, settings: GraphSettings) -> np.ndarray:
     """Covariance [6, 6] of a motion by odometry, left twist in frame i: its own and what the path drifts."""
     turn = float(np.linalg.norm(so3_log(T_i_j[:3, :3])))
-    path = max(float(np.linalg.norm(T_i_j[:3, 3])) + settings.turn_length * turn, _SHORTEST)
+    path = max(float(np.linalg.norm(T_i_j[:3, 3])) + settings.turn_length * turn, PoseGraphTuning.min_path_m)
     drift = _isotropic(settings.translation_drift * path**0.5, settings.rotation_drift_deg * path**0.5)
     return covariance_of(information, covariance_in_frame(drift, T_i_j))
 
@@ -139,12 +149,12 @@ class PoseGraph:
         """
         if j != len(self) - 1 or len(self._tree) != j or not 0 <= i < j:
             raise ValueError(f"odometry {i} to {j}: expected from an older node to the newest, which has none yet")
-        s, covariance = self.settings, _isotropic(_RIGID_M, _RIGID_DEG)
+        s, covariance = self.settings, _isotropic(PoseGraphTuning.rig_sigma_m, PoseGraphTuning.rig_sigma_deg)
         if not rigid:
             covariance = odometry_covariance(T_i_j, information, s)
         if unknown:
-            far = _ANYWHERE * float(np.linalg.norm(T_i_j[:3, 3]))
-            covariance = covariance + covariance_in_frame(_isotropic(far, _ANYWHERE_DEG), T_i_j)
+            far = PoseGraphTuning.unknown_lengths * float(np.linalg.norm(T_i_j[:3, 3]))
+            covariance = covariance + covariance_in_frame(_isotropic(far, PoseGraphTuning.unknown_deg), T_i_j)
         if found:
             covariance += covariance_in_frame(_isotropic(s.found_translation, s.found_rotation_deg), T_i_j)
         self._tree.add(i, np.array(T_i_j, float), covariance)

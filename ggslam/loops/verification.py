@@ -18,10 +18,16 @@ from ggslam.geometry.voxels import voxel_keys
 from ggslam.loops.settings import VerificationSettings
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
+from ggslam.system.tuning import Tuning
 
-_CELLS = 4
-_ALIKE = 1.5
-"""Of the overlap that is needed, so much is more than enough: features may then be gathered in fewer places."""
+
+class VerificationTuning(Tuning):
+    """Check of a candidate place."""
+
+    cells = 4
+    """Parts of the image along each axis, over which matches must be spread."""
+    sufficient_overlap = 1.5
+    """Overlap, in multiples of the required one, from which matches may be concentrated in fewer parts."""
 
 
 class Status(Protocol):
@@ -124,7 +130,7 @@ def verify(
     kept = registration.matches.agree(refined.T_world_camera, camera, settings.registration, slack=2.0)
     found = _judge(old, new, registration, refined, int((kept & registration.inliers).sum()), sigma, settings)
     narrow = _doubt_about_features(registration, cells, settings, settings.min_cells)
-    if found.accepted and narrow and found.overlap < _ALIKE * settings.min_overlap:
+    if found.accepted and narrow and found.overlap < VerificationTuning.sufficient_overlap * settings.min_overlap:
         return replace(found, accepted=False, reason=narrow)
     return found
 
@@ -191,7 +197,7 @@ def _doubt_about_features(found: Registration, cells: int, settings: Verificatio
         return f"{found.count} of {len(found.matches)} matches agree with one pose, {settings.min_inliers} needed"
     if cells < min_cells:
         return (
-            f"the {found.count} matches that agree lie in {cells} of {_CELLS**2} parts of the image, "
+            f"the {found.count} matches that agree lie in {cells} of {VerificationTuning.cells**2} parts of the image, "
             f"{min_cells} needed"
         )
     return ""
@@ -200,8 +206,9 @@ def _doubt_about_features(found: Registration, cells: int, settings: Verificatio
 def _count_cells(found: Registration, camera: Camera) -> int:
     """Parts of the image in which features agree."""
     pixels = pixels_of(found.matches.new[found.inliers], camera)
-    cells = np.floor(pixels / (camera.width, camera.height) * _CELLS).clip(0, _CELLS - 1).astype(int)
-    return len(np.unique(cells[:, 0] * _CELLS + cells[:, 1]))
+    across = VerificationTuning.cells
+    cells = np.floor(pixels / (camera.width, camera.height) * across).clip(0, across - 1).astype(int)
+    return len(np.unique(cells[:, 0] * across + cells[:, 1]))
 
 
 def _doubt_about_geometry(

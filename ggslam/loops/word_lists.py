@@ -6,8 +6,14 @@ from __future__ import annotations
 
 import numpy as np
 
-_MERGED_AFTER = 16
-"""Places that are kept in a list of their own, which is short and so quick to add to, before they join the others."""
+from ggslam.system.tuning import Tuning
+
+
+class WordListTuning(Tuning):
+    """Index of words."""
+
+    merge_after = 16
+    """Places that are kept in a separate, quickly extended list before they are merged into the others."""
 
 
 class WordLists:
@@ -37,7 +43,7 @@ class WordLists:
         self._recent_words = np.insert(self._recent_words, place, words)
         self._recent_positions = np.insert(self._recent_positions, place, position)
         self._waiting += 1
-        if self._waiting == _MERGED_AFTER:
+        if self._waiting == WordListTuning.merge_after:
             self._merge()
 
     def hits(self, words: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:

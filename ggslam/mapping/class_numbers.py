@@ -10,12 +10,18 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-FIRST_CLASSES = 100
-"""Rows allocated to begin with."""
-ROW_LENGTH = 4.0
-"""Length of a new class's row: with codes of length 2 a Gaussian of one object has a logit of 8 for it."""
-CODE_LENGTH = 2.0
+
+class ClassTuning(Tuning):
+    """How new classes of objects start."""
+
+    initial_rows = 100
+    """Rows allocated at the start."""
+    row_length = 4.0
+    """Length of a new class's row: with codes of length 2, a Gaussian of one object has a logit of 8 for it."""
+    code_length = 2.0
+    """Length of the identity vector of a Gaussian that shows one object only."""
 
 
 @savable(check="check")
@@ -26,7 +32,7 @@ class ClassNumbers:
     _class_of: Annotated[np.ndarray, Form("i4", 65536)]
 
     def __init__(self) -> None:
-        self._ids = np.zeros(FIRST_CLASSES, np.uint16)
+        self._ids = np.zeros(ClassTuning.initial_rows, np.uint16)
         self._class_of = np.full(65536, -1, np.int32)
         self.count = 0
 
@@ -78,5 +84,5 @@ class ClassNumbers:
 def new_rows(rng: np.random.Generator, count: int, channels: int) -> np.ndarray:
     """Weights of new classes, float32 [count, channels]: directions drawn evenly."""
     directions = rng.normal(size=(count, channels)).astype(np.float32)
-    directions *= ROW_LENGTH / np.linalg.norm(directions, axis=1, keepdims=True)
+    directions *= ClassTuning.row_length / np.linalg.norm(directions, axis=1, keepdims=True)
     return directions

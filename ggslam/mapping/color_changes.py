@@ -9,9 +9,14 @@ import torch
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap, rgb_to_sh
 from ggslam.scene.poses import transform_points
+from ggslam.system.tuning import Tuning
 
-NEAR_SHARE = 0.05
-"""Gaussians take a colour where they lie at the measured depth but for this share of it."""
+
+class ColorChangeTuning(Tuning):
+    """Which Gaussians take a new colour."""
+
+    max_depth_error = 0.05
+    """Largest distance from the measured depth, as a share of it, at which a Gaussian takes the new colour."""
 
 
 def scale_colors(gaussians: GaussianMap, gain: np.ndarray) -> None:
@@ -41,7 +46,7 @@ def take_colors(gaussians: GaussianMap, keyframe: Keyframe) -> None:
     rows = np.flatnonzero(inside)
     u, v = u[rows].astype(np.int64), v[rows].astype(np.int64)
     measured = depth[v, u]
-    near = np.abs(points[rows, 2] - measured) < NEAR_SHARE * measured
+    near = np.abs(points[rows, 2] - measured) < ColorChangeTuning.max_depth_error * measured
     rows, colors = rows[near], keyframe.color[v[near], u[near]].astype(np.float32) / 255
     index = torch.from_numpy(rows).to(gaussians.device)
     gaussians.sh[index] = 0

@@ -9,9 +9,14 @@ import torch
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.harmonics import harmonic_rotations
 from ggslam.scene.poses import left_multiplication, matrix_to_quaternion
+from ggslam.system.tuning import Tuning
 
-_BLOCK = 1 << 16
-"""Gaussians moved at a time, so that the temporaries of a large map stay small."""
+
+class DeformationTuning(Tuning):
+    """How the map follows its keyframes."""
+
+    block = 1 << 16
+    """Gaussians moved in one batch, so that temporary arrays stay small."""
 
 
 def move_with_keyframes(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
@@ -33,7 +38,7 @@ def move_with_keyframes(gaussians: GaussianMap, T_new_old: np.ndarray) -> None:
     harmonics = _harmonic_turns(T_new_old, gaussians)
     moved = torch.as_tensor(np.abs(T_new_old - np.eye(4)).max((1, 2)) > 0).to(gaussians.device)
     rows = torch.nonzero((birth >= 0) & moved[birth.clamp(min=0)], as_tuple=True)[0]
-    for block in rows.split(_BLOCK):
+    for block in rows.split(DeformationTuning.block):
         own = birth[block]
         gaussians.means[block] = _times(R[own], gaussians.means[block]) + t[own]
         gaussians.quaternions[block] = _times(turn[own], gaussians.quaternions[block])

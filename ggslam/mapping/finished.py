@@ -15,15 +15,21 @@ from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.exposure import identity_exposure
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-_GROWN_UP = 100
-"""Steps that a Gaussian of a finished map counts as having made: otherwise Adam's first steps would be the longest."""
+
+class FinishedMapTuning(Tuning):
+    """Training of finished maps."""
+
+    past_updates = 100
+    """Optimizer steps that each Gaussian counts as having seen. Without them, Adam's first steps would be the
+    longest."""
 
 
 def adopt_finished(mapper: Mapper, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
     """Gives a mapper a finished map and its keyframes, numbered from 0. The map is changed by training."""
-    gaussians.updates[:] = _GROWN_UP
-    gaussians.feature_updates[:] = _GROWN_UP
+    gaussians.updates[:] = FinishedMapTuning.past_updates
+    gaussians.feature_updates[:] = FinishedMapTuning.past_updates
     mapper.adopt(gaussians, keyframes)
 
 

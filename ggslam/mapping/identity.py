@@ -20,7 +20,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Final, Protocol
 
 import numpy as np
 import torch
@@ -35,17 +35,26 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.system.array_forms import Form, check_indices
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-POOL_STEPS = 4
-"""Steps' worth of pixels that are drawn from a keyframe at once."""
-TERMS, MIN_WEIGHT = 32, 2e-2
-"""Contributions to a pixel that training looks at: at most so many, none lighter."""
-SPLIT_STRIDE = 2
-"""A split looks at every so manyth pixel and row."""
-BIRTH_VOTE = 0.1
-"""Weight of the vote that a Gaussian gets for the pixel it is born from."""
-IDS = 65536
-"""Object ids there can be, 0 (none) among them."""
+
+class IdentityTuning(Tuning):
+    """Training of identity vectors."""
+
+    pool_steps = 4
+    """Training steps for which pixels of a keyframe are drawn at once."""
+    max_terms = 32
+    """Most contributions to a pixel that training reads."""
+    min_weight = 2e-2
+    """Smallest weight, in [0, 1], of a contribution that training reads."""
+    split_stride = 2
+    """Distance, in rows and columns, between the pixels that a split of an object reads."""
+    birth_vote = 0.1
+    """Weight of the vote that a Gaussian gets for the pixel that it is made from."""
+
+
+IDS: Final = 65536
+"""Object ids that uint16 holds, with 0 (none)."""
 _OfEachId = Annotated[np.ndarray, Form("u2", IDS)]
 
 
@@ -273,7 +282,7 @@ class IdentityLearner(ABC):
             return self._new_pool(keyframe, self.settings.pixels).take(self.settings.pixels)
         pool = self._pools.get(keyframe.index)
         if pool is None or not pool.has(self.settings.pixels):
-            pool = self._new_pool(keyframe, POOL_STEPS * self.settings.pixels)
+            pool = self._new_pool(keyframe, IdentityTuning.pool_steps * self.settings.pixels)
             self._pools.pop(keyframe.index, None)
             self._pools[keyframe.index] = pool
             if self.kept_pools is not None and len(self._pools) > self.kept_pools:

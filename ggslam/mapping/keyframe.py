@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -15,15 +15,24 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.system.array_forms import ColorImage, Form, IdImage, Mask, MaybeNan, Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-ELSEWHERE = -1
-"""Frame index of keyframes that are of another recording than the run's: of the map that it began with."""
-DEPTH_UNIT = 1 / 5000.0
-"""Metres. Depth of keyframes is kept as uint16 in units of 0.2 mm (range 13.1 m), the resolution of the TUM recordings;
-of keyframes that see farther in units so many times as large, see `depth_unit_for`."""
-FAR_SHARE = 0.02
-"""Of the pixels with depth: as few beyond the range of `DEPTH_UNIT` are taken for errors of a room's sensor."""
-_MOST_UNITS = 65535
+ELSEWHERE: Final = -1
+"""Frame index of keyframes that belong to another recording: to the map that the run started from."""
+DEPTH_UNIT: Final = 1 / 5000.0
+"""Unit of a keyframe's depth in metres: uint16 steps of 0.2 mm (range 13.1 m), the resolution of TUM recordings.
+Keyframes that see farther use a multiple, see `depth_unit_for`."""
+
+
+class DepthRangeTuning(Tuning):
+    """Range of the depth that keyframes keep."""
+
+    far_share = 0.02
+    """Largest share of pixels beyond the range of a depth unit. They count as errors of an indoor sensor."""
+
+
+_MOST_UNITS: Final = 65535
+"""Largest value of uint16."""
 _IMAGES = ("color", "depth", "mask", "moving")
 
 
@@ -116,10 +125,10 @@ def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyfr
 
 
 def depth_unit_for(depth: np.ndarray) -> float:
-    """Metres: `DEPTH_UNIT`, doubled until at most `FAR_SHARE` of the pixels with depth, float [H, W], are beyond its
-    range."""
+    """Unit for depth, float [H, W], in metres: `DEPTH_UNIT`, doubled until at most `DepthRangeTuning.far_share` of the
+    pixels with depth are beyond its range."""
     known, unit = depth[depth > 0], DEPTH_UNIT
-    while len(known) and np.mean(known > _MOST_UNITS * unit) > FAR_SHARE:
+    while len(known) and np.mean(known > _MOST_UNITS * unit) > DepthRangeTuning.far_share:
         unit *= 2
     return unit
 

@@ -34,25 +34,34 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.array_forms import Mask
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-BOUND_EVERY = 4
-"""Iterations after which sizes and colours are bounded: free colours overshoot (13 % of a young map's Gaussians, by up
-to 0.4), and cut to bytes they cost up to 0.4 dB."""
-STEPS = 2
-"""Steps on every second pixel of every second row in an iteration at the end of a run with noisy depth. Each takes 0.57
-of the time of one on all pixels, and moves poses by a STEPS-th."""
-END_SHARE, LIVE_END_SHARE, WHOLE_END_SHARE = 1.2, 0.4, 0.7
-"""Iterations at the end of a run for each one before: these are on a quarter of the pixels and those on all, and to the
-map it hardly matters when its steps are made. Where a camera sets the pace, many fit in between; and where those before
-are on all pixels, too, fewer follow."""
-LEAST_VISITS = 10
-"""Iterations at the end for each keyframe of the recording at least: of few frames the map would hardly see each."""
-AVERAGE_EVERY, AVERAGED_MAPS = 4, 8
-"""Steps at most from one map to the next that joins the mean, and maps at least where there are as many steps."""
-FINAL_DECAY = 0.2
-"""The last identity steps fall to this share of their length."""
-FINAL_STEPS_A_VIEW = 4
-"""Of the last identity steps so many follow each other on one rendering, which takes as long as a step."""
+
+class MapperTuning(Tuning):
+    """Training of the map."""
+
+    bound_every = 4
+    """Iterations between two clampings of sizes and colours. Unclamped colours overshoot by up to 0.4, which costs up
+    to 0.4 dB once they are cut to bytes."""
+    noisy_steps = 2
+    """Steps per iteration of the final refinement where depth is noisy, each on a quarter of the pixels."""
+    end_share = 1.2
+    """Iterations of the final refinement per iteration before it."""
+    live_end_share = 0.4
+    """The same in real time."""
+    all_pixels_end_share = 0.7
+    """The same where the iterations before it used all pixels."""
+    min_visits = 10
+    """Fewest iterations of the final refinement per keyframe of the recording."""
+    average_every = 4
+    """Most steps between two maps that enter the average."""
+    averaged_maps = 8
+    """Fewest maps that enter the average, if there are as many steps."""
+    final_identity_decay = 0.2
+    """Share of their length to which the last identity steps shrink."""
+    final_steps_per_view = 4
+    """Last identity steps made on one rendering. Rendering takes as long as a step."""
+
 
 _FALLING = ("means", "quaternions", "sh_dc")
 """Groups whose rates fall with the root of a Gaussian's updates."""
@@ -289,7 +298,7 @@ class Mapper(ABC):
     def _iterate_wholly(self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0) -> None:
         """One iteration of the final refinement on some keyframes: a step on all pixels of one or, where depth is
         noisy, STEPS on every second pixel of as many. It is the same whether identities are trained, too, or not."""
-        for step in range(STEPS if self._is_noisy else 1):
+        for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
             keyframe = self._draw(numbers)
             grid = self._choose_grid(keyframe) if self._is_noisy else WHOLE
             self._step(keyframe, (rate_factor, pose_factor), grid, step == 0 and self._is_identity_due(keyframe))
@@ -354,11 +363,11 @@ class Mapper(ABC):
     def last_iterations(self, before: int) -> int:
         """Iterations of the final refinement after so many, unless a user says how many there are."""
         if self.residency is not None:
-            return round(WHOLE_END_SHARE * before)
+            return round(MapperTuning.all_pixels_end_share * before)
         if self.is_live or not before:
-            return round(LIVE_END_SHARE * before)
+            return round(MapperTuning.live_end_share * before)
         own = sum(self.keyframes[k].frame_index != ELSEWHERE for k in self._all_numbers)
-        return max(round(END_SHARE * before), LEAST_VISITS * own)
+        return max(round(MapperTuning.end_share * before), MapperTuning.min_visits * own)
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
         """One iteration on the whole images of one keyframe.
@@ -400,7 +409,7 @@ class Mapper(ABC):
             optimizer=self._standard_adam() if rate_factor == 1 else self._adam(rate_factor),
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
-        share = 1 if grid.is_whole else 1 / STEPS  # fewer pixels tell less of where the camera was
+        share = 1 if grid.is_whole else 1 / MapperTuning.noisy_steps  # fewer pixels tell less of where the camera was
         pose_rate = 0.0 if self._is_world(keyframe) else share * pose_factor * self._pose_rate
         self._finish_step(keyframe, step.twist, loss, pose_rate)
         times.backward += watch.lap()
@@ -409,7 +418,7 @@ class Mapper(ABC):
 
     def _count_iteration(self) -> None:
         self.times.iterations += 1
-        if self.times.iterations % BOUND_EVERY == 0:
+        if self.times.iterations % MapperTuning.bound_every == 0:
             self._bound_values()
 
     def _bound_values(self) -> None:
@@ -478,7 +487,7 @@ class Mapper(ABC):
         made before; between steps `progress` is told how many of how many are."""
         share, done = self._averaged_share, 0
         for numbers, steps in self._stages(iterations):
-            every = max(1, min(AVERAGE_EVERY, int(share * steps) // AVERAGED_MAPS))
+            every = max(1, min(MapperTuning.average_every, int(share * steps) // MapperTuning.averaged_maps))
             for i in range(steps):
                 done += 1
                 if done > begin:
@@ -509,11 +518,13 @@ class Mapper(ABC):
         start, settings = time.perf_counter(), self.identity.settings
         total = settings.final_passes * len(self._all_numbers) if settings.schedule == "sampled" else 0
         for numbers, steps in self._stages(total) if total else ():
-            for i in range(0, steps, FINAL_STEPS_A_VIEW):
+            for i in range(0, steps, MapperTuning.final_steps_per_view):
                 keyframe = self._draw(numbers)
                 if keyframe.mask is None:
                     continue
-                self._train_identity(keyframe, FINAL_STEPS_A_VIEW, FINAL_DECAY ** (i / steps))
+                self._train_identity(
+                    keyframe, MapperTuning.final_steps_per_view, MapperTuning.final_identity_decay ** (i / steps)
+                )
         self.identity.label(self.map)
         self.times.identity_finish += time.perf_counter() - start
 

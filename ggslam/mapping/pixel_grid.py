@@ -10,14 +10,23 @@ teach more in the same time; see `MapperSettings.sparse_noise`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-LEAST_SIZE = 32
-"""Pixels that a grid has along each side at least; of smaller images all pixels are used."""
-_ORDER = ((0, 0), (1, 1), (0, 1), (1, 0))
+
+class PixelGridTuning(Tuning):
+    """Training on a part of the pixels."""
+
+    min_size = 32
+    """Fewest pixels of a grid along each side. Smaller images use all pixels."""
+
+
+_ORDER: Final = ((0, 0), (1, 1), (0, 1), (1, 0))
+"""Offsets (row, column) of the four grids of every second pixel, in the order of their turns."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,6 @@ WHOLE = PixelGrid()
 def grid_of_turn(turn: int, camera: Camera) -> PixelGrid:
     """The grid of a view's next step, of which `turn` counts those before: every second pixel. In four turns each
     pixel comes once."""
-    if min(camera.width, camera.height) < 2 * LEAST_SIZE:
+    if min(camera.width, camera.height) < 2 * PixelGridTuning.min_size:
         return WHOLE
     return PixelGrid(2, *_ORDER[turn % 4])

@@ -16,13 +16,21 @@ from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
 from ggslam.sight.margin import Margin
+from ggslam.system.tuning import Tuning
 
-OUTLINE = 4
-"""Pixels of a 320 pixel wide image about a thing's outline at which its depth is still that of the thing."""
+
+class PruningTuning(Tuning):
+    """Removal of useless Gaussians."""
+
+    outline_pixels = 4
+    """Width, in pixels of a 320 pixel wide image, of the outlines within which depth counts as that of the nearer
+    surface."""
+    first_look = 10
+    """Keyframes after which hidden Gaussians are searched for the first time."""
+
+
 _THICKNESS = Margin()
 """How far Gaussians of a surface may lie before and behind what was measured of it."""
-FIRST_LOOK = 10
-"""Keyframes at which one looks for the first time for what surfaces hide."""
 
 
 def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
@@ -41,7 +49,7 @@ def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
 def is_look_due(keyframes: int) -> bool:
     """Whether one looks for what surfaces hide when there are so many keyframes: 10, 20, 40, ... As there are ever more
     of them to look from, the looks take about twice as long as the last of them."""
-    turns, rest = divmod(keyframes, FIRST_LOOK)
+    turns, rest = divmod(keyframes, PruningTuning.first_look)
     return rest == 0 and turns.bit_count() == 1
 
 
@@ -72,7 +80,7 @@ def drop_before(
     rows = np.flatnonzero(np.isin(gaussians.birth_keyframe.cpu().numpy(), births))
     means, goes = gaussians.means.detach().cpu().numpy()[rows], np.zeros(len(rows), bool)
     for keyframe, gone, around in parts:
-        reach = 1 + 2 * max(1, round(OUTLINE * keyframe.camera.width / 320))
+        reach = 1 + 2 * max(1, round(PruningTuning.outline_pixels * keyframe.camera.width / 320))
         window, depth = np.ones((reach, reach), np.uint8), keyframe.depth_m()
         known = gone & (depth > 0)
         # Of the thing; about it images show what is farther, or nearer and hides a part of it.

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from ggslam.system.savable import savable
 
-GOLDEN_RATIO = 0.6180339887498949
+GOLDEN_RATIO: Final = 0.6180339887498949
+"""Fractional part of the golden ratio: its multiples are spread evenly."""
 
 
 @savable()

@@ -8,6 +8,7 @@ map is the mean over many frames, and a picture of it fits a camera's image to a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import cv2
 import numpy as np
@@ -15,15 +16,23 @@ import numpy as np
 from ggslam.mapping.settings import ViewAlignmentSettings
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import se3_exp, transform_points
+from ggslam.system.tuning import Tuning
 
-BLURS = (2.0, 1.0)
-"""Standard deviations in pixels of the smoothing, one after the other: the first reaches farther."""
-FEWEST_POINTS = 500
-"""Textured pixels that are needed."""
-HUBER = 0.05
-"""Grey difference from which a residual counts linearly."""
+
+class AlignmentTuning(Tuning):
+    """Alignment of an image to the rendered map."""
+
+    blurs = (2.0, 1.0)
+    """Standard deviations of the smoothing, in pixels, one pass each: the first has the larger basin."""
+    min_points = 500
+    """Fewest textured pixels of an alignment."""
+    huber = 0.05
+    """Grey difference, in [0, 1], from which a residual counts linearly."""
+
+
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
-_CHUNK = 1024  # columns of the images that cv2.remap is asked for: it takes no more than 32767
+_CHUNK: Final = 1024  # columns of the images that cv2.remap is asked for: it takes no more than 32767
+"""Columns per row that cv2.remap is called with. It takes no more than 32767."""
 
 
 def grey_of(color: np.ndarray) -> np.ndarray:
@@ -34,7 +43,7 @@ def grey_of(color: np.ndarray) -> np.ndarray:
 
 def align_view(
     grey: np.ndarray, rendered: np.ndarray, depth: np.ndarray, alpha: np.ndarray, camera: Camera,
-    settings: ViewAlignmentSettings, blurs: Sequence[float] = BLURS,
+    settings: ViewAlignmentSettings, blurs: Sequence[float] = AlignmentTuning.blurs,
 ) -> np.ndarray | None:  # fmt: skip
     """How the camera that saw an image stands to the pose that a map was rendered from.
 
@@ -57,7 +66,7 @@ def align_view(
     for blur in blurs:
         ours, theirs = (cv2.GaussianBlur(image, (0, 0), blur) for image in (grey, rendered))
         pixels = _choose_textured(theirs, depth, alpha, settings)
-        if len(pixels) < FEWEST_POINTS:
+        if len(pixels) < AlignmentTuning.min_points:
             return None
         points = camera.rays().reshape(-1, 3)[pixels].astype(np.float64) * depth.reshape(-1)[pixels, None]
         channels = np.dstack([ours, *_gradients(ours)])
@@ -97,11 +106,11 @@ def _step(
     z = np.maximum(moved[:, 2], 0.05)
     u, v = camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy
     inside = (u > 1) & (v > 1) & (u < camera.width - 2) & (v < camera.height - 2)
-    if inside.sum() < FEWEST_POINTS:
+    if inside.sum() < AlignmentTuning.min_points:
         return None
     grey, du, dv = _sample(channels, u, v)
     residual = grey - (exposure[0] * values + exposure[1])
-    weight = np.where(inside, np.minimum(1, HUBER / np.maximum(np.abs(residual), 1e-6)), 0)
+    weight = np.where(inside, np.minimum(1, AlignmentTuning.huber / np.maximum(np.abs(residual), 1e-6)), 0)
     gx, gy = du * camera.fx / z, dv * camera.fy / z
     by_point = np.stack([gx, gy, -(gx * moved[:, 0] + gy * moved[:, 1]) / z], 1)
     jacobian = np.column_stack([by_point, np.cross(moved, by_point), -values, -np.ones(len(values))])

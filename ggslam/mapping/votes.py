@@ -7,9 +7,14 @@ from __future__ import annotations
 import torch
 
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-_ROWS_AT_ONCE = 65536
-"""Rows that are looked at together on the CPU, so that not all votes are in memory twice."""
+
+class VoteTuning(Tuning):
+    """Reading of votes."""
+
+    rows_at_once = 65536
+    """Gaussians whose votes are read in one batch on the CPU, so that votes are not in memory twice."""
 
 
 def vote_labels(gaussians: GaussianMap) -> torch.Tensor:
@@ -46,7 +51,9 @@ def merge_votes(gaussians: GaussianMap, alias: torch.Tensor) -> None:
         _merge_rows(merged, weights)
         ids.copy_(merged)
         return
-    for ids_here, weights_here in zip(ids.split(_ROWS_AT_ONCE), weights.split(_ROWS_AT_ONCE), strict=True):
+    for ids_here, weights_here in zip(
+        ids.split(VoteTuning.rows_at_once), weights.split(VoteTuning.rows_at_once), strict=True
+    ):
         merged = alias[ids_here.long()]
         rows = (merged != ids_here).any(1).nonzero()[:, 0]
         if len(rows):

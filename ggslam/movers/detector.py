@@ -26,16 +26,21 @@ from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView, compare, thin_out
 from ggslam.system.array_forms import Form, Mask
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-AGES = (1, 2, 4, 8, 16, 32, 48)
-"""Each frame is compared with those so many frames before it."""
-GROWN = 1
-"""Pixels of a 320 pixel wide image by which masks of movers are larger than what was found: outlines are blurred."""
-PREDICTED = 6
-"""...and the larger of what is expected to move in the next frame. What was seen once is expected there if the image
-shifts by no more than twice as much from frame to frame: else most of it will be elsewhere."""
-FEWEST_ROWS = 8
-"""Rows and columns that the smaller images have at least, if the whole ones do."""
+
+class DetectorTuning(Tuning):
+    """Detection of movers."""
+
+    ages = (1, 2, 4, 8, 16, 32, 48)
+    """Each frame is compared with the frames this many before it."""
+    mask_margin = 1
+    """Margin of the masks of movers, in pixels of a 320 pixel wide image: outlines are blurred."""
+    prediction_margin = 6
+    """The same for the prediction of the next frame. Evidence from a single frame is predicted if the image shifts by
+    at most twice this much."""
+    min_rows = 8
+    """Fewest rows and columns of the reduced images."""
 
 
 @savable(not_saved="settings")
@@ -92,10 +97,10 @@ class MoverDetector:
             return
         s, factor = self.settings, coarse_factor(frame.camera, self.settings)
         view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera, margin, context)
-        earlier, self.views = self.views, [*self.views[-AGES[-1] :], *([] if swift else [view])]
+        earlier, self.views = self.views, [*self.views[-DetectorTuning.ages[-1] :], *([] if swift else [view])]
         passed, clearly, surely, same = np.zeros((4, *view.depth.shape), np.int8)
         known, stayed, left = np.zeros((3, *view.depth.shape), bool)
-        ages = [age for age in AGES if age <= len(earlier)]
+        ages = [age for age in DetectorTuning.ages if age <= len(earlier)]
         found_by = compare(view, [earlier[-age] for age in ages], margin, context, self.small)
         for age, evidence in zip(ages, found_by, strict=True):
             passed += evidence.passed
@@ -127,13 +132,13 @@ class MoverDetector:
         self.found = found.small
         seen_twice = None if before is None else found.pixels_near(before)
         if seen_twice is not None:
-            self.mask = grow(seen_twice, GROWN)
+            self.mask = grow(seen_twice, DetectorTuning.mask_margin)
             self.things = np.where(seen_twice, found.full, 0)
             self.small = thin_out(seen_twice, factor)
             self.segments = found.segments_on(seen_twice)
             self.trail.add(view, self.small)
         likely = found.full > 0 if earlier and _stays_in_place(view, earlier[-1], found.small) else seen_twice
-        self.expected = None if likely is None else grow(likely, PREDICTED)
+        self.expected = None if likely is None else grow(likely, DetectorTuning.prediction_margin)
 
     def clean(self, frame: Frame) -> Frame:
         """The frame at hand without depth where something moves, which `Frame.moving` tells."""
@@ -152,12 +157,14 @@ def _stays_in_place(view: CoarseView, before: CoarseView, places: np.ndarray) ->
     if not len(seen):
         return False
     T_new_old = inverse(view.T_world_camera) @ before.T_world_camera
-    return largest_shift(T_new_old, view.camera, float(np.median(seen))) * 320 <= 2 * PREDICTED * view.camera.width
+    shift = largest_shift(T_new_old, view.camera, float(np.median(seen)))
+    return shift * 320 <= 2 * DetectorTuning.prediction_margin * view.camera.width
 
 
 def coarse_factor(camera: Camera, settings: MoverSettings) -> int:
     """How many times smaller the images are that are compared."""
-    return max(1, min(round(camera.width / settings.columns), min(camera.width, camera.height) // FEWEST_ROWS))
+    largest = min(camera.width, camera.height) // DetectorTuning.min_rows
+    return max(1, min(round(camera.width / settings.columns), largest))
 
 
 def grow(mask: np.ndarray, pixels: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from ggslam.movers.detector import GROWN, grow
+from ggslam.movers.detector import DetectorTuning, grow
 from ggslam.movers.segments import grow_places, large_parts
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
@@ -24,18 +24,26 @@ from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView, PairEvidence, compare, thin_out
 from ggslam.system.array_forms import Form, Mask
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-COLUMNS = 160
-"""Pixels: width of the images that are compared, about; small things count."""
-VIEWS, RATIO = 3, 2
-"""Views that look through a place at least, and so many times as many as still see it."""
-LEAST_PLACES = 6
-"""Connected places that are a thing: fewer are noise."""
-WHOLE = 0.5
-"""Of a segment all is gone, if more than this share was judged, and more than this share of that is gone."""
-HIDDEN_SHARE = 0.25
-"""Of the newer views that see some of what a view sees, so many see something before a place where something stands:
-where outlines err, fewer do."""
+
+class OutdatedTuning(Tuning):
+    """Outdated parts of earlier views."""
+
+    columns = 160
+    """Approximate width, in pixels, of the images that are compared."""
+    min_views = 3
+    """Fewest views that look through a place..."""
+    through_per_same = 2
+    """...for each view that still sees it."""
+    min_places = 6
+    """Fewest connected places of a thing. Fewer are noise."""
+    whole_share = 0.5
+    """Share of a segment that must be judged, and share of that which must be gone, for all of it to be gone."""
+    hidden_share = 0.25
+    """Share of the newer views that must see something in front of a place. Wrong outlines reach less."""
+
+
 _AROUND = np.ones((3, 3), np.uint8)
 
 
@@ -118,16 +126,19 @@ class EarlierView:
             shape: of its keyframe's images, (H, W).
         """
         self.fresh, factor = False, shape[1] // self.view.camera.width
-        gone = large_parts((self.through >= VIEWS) & (self.through >= RATIO * self.same), LEAST_PLACES)
-        hidden = large_parts(self.before >= max(VIEWS, HIDDEN_SHARE * self.looks), LEAST_PLACES)
+        tuning = OutdatedTuning
+        through = (self.through >= tuning.min_views) & (self.through >= tuning.through_per_same * self.same)
+        gone = large_parts(through, tuning.min_places)
+        before = self.before >= max(tuning.min_views, tuning.hidden_share * self.looks)
+        hidden = large_parts(before, tuning.min_places)
         full = _enlarge(gone, factor, shape)
         if segments is not None and gone.any():
             small = thin_out(segments, factor)
-            ids = _segments_gone(gone, self.through + self.same >= VIEWS, small, self.view.depth > 0)
+            ids = _segments_gone(gone, self.through + self.same >= OutdatedTuning.min_views, small, self.view.depth > 0)
             gone, full = gone | np.isin(small, ids), full | np.isin(segments, ids)
         # What is next to what was told before is its outline, and was left out with it.
         new_gone, new_hidden = (
-            large_parts(now & ~grow_places(known), LEAST_PLACES).any()
+            large_parts(now & ~grow_places(known), OutdatedTuning.min_places).any()
             for now, known in ((gone, self.gone), (hidden, self.hidden))
         )
         if not new_gone and not new_hidden:
@@ -142,7 +153,7 @@ class EarlierView:
 
 def coarse_factor(camera: Camera) -> int:
     """How many times smaller the images are that are compared."""
-    return max(1, round(camera.width / COLUMNS))
+    return max(1, round(camera.width / OutdatedTuning.columns))
 
 
 def compare_both_ways(
@@ -151,7 +162,11 @@ def compare_both_ways(
     """What the newest view says of the places of earlier ones; and where each of them looked past something that it
     sees, bool [h, w] in the newest view. Arguments as of `compare`."""
     of_earlier = [compare(view, [newest], margin, context)[0] for view in earlier]
-    come = [large_parts(e.passed, LEAST_PLACES) for e in compare(newest, earlier, margin, context)] if earlier else []
+    come = (
+        [large_parts(e.passed, OutdatedTuning.min_places) for e in compare(newest, earlier, margin, context)]
+        if earlier
+        else []
+    )
     return of_earlier, come
 
 
@@ -174,13 +189,20 @@ def _segments_gone(gone: np.ndarray, judged: np.ndarray, small: np.ndarray, know
     """
     count = int(small.max()) + 1
     lost, told, whole = (np.bincount(small[places], minlength=count) for places in (gone, judged, known))
-    ids = np.flatnonzero((lost >= LEAST_PLACES) & (lost > WHOLE * told) & (told > WHOLE * whole))
+    ids = np.flatnonzero(
+        (lost >= OutdatedTuning.min_places)
+        & (lost > OutdatedTuning.whole_share * told)
+        & (told > OutdatedTuning.whole_share * whole)
+    )
     return ids[ids > 0]
 
 
 def _with_outlines(mask: np.ndarray, factor: int) -> np.ndarray:
     """A mask bool [H, W] larger by a place and a little more all around: evidence comes of whole 3x3 places alone."""
-    return grow(cv2.dilate(mask.astype(np.uint8), np.ones((2 * factor + 1, 2 * factor + 1), np.uint8)) > 0, GROWN)
+    return grow(
+        cv2.dilate(mask.astype(np.uint8), np.ones((2 * factor + 1, 2 * factor + 1), np.uint8)) > 0,
+        DetectorTuning.mask_margin,
+    )
 
 
 def _enlarge(places: np.ndarray, factor: int, shape: tuple[int, int]) -> np.ndarray:

@@ -11,12 +11,20 @@ from ggslam.geometry.colored_surface import ColoredSurface
 from ggslam.geometry.normals import estimate_normals, turn_toward
 from ggslam.scene.camera import Camera
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-MOST = 2000
-"""Points: of more they are taken at regular distances."""
-_FEWEST, _NEIGHBOURS = 12, 9
-_OUTLYING = 3.0
-"""Points so many times farther from the middle than half of them are of something else: masks are not exact."""
+
+class PatchTuning(Tuning):
+    """Points of a mover in one frame."""
+
+    max_points = 2000
+    """Most points, spread evenly."""
+    min_points = 12
+    """Fewest points."""
+    neighbours = 9
+    """Points that a normal is estimated from."""
+    max_distance = 3.0
+    """Largest distance of a point from the centre, in medians: masks are not exact."""
 
 
 @savable()
@@ -34,18 +42,18 @@ class Patch(ColoredSurface):
 def patch_of(mask: np.ndarray, depth: np.ndarray, color: np.ndarray, camera: Camera) -> Patch | None:
     """What is on a mask bool [H, W], in the camera's axes; None: too little."""
     v, u = np.nonzero(mask & (depth > 0))
-    if len(v) < _FEWEST:
+    if len(v) < PatchTuning.min_points:
         return None
-    step = int(np.ceil(np.sqrt(len(v) / MOST)))
+    step = int(np.ceil(np.sqrt(len(v) / PatchTuning.max_points)))
     if step > 1:
         chosen = (v % step == 0) & (u % step == 0)
         v, u = v[chosen], u[chosen]
     z = depth[v, u].astype(float)
     points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], 1)
     off = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    kept = off <= _OUTLYING * np.median(off)
-    if kept.sum() < _FEWEST:
+    kept = off <= PatchTuning.max_distance * np.median(off)
+    if kept.sum() < PatchTuning.min_points:
         return None
     points = points[kept]
-    normals = turn_toward(estimate_normals(points, neighbours=_NEIGHBOURS, workers=1), -points)
+    normals = turn_toward(estimate_normals(points, neighbours=PatchTuning.neighbours, workers=1), -points)
     return Patch(points, color[v, u][kept] / 255.0, normals)

@@ -14,30 +14,38 @@ from ggslam.movers.surface import MoverSurface, PatchFit
 from ggslam.scene.poses import inverse, orthonormalize, se3_exp, so3_log
 from ggslam.system.array_forms import Form, Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-AS_GOOD = 1.2
-"""A mover stands still as long as the pose that it had explains what is seen that well against the best one."""
-STILL_RMS_M = 0.0015
-"""...or leaves no more than this off its surface."""
-STILL_SHARE = 0.95
-"""...if this share lies on its surface."""
-GROWS, RIGID = 0.7, 0.8
-"""Share of a patch on the surface from which the surface takes it in; median share of rigid things."""
-FEWEST_FITS, LATEST_FITS = 5, 7
-"""Fits that tell rigid from not rigid; the latest ones count."""
-SEEN_SHARE = 0.5
-"""Less of a patch than this on the surface says nothing of where it stands."""
-KEPT_FITS = 8
-"""Fits of a mover that stands, whose scatter tells how well its place is known."""
-_SMOOTH = 0.7
-"""Weight of the newest motion in the mean of the latest."""
-_HIDDEN_SHARE = 0.6
-"""A mover is found again only where so much is seen as before it was hidden."""
-_TURNS = 0.35
-"""Radians about each axis, from what is expected, where one is looked for that was hidden..."""
-_TURN_COSTS_M = 0.004
-"""...and metres of misfit that a turn of a radian away from it has to be worth: many things look alike from all
-sides."""
+
+class RigidTuning(Tuning):
+    """Motion of a rigid mover."""
+
+    same_fit = 1.2
+    """Misfit of the old pose, in multiples of the best one's, up to which a mover counts as standing still."""
+    still_rms_m = 0.0015
+    """Misfit of the old pose, in metres, below which a mover also counts as standing still..."""
+    still_share = 0.95
+    """...if this share of it lies on its surface."""
+    min_growing = 0.7
+    """Smallest share of a patch on the surface for the surface to grow by it."""
+    min_rigid = 0.8
+    """Smallest median share of a rigid mover."""
+    min_fits = 5
+    """Fewest fits that tell rigid from not rigid."""
+    latest_fits = 7
+    """Latest fits that count."""
+    min_seen = 0.5
+    """Smallest share of a patch on the surface that tells a pose."""
+    kept_fits = 8
+    """Fits of a standing mover whose scatter is its uncertainty."""
+    newest_weight = 0.7
+    """Weight of the newest motion in the running mean."""
+    min_size = 0.6
+    """Smallest visible size of a mover that was hidden, as a share of its size before."""
+    turn_rad = 0.35
+    """Rotation about each axis, in radians, that is tried for a mover that was hidden."""
+    turn_cost_m = 0.004
+    """Misfit, in metres per radian, that such a rotation must save: many things look alike from all sides."""
 
 
 @savable()
@@ -73,7 +81,7 @@ class RigidTracker:
         """Whether it keeps its shape."""
         if self.flexible:
             return "not rigid"
-        return "unknown" if len(self.shares) < FEWEST_FITS else "rigid"
+        return "unknown" if len(self.shares) < RigidTuning.min_fits else "rigid"
 
     def predict(self, frame: int) -> np.ndarray:
         """T_world_mover expected in a frame."""
@@ -103,21 +111,22 @@ class RigidTracker:
         if self.flexible:
             return self._follow_middle(patch, frame)
         hidden = frame - self.frame > 2
-        if area < (_HIDDEN_SHARE if hidden else 0.25) * self.size:
+        if area < (RigidTuning.min_size if hidden else 0.25) * self.size:
             return None
         fit = self._fit(patch, frame, margin, hidden)
         still = self.surface.fit(patch, self.T_world_mover, margin, 0)
-        enough = still.share > STILL_SHARE and still.rms_m < STILL_RMS_M
-        as_good = still.rms_m <= AS_GOOD * fit.rms_m and still.share >= max(SEEN_SHARE, fit.share - 0.02)
+        enough = still.share > RigidTuning.still_share and still.rms_m < RigidTuning.still_rms_m
+        seen = still.share >= max(RigidTuning.min_seen, fit.share - 0.02)
+        as_good = still.rms_m <= RigidTuning.same_fit * fit.rms_m and seen
         self.stands = enough or as_good
         if self.stands:
-            self.scatter = [*self.scatter[1 - KEPT_FITS :], fit.T_patch_surface]
+            self.scatter = [*self.scatter[1 - RigidTuning.kept_fits :], fit.T_patch_surface]
             fit = still
         else:
             self.scatter = []
             self.shares.append(fit.share)
-            latest = self.shares[-LATEST_FITS:]
-            if len(latest) >= FEWEST_FITS and np.median(latest) < RIGID:
+            latest = self.shares[-RigidTuning.latest_fits:]
+            if len(latest) >= RigidTuning.min_fits and np.median(latest) < RigidTuning.min_rigid:
                 self.flexible = True
                 return self._follow_middle(patch, frame)
         self._accept(fit, patch, area, frame)
@@ -138,12 +147,12 @@ class RigidTracker:
         middle[:3, 3] += patch.points.mean(0) - self._middle_of(expected)
         starts = [expected, middle]
         for axis in np.eye(3):
-            for angle in (-2 * _TURNS, -_TURNS, _TURNS, 2 * _TURNS):
+            for angle in (times * RigidTuning.turn_rad for times in (-2, -1, 1, 2)):
                 start = middle.copy()
                 start[:3, :3] = se3_exp(np.concatenate([np.zeros(3), angle * axis]))[:3, :3] @ start[:3, :3]
                 starts.append(start)
         fits = [self.surface.fit(patch, start, margin, 12) for start in starts]
-        return min(fits, key=lambda fit: fit.apart_m + _TURN_COSTS_M * _angle(expected, fit.T_patch_surface))
+        return min(fits, key=lambda fit: fit.apart_m + RigidTuning.turn_cost_m * _angle(expected, fit.T_patch_surface))
 
     def _middle_of(self, T: np.ndarray) -> np.ndarray:
         return np.asarray(self.surface.points.mean(0) @ T[:3, :3].T + T[:3, 3])
@@ -153,9 +162,9 @@ class RigidTracker:
         if self.frame >= 0 and frame - self.frame == 1:
             turn = so3_log(T[:3, :3] @ before[:3, :3].T)
             newest = np.concatenate([T[:3, 3] - before[:3, 3], turn])
-            self.velocity = _SMOOTH * newest + (1 - _SMOOTH) * self.velocity
+            self.velocity = RigidTuning.newest_weight * newest + (1 - RigidTuning.newest_weight) * self.velocity
         self.T_world_mover, self.frame = orthonormalize(T), frame
-        if fit.share >= GROWS:
+        if fit.share >= RigidTuning.min_growing:
             self.surface.add(patch.move(inverse(T)))
             self.size = max(area, 0.9 * self.size)
 

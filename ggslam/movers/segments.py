@@ -12,19 +12,24 @@ import numpy as np
 from ggslam.geometry.image_parts import parts_with_seeds
 from ggslam.movers.settings import MoverSettings
 from ggslam.sight.places import thin_out
+from ggslam.system.tuning import Tuning
 
-SAME_THING = 0.03
-"""Neighbouring places whose depths differ by less than this share are of one thing."""
-CLEAR = 0.5
-"""Where a thing begins to move, this share of its evidence has to be clear: what differs by little more than noise
-would may be a pose's or a camera's error."""
-JUDGED = 0.25
-"""Share of a thing's places that earlier frames must have looked at to say that it rests."""
-STILL_MOVES = 0.5
-"""A segment that moved in the frame before goes on, though frames before saw it all about, while no more than this
-share of what can be judged of it rests."""
-REACH = 2
-"""Places by which a thing is larger than its evidence, at most."""
+
+class SegmentTuning(Tuning):
+    """Segments of moving things."""
+
+    same_depth = 0.03
+    """Largest relative difference in depth of neighbouring places of one thing."""
+    min_clear = 0.5
+    """Smallest share of clear evidence where a thing starts to move: a wrong pose can explain the rest."""
+    min_judged = 0.25
+    """Smallest share of a thing's places seen by earlier frames for it to be at rest."""
+    max_rest = 0.5
+    """Largest share at rest, of the judged places of a segment, that still moves as in the frame before."""
+    max_growth = 2
+    """Most places by which a thing grows beyond its evidence."""
+
+
 _AROUND = np.ones((3, 3), np.uint8)
 
 
@@ -83,7 +88,7 @@ class MovingThings:
         for number in np.unique(self.parts[self.small]):
             own = self.parts == number
             known = before is not None and bool((own & grow_places(before)).any())
-            if known or (own & clear).sum() > CLEAR * (own & novel).sum():
+            if known or (own & clear).sum() > SegmentTuning.min_clear * (own & novel).sum():
                 numbers.append(number)
         if not numbers:
             return None
@@ -132,7 +137,7 @@ def _segments_that_move(
     for number in candidates:
         enough = max(s.min_pixels / 4, s.min_share * count[number])
         has_come = novel[number] >= enough and not _at_rest(rest[number], judged[number], count[number], s)
-        if has_come or (number in moved and rest[number] <= STILL_MOVES * judged[number]):
+        if has_come or (number in moved and rest[number] <= SegmentTuning.max_rest * judged[number]):
             found.append(number)
     return found
 
@@ -144,14 +149,14 @@ def _blobs_that_move(blobs: np.ndarray, places: Gathering, s: MoverSettings) -> 
         own = labels == number
         if _at_rest(places.rests[own].sum(), places.judged[own].sum(), own.sum(), s):
             labels[own] = 0
-    for _ in range(REACH):
+    for _ in range(SegmentTuning.max_growth):
         labels = _spread(labels, places)
     return labels
 
 
 def _at_rest(rest: int, judged: int, count: int, s: MoverSettings) -> bool:
     """Whether a thing of so many places stays where it is."""
-    return judged >= JUDGED * count and rest >= s.at_rest * judged
+    return judged >= SegmentTuning.min_judged * count and rest >= s.at_rest * judged
 
 
 def _spread(labels: np.ndarray, places: Gathering) -> np.ndarray:
@@ -159,7 +164,7 @@ def _spread(labels: np.ndarray, places: Gathering) -> np.ndarray:
     depth, grown = places.depth, labels.copy()
     for step in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         beside, z = np.roll(labels, step, (0, 1)), np.roll(depth, step, (0, 1))
-        joins = (grown == 0) & (beside > 0) & ~places.world & (np.abs(z - depth) < SAME_THING * depth)
+        joins = (grown == 0) & (beside > 0) & ~places.world & (np.abs(z - depth) < SegmentTuning.same_depth * depth)
         grown[joins] = beside[joins]
     return grown
 

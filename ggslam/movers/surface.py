@@ -15,23 +15,36 @@ from ggslam.movers.patches import Patch
 from ggslam.scene.poses import inverse, orthonormalize, transform_points
 from ggslam.system.array_forms import Form, Points64
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-VOXEL = 0.006
-"""Metres, of points that are kept."""
-MOST_POINTS = 6000
-"""A larger surface grows no more."""
-COLOR_M, NORMAL_M = 0.15, 0.05
-"""Metres that the distance from black to full in one channel, and of unit normals, counts as where partners are looked
-for: the inside of a thin wall is no partner of its outside."""
-REACH_M = 0.03
-"""Partners are looked for up to three times as far."""
-_TANGENT, _HELD = 0.3, 1.5
-"""Weight of the distance along the surface, and voxels up to which it counts: what lies beyond the edge of what was
-seen so far would pull."""
-_STEER, _PAIRED, _INNER = 1000, 5, 2
-"""Points that steer, searches for partners, and steps after each."""
-_SMALL = 1e-4
-_MOST_SEEN = 50.0
+
+class MoverSurfaceTuning(Tuning):
+    """Surface of a mover."""
+
+    voxel_m = 0.006
+    """Voxel of the kept points in metres."""
+    max_points = 6000
+    """Points from which a surface no longer grows."""
+    color_m = 0.15
+    """Distance, in metres, that the step from black to full in one channel equals in the search for partners."""
+    normal_m = 0.05
+    """The same for a unit of normals: the inside of a thin wall is no partner of its outside."""
+    reach_m = 0.03
+    """A third of the largest distance of partners, in metres, and the width of the robust kernel."""
+    tangent_weight = 0.3
+    """Weight of the distance along the surface..."""
+    held_voxels = 1.5
+    """...up to this many voxels: points beyond the known edge would pull."""
+    max_steering = 1000
+    """Most points that a fit uses."""
+    rounds = 5
+    """Searches for partners."""
+    inner_steps = 2
+    """Steps after each search."""
+    min_step = 1e-4
+    """Last step of a fit, in metres and radians."""
+    max_seen = 50.0
+    """Largest weight of a point, in observations."""
 
 
 @dataclass(frozen=True)
@@ -72,22 +85,25 @@ class MoverSurface:
 
     def add(self, patch: Patch) -> None:
         """Takes in a patch in the mover's frame: means of what falls into one voxel and faces one way."""
-        if len(self) > MOST_POINTS:
+        if len(self) > MoverSurfaceTuning.max_points:
             return
         points = np.concatenate([self.points, patch.points])
         normals = np.concatenate([self.normals, patch.normals])
         axis = np.abs(normals).argmax(1)
         side = 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0)
-        _, place = np.unique(8 * (voxel_keys(points, VOXEL) % (1 << 60)) + side, return_inverse=True)
+        keys = voxel_keys(points, MoverSurfaceTuning.voxel_m)
+        _, place = np.unique(8 * (keys % (1 << 60)) + side, return_inverse=True)
         weight = np.concatenate([self.seen, np.ones(len(patch))])
         total = np.bincount(place, weight)
         values = np.concatenate([points, np.concatenate([self.colors, patch.colors]), normals], 1)
         mean = np.stack([np.bincount(place, weight * column) for column in values.T], 1) / total[:, None]
         self.points, self.colors, normals = mean[:, :3], mean[:, 3:6], mean[:, 6:]
         self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        self.seen, self._tree = np.minimum(total, _MOST_SEEN), None
+        self.seen, self._tree = np.minimum(total, MoverSurfaceTuning.max_seen), None
 
-    def fit(self, patch: Patch, T_patch_surface: np.ndarray, margin: float, rounds: int = _PAIRED) -> PatchFit:
+    def fit(
+        self, patch: Patch, T_patch_surface: np.ndarray, margin: float, rounds: int = MoverSurfaceTuning.rounds
+    ) -> PatchFit:
         """Brings the patch upon the surface.
 
         Args:
@@ -96,28 +112,30 @@ class MoverSurface:
             margin: metres up to which a point lies on the surface.
             rounds: searches for partners; none: it is judged where it is.
         """
-        some, T = patch.some(_STEER), inverse(T_patch_surface)
+        some, T = patch.some(MoverSurfaceTuning.max_steering), inverse(T_patch_surface)
         for _ in range(rounds):
             moved = some.move(T)
-            apart, partners = self._partners(moved, 3 * REACH_M)
+            apart, partners = self._partners(moved, 3 * MoverSurfaceTuning.reach_m)
             pairs = np.isfinite(apart)
             if pairs.sum() < 12:
                 break
             p, q, n = moved.points[pairs], self.points[partners[pairs]], self.normals[partners[pairs]]
             total = np.eye(4)
-            for _ in range(_INNER):
+            for _ in range(MoverSurfaceTuning.inner_steps):
                 off = p - q
                 along = off - (off * n).sum(1, keepdims=True) * n
-                step = plane_step(p, q, n, REACH_M, _TANGENT, (along**2).sum(1) < (_HELD * VOXEL) ** 2)
+                near = (along**2).sum(1) < (MoverSurfaceTuning.held_voxels * MoverSurfaceTuning.voxel_m) ** 2
+                step = plane_step(p, q, n, MoverSurfaceTuning.reach_m, MoverSurfaceTuning.tangent_weight, near)
                 total, p = step @ total, transform_points(p, step)
             T = orthonormalize(total @ T)
-            if np.abs(total - np.eye(4)).max() < _SMALL:
+            if np.abs(total - np.eye(4)).max() < MoverSurfaceTuning.min_step:
                 break
         moved = some.move(T)
         apart, partners = self._partners(moved, np.inf)
         plane = np.abs(((moved.points - self.points[partners]) * self.normals[partners]).sum(1))
         rms = float(np.sqrt((np.minimum(plane, 0.02) ** 2).mean()))
-        return PatchFit(inverse(T), float((plane < margin).mean()), rms, float(np.minimum(apart, 3 * REACH_M).mean()))
+        apart_m = float(np.minimum(apart, 3 * MoverSurfaceTuning.reach_m).mean())
+        return PatchFit(inverse(T), float((plane < margin).mean()), rms, apart_m)
 
     def _partners(self, patch: Patch, reach: float) -> tuple[np.ndarray, np.ndarray]:
         if self._tree is None:
@@ -127,4 +145,4 @@ class MoverSurface:
 
 
 def _joint(points: np.ndarray, colors: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    return np.concatenate([points, COLOR_M * colors, NORMAL_M * normals], 1)
+    return np.concatenate([points, MoverSurfaceTuning.color_m * colors, MoverSurfaceTuning.normal_m * normals], 1)

@@ -16,21 +16,26 @@ from ggslam.movers.rigid import RigidTracker
 from ggslam.scene.poses import inverse, transform_points, turning_angle
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-REMEMBERED = 16
-"""Frames that are looked back at when something begins to move."""
-RESTED = 8
-"""Frames for which something stands before it counts as put down."""
-HIDDEN = 48
-"""Frames for which a mover may be hidden."""
-OWN_SEGMENT = 0.5
-"""Share of a thing on one segment that makes it this segment."""
-OVERLAP = 0.3
-"""Share of a mover's surface, where it is expected, that has to be on a thing to be it."""
-FEWEST_FRAMES = 3
-"""What moves in fewer is not told of."""
-_SPREAD = 3
-"""Pixels about the points of a surface at which it may be seen."""
+
+class TrackTuning(Tuning):
+    """Tracks of movers."""
+
+    remembered_frames = 16
+    """Frames that are searched when something starts to move."""
+    rested_frames = 8
+    """Frames at rest after which something counts as put down."""
+    hidden_frames = 48
+    """Frames for which a mover may be hidden."""
+    min_own_segment = 0.5
+    """Smallest share of a thing on one segment for it to be that segment."""
+    min_overlap = 0.3
+    """Smallest share of a mover's predicted surface on a thing for the two to be the same."""
+    min_frames = 3
+    """Fewest frames of a reported motion."""
+    spread_pixels = 3
+    """Distance from a surface's points, in pixels, at which it may be seen."""
 
 
 @savable()
@@ -92,7 +97,7 @@ class Track:
         if here.frame <= self.found and len(self.pending) > 1:
             self.before, self.sights = self.pending[-1], []
             self.scatter[0] = self.stood
-        elif not self.sights or len(self.pending) < RESTED:
+        elif not self.sights or len(self.pending) < TrackTuning.rested_frames:
             self.sights += self.pending  # it moved from the first frame on that showed it, or seemed to stand
         self.pending, self.after = [], None
         self.sights.append(here)
@@ -100,12 +105,12 @@ class Track:
     def is_over(self, frame: int) -> bool:
         """Whether there is nothing more to follow, where it is not found to move."""
         if self.tracker.flexible:
-            return not self.sights or frame - self.sights[-1].frame > RESTED
-        return len(self.pending) >= RESTED or frame - self.tracker.frame > HIDDEN
+            return not self.sights or frame - self.sights[-1].frame > TrackTuning.rested_frames
+        return len(self.pending) >= TrackTuning.rested_frames or frame - self.tracker.frame > TrackTuning.hidden_frames
 
     def settle(self) -> None:
         """It has come to rest, or is lost from sight."""
-        if len(self.pending) >= RESTED and self.sights and not self.tracker.flexible:
+        if len(self.pending) >= TrackTuning.rested_frames and self.sights and not self.tracker.flexible:
             self.after = self.pending[-1]
             self.scatter[1] = self.stood
         self.settled = True
@@ -153,7 +158,7 @@ class MoverTracks:
         active = [track for track in self.tracks if not track.settled]
         if things is not None or active:
             self._follow(view, things, active)
-        self.recent = [*self.recent[1 - REMEMBERED :], view]
+        self.recent = [*self.recent[1 - TrackTuning.remembered_frames :], view]
 
     def _follow(self, view: RecentFrame, things: np.ndarray | None, active: list[Track]) -> None:
         segments = view.segments()
@@ -192,13 +197,14 @@ class MoverTracks:
 
     def _nearest(self, view: RecentFrame, mask: np.ndarray) -> list[int]:
         """Which mover without a segment is expected where a thing is."""
-        grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * _SPREAD + 1, 2 * _SPREAD + 1), np.uint8)) > 0
+        side = 2 * TrackTuning.spread_pixels + 1
+        grown = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
         shares = {}
         for k, track in enumerate(self.tracks):
             if track.instance is None and track.latest is not None:
                 shares[k] = view_share(view, track, grown)
         best = max(shares, key=lambda k: shares[k], default=None)
-        return [] if best is None or shares[best] < OVERLAP else [best]
+        return [] if best is None or shares[best] < TrackTuning.min_overlap else [best]
 
     def _begin(self, view: RecentFrame, mask: np.ndarray, instance: int | None) -> None:
         """A mover that was not known; where its segment is known, it is followed from the oldest frame at hand."""
@@ -236,7 +242,7 @@ class MoverTracks:
         """What is known of each that moved in more than a few frames."""
         found = []
         for track in self.tracks:
-            if len(track.sights) >= FEWEST_FRAMES:
+            if len(track.sights) >= TrackTuning.min_frames:
                 found.append(track.describe())
         return found
 
@@ -254,7 +260,7 @@ def _segment_of(ids: np.ndarray) -> int | None:
     counts = np.bincount(ids)
     counts[0] = 0
     best = int(counts.argmax())
-    return best if counts[best] >= OWN_SEGMENT * len(ids) else None
+    return best if counts[best] >= TrackTuning.min_own_segment * len(ids) else None
 
 
 def _scatter(poses: list[np.ndarray], T: np.ndarray) -> np.ndarray:

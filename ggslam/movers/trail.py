@@ -18,11 +18,18 @@ from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView, compare
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-VOXEL = 0.05
-"""Metres."""
-SEED_SHARE = 0.1
-"""Of what has gone in one piece so much lies in the trail at least."""
+
+class TrailTuning(Tuning):
+    """Space that movers passed through."""
+
+    voxel_m = 0.05
+    """Voxel of the trail in metres."""
+    min_in_trail = 0.1
+    """Smallest share in the trail of a piece that has gone."""
+
+
 _STEPS = [neighbour_step(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
 
 
@@ -41,7 +48,7 @@ class Trail:
 
     def add(self, view: CoarseView, places: np.ndarray) -> None:
         """Adds what a view shows at some places, bool [h, w]."""
-        keys = np.unique(voxel_keys(_world_points(view)[(places & (view.depth > 0)).reshape(-1)], VOXEL))
+        keys = np.unique(voxel_keys(_world_points(view)[(places & (view.depth > 0)).reshape(-1)], TrailTuning.voxel_m))
         around = np.unique((keys[:, None] + np.array(_STEPS)).reshape(-1))
         joined = np.union1d(self.keys, around)
         if len(joined) > len(self.keys):
@@ -49,7 +56,7 @@ class Trail:
 
     def contains(self, view: CoarseView) -> np.ndarray:
         """Which places of a view are in it, bool [h, w]."""
-        keys = voxel_keys(_world_points(view), VOXEL)
+        keys = voxel_keys(_world_points(view), TrailTuning.voxel_m)
         if not len(self.keys):
             return np.zeros(view.depth.shape, bool)
         at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
@@ -81,7 +88,7 @@ def gone_since(
         return None
     (evidence,) = compare(earlier, [newest], margin, context)
     # Movers are found by the side that goes ahead: the rest of what has gone hangs on what lies in their trail.
-    passed = parts_with_seeds(evidence.passed & near, evidence.passed, SEED_SHARE)
+    passed = parts_with_seeds(evidence.passed & near, evidence.passed, TrailTuning.min_in_trail)
     if passed.sum() < settings.min_pixels / 4:
         return None
     rests, world = np.zeros(passed.shape, bool), evidence.same

@@ -13,10 +13,17 @@ import numpy as np
 import torch
 
 from ggslam.errors import RenderError
+from ggslam.system.tuning import Tuning
 
 ADAM_GROUPS = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "features")
 """Parameter groups with a learning rate of their own, in the order of the columns of an Adam schedule."""
-_MAX_ROWS = 1 << 15
+
+
+class AdamTuning(Tuning):
+    """Rows of bias corrections."""
+
+    max_rows = 1 << 15
+    """Most rows of the table of bias corrections."""
 
 
 def _default_rates() -> Mapping[str, float]:
@@ -101,7 +108,7 @@ class _Shape:
         """Enough for everything to have settled within float32, or to where it no longer matters."""
         fall = math.ceil(self.fall_updates * (self.fall_floor**-2 - 1)) + 1 if any(self.falling) else 1
         decay = _rows_until(self.decay, max(self.decay_floor, 1e-6)) if any(self.decayed) else 1
-        return min(_MAX_ROWS, max(_rows_until(self.beta1, 1e-8), _rows_until(self.beta2, 1e-8), decay, fall))
+        return min(AdamTuning.max_rows, max(_rows_until(self.beta1, 1e-8), _rows_until(self.beta2, 1e-8), decay, fall))
 
 
 def _rows_until(factor: float, limit: float) -> int:

@@ -8,19 +8,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
-OPAQUE, SAME_DEPTH = 0.9, 0.05
-"""Pixels count whose rendering is so opaque, at the measured depth but for this share."""
-DARK, BRIGHT = 0.04, 0.98
-"""Values outside are not compared: they are black level, or saturated."""
-FEWEST_SHARE = 0.02
-"""Of the pixels have to be left."""
-STEP = 2
-"""Every so many rows and columns are looked at."""
-LIT_SHARE = 0.3
-"""Of an image's pixels have to be neither dark nor bright for it to show colours."""
-CONTRADICTION = 0.15
-"""Median difference of grey values in [0, 1] between an image and a map that cannot both be of the same scene."""
-_SOME = (slice(None, None, STEP), slice(None, None, STEP))
+from ggslam.system.tuning import Tuning
+
+
+class ExposureTuning(Tuning):
+    """Comparison of an image with a rendering."""
+
+    min_alpha = 0.9
+    """Smallest opacity of the rendering at a pixel that is compared."""
+    max_depth_error = 0.05
+    """Largest error of the rendered depth at such a pixel, as a share of the measured depth."""
+    dark = 0.04
+    """Values below this one, in [0, 1], are not compared: they are black level."""
+    bright = 0.98
+    """Values above this one, in [0, 1], are not compared: they are saturated."""
+    min_share = 0.02
+    """Smallest share of pixels left for a comparison."""
+    stride = 2
+    """One in this many rows and columns is compared."""
+    min_lit_share = 0.3
+    """Smallest share of pixels, neither dark nor saturated, of an image that shows colours."""
+    contradiction = 0.15
+    """Median difference of grey values, in [0, 1], from which image and map show different scenes."""
+
+
+_SOME = (slice(None, None, ExposureTuning.stride), slice(None, None, ExposureTuning.stride))
 
 
 def identity_exposure() -> np.ndarray:
@@ -72,8 +84,8 @@ class SeenAgain:
     def common_pixels(self) -> np.ndarray:
         """Which of every STEP-th row and column both see, bool [h, w]."""
         depth, rendered_depth = self.depth[_SOME], self.rendered_depth[_SOME]
-        near = np.abs(rendered_depth - depth) < SAME_DEPTH * depth
-        return np.asarray((depth > 0) & (self.alpha[_SOME] > OPAQUE) & near)
+        near = np.abs(rendered_depth - depth) < ExposureTuning.max_depth_error * depth
+        return np.asarray((depth > 0) & (self.alpha[_SOME] > ExposureTuning.min_alpha) & near)
 
     def measure(self, color: np.ndarray) -> np.ndarray | None:
         """`measure_exposure` of what the camera saw, uint8 [H, W, 3]."""
@@ -83,17 +95,17 @@ class SeenAgain:
 def is_lit(color: np.ndarray) -> bool:
     """Whether an image uint8 [H, W, 3] shows colours: it is neither nearly black nor saturated nearly everywhere."""
     grey = color[_SOME].astype(np.float32).mean(2) / 255
-    return bool(((grey > DARK) & (grey < BRIGHT)).mean() >= LIT_SHARE)
+    return bool(((grey > ExposureTuning.dark) & (grey < ExposureTuning.bright)).mean() >= ExposureTuning.min_lit_share)
 
 
 def shows_otherwise(color: np.ndarray, seen: SeenAgain) -> bool:
     """Whether a map and an image uint8 [H, W, 3] that is not lit, or a map of such images and one that is, contradict
     each other; what is black or white in the scene is so in both."""
     known = seen.common_pixels()
-    if known.mean() < FEWEST_SHARE:
+    if known.mean() < ExposureTuning.min_share:
         return False
     grey = color[_SOME].astype(np.float32).mean(2) / 255
-    return bool(np.median(np.abs(grey - seen.image.mean(0)[_SOME])[known]) > CONTRADICTION)
+    return bool(np.median(np.abs(grey - seen.image.mean(0)[_SOME])[known]) > ExposureTuning.contradiction)
 
 
 def measure_exposure(
@@ -115,8 +127,8 @@ def measure_exposure(
     seen, exposure = color[_SOME][known], identity_exposure()
     for channel in range(3):
         x, y = image[channel][_SOME][known], seen[:, channel].astype(np.float32) / 255
-        used = (x > DARK) & (x < BRIGHT) & (y < BRIGHT)
-        if used.sum() < FEWEST_SHARE * known.size:
+        used = (x > ExposureTuning.dark) & (x < ExposureTuning.bright) & (y < ExposureTuning.bright)
+        if used.sum() < ExposureTuning.min_share * known.size:
             return None
         exposure[channel, 0] = float(np.median(y[used] / x[used]))
     return exposure if (exposure[:, 0] > 0).all() else None
@@ -132,7 +144,7 @@ def relative_sharpness(color: np.ndarray, seen: SeenAgain, exposure: np.ndarray)
     image = color.astype(np.float32).mean(2) / 255
     shown = np.tensordot(gains, seen.image.clip(0, 1), 1) / np.float32(3)
     ours, theirs = (float(sum(np.square(d)[known].sum() for d in np.gradient(grey))) for grey in (image, shown))
-    if known.sum() < FEWEST_SHARE * known.size / STEP**2 or theirs <= 0:
+    if known.sum() < ExposureTuning.min_share * known.size / ExposureTuning.stride**2 or theirs <= 0:
         return 1.0
     return float(np.sqrt(ours / theirs))
 

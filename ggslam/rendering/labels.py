@@ -13,22 +13,26 @@ from ggslam.errors import RenderError
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import Gaussians, RenderBuffers
 from ggslam.scene.camera import Camera
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IdentityClassifier, IdentityVectorTuning
+from ggslam.system.tuning import Tuning
 
-MIN_ALPHA = 0.5
-"""Pixels that are covered less than this show no object."""
-_VALUES_AT_ONCE = 1 << 18
-"""Logits held at a time (1 MB, which stays in the cache): with 1,000 classes a whole image of them would take more than
-a gigabyte."""
-_PIXELS_AT_ONCE = 1 << 15
-"""Pixels whose terms are held at a time (12 MB)."""
+
+class LabelTuning(Tuning):
+    """Object ids of pixels."""
+
+    min_alpha = 0.5
+    """Smallest opacity of a pixel that shows an object."""
+    logits_at_once = 1 << 18
+    """Logits in memory at a time: 1 MB, which fits the cache."""
+    pixels_at_once = 1 << 15
+    """Pixels whose contributions are in memory at a time (12 MB)."""
 
 
 def label_image(
     features: torch.Tensor | np.ndarray,
     alpha: torch.Tensor | np.ndarray,
     classifier: IdentityClassifier,
-    min_alpha: float = MIN_ALPHA,
+    min_alpha: float = LabelTuning.min_alpha,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Most probable object id of every pixel of a rendered identity image.
 
@@ -56,15 +60,15 @@ def label_image(
         return ids, confidence
     weight, bias = torch.from_numpy(classifier.weight).T, torch.from_numpy(classifier.bias)
     vectors = features.reshape(len(features), -1).T
-    step = max(1, _VALUES_AT_ONCE // len(classifier))
+    step = max(1, LabelTuning.logits_at_once // len(classifier))
     with torch.inference_mode():
         for start in range(0, len(vectors), step):
             part = slice(start, start + step)
             logits = torch.addmm(bias, vectors[part], weight)
             best = logits.numpy().argmax(1)  # torch's own takes several times longer
             highest = logits.gather(1, torch.from_numpy(best)[:, None])
-            sums = logits.sub_(highest).exp_().sum(1).add_((NOTHING_LOGIT - highest[:, 0]).exp_())
-            something = (highest[:, 0] > NOTHING_LOGIT).numpy()
+            sums = logits.sub_(highest).exp_().sum(1).add_((IdentityVectorTuning.nothing_logit - highest[:, 0]).exp_())
+            something = (highest[:, 0] > IdentityVectorTuning.nothing_logit).numpy()
             confidence.reshape(-1)[part] = sums.reciprocal_().numpy()
             ids.reshape(-1)[part] = np.where(something, classifier.class_ids[best], 0)
     empty = (alpha < min_alpha).numpy() | (ids == 0)
@@ -94,7 +98,7 @@ def vote_label_image(
     rasterizer: CpuRasterizer,
     view: RenderBuffers,
     labels: np.ndarray,
-    min_alpha: float = MIN_ALPHA,
+    min_alpha: float = LabelTuning.min_alpha,
     stride: int = 1,
 ) -> np.ndarray:
     """For every pixel the label with the largest rendering weight, uint16 [H, W]; 0 where alpha is below `min_alpha` or
@@ -115,8 +119,8 @@ def vote_label_image(
     covered = (view.alpha[::stride, ::stride] >= min_alpha).numpy()
     pixels = looked_at[covered]
     found = np.zeros(len(pixels), np.uint16)
-    for start in range(0, len(pixels), _PIXELS_AT_ONCE):
-        part = slice(start, start + _PIXELS_AT_ONCE)
+    for start in range(0, len(pixels), LabelTuning.pixels_at_once):
+        part = slice(start, start + LabelTuning.pixels_at_once)
         found[part] = rasterizer.pixel_terms(pixels[part]).labels(labels)[0]
     ids = np.zeros(covered.shape, np.uint16)
     ids[covered] = found

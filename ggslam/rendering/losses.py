@@ -18,7 +18,7 @@ import torch
 from torch.nn.functional import conv2d
 
 from ggslam.errors import RenderError
-from ggslam.scene.identity import NOTHING_LOGIT
+from ggslam.scene.identity import IdentityVectorTuning
 
 
 def color_loss(image: torch.Tensor, target: torch.Tensor, dssim_weight: float = 0.2) -> torch.Tensor:
@@ -119,7 +119,7 @@ def neighbour_loss(logits: torch.Tensor, neighbour_logits: torch.Tensor) -> torc
 
 def _log_softmax(logits: torch.Tensor) -> torch.Tensor:
     """Of the classes and, in the last place, of being nothing: [..., C + 1]."""
-    nothing = torch.full_like(logits[..., :1], NOTHING_LOGIT)
+    nothing = torch.full_like(logits[..., :1], IdentityVectorTuning.nothing_logit)
     return torch.log_softmax(torch.cat([logits, nothing], -1), -1)
 
 

@@ -13,10 +13,18 @@ from scipy.spatial import cKDTree
 from ggslam.errors import RenderError
 from ggslam.rendering.types import PARAMETERS, Gaussians, GaussianTensors, check_gaussians
 from ggslam.scene.gaussian_map import GaussianMap, rgb_to_sh
+from ggslam.system.tuning import Tuning
 
 _LABELS = ("birth_keyframe", "object_id")
-_COLOR_SLACK = 1e-3
-"""By which rounding may bring a colour out of 0 to 1."""
+
+
+class ModelTuning(Tuning):
+    """Checks of a model's values."""
+
+    color_slack = 1e-3
+    """Distance from [0, 1] that rounding may give a colour."""
+
+
 _SH_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 DEFAULT_RATES: Mapping[str, float] = {
     "means": 6e-4, "quaternions": 4e-3, "log_scales": 1e-2, "opacity_logits": 5e-2, "sh": 1.8e-2, "features": 1e-2,
@@ -98,7 +106,7 @@ class GaussianModel(torch.nn.Module):
             raise RenderError(f"from_points: expected points and colors [N, 3], found {means.shape} and {rgb.shape}")
         if not np.isfinite(means.numpy()).all():
             raise RenderError(f"from_points: point {int((~torch.isfinite(means)).any(1).int().argmax())} is not finite")
-        if not (rgb >= -_COLOR_SLACK).all() or not (rgb <= 1 + _COLOR_SLACK).all():
+        if not (rgb >= -ModelTuning.color_slack).all() or not (rgb <= 1 + ModelTuning.color_slack).all():
             low, high = float(rgb.min()), float(rgb.max())
             raise RenderError(
                 f"from_points: colors reach from {low:g} to {high:g}, expected uint8, or floating-point numbers 0 to 1"

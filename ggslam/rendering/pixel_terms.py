@@ -12,7 +12,7 @@ import ctypes
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from ggslam.errors import CoreInputError, RenderError
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.gaussian_map import GaussianMap
 
-MAX_CHANNELS = 64
+MAX_CHANNELS: Final = 64
+"""Most channels of a feature image: the compiled core's limit."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ This file is the contract; the other backends are tested against it.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import torch
 
@@ -33,13 +33,20 @@ from ggslam.rendering.types import LOW_PASS, Gaussians, RenderBuffers, active_co
 from ggslam.scene.camera import Camera
 from ggslam.scene.harmonics import spherical_harmonics
 
-MIN_ALPHA = 1.0 / 255.0
-MAX_ALPHA = 0.999
-MIN_TRANSMITTANCE = 1e-4
-FRUSTUM_MARGIN = 0.15
-MAX_DEPTH = 1e6
-LOG_SCALE_RANGE = (-23.0, 10.0)
-QUATERNION_NORM2_RANGE = (1e-20, 1e20)
+MIN_ALPHA: Final = 1.0 / 255.0
+"""Smallest alpha that is drawn, as in 3D Gaussian Splatting."""
+MAX_ALPHA: Final = 0.999
+"""Largest alpha of one Gaussian."""
+MIN_TRANSMITTANCE: Final = 1e-4
+"""Transmittance at which a pixel is finished."""
+FRUSTUM_MARGIN: Final = 0.15
+"""Share of the image size by which projections are linearised beyond the border."""
+MAX_DEPTH: Final = 1e6
+"""Largest depth that is drawn."""
+LOG_SCALE_RANGE: Final = (-23.0, 10.0)
+"""Range of logarithms of scales that are drawn."""
+QUATERNION_NORM2_RANGE: Final = (1e-20, 1e20)
+"""Range of squared norms of quaternions that are drawn."""
 
 
 def render_reference(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "fea
 """Names of the parameter arrays of a set of Gaussians."""
 
 
-LOW_PASS_3DGS = 0.3
+LOW_PASS_3DGS: Final = 0.3
 """Pixels^2 that 3D Gaussian Splatting, and viewers that follow it, add to both variances of a projected Gaussian."""
 LOW_PASS = LOW_PASS_3DGS
 """Ours: the same, so that a map looks alike everywhere. Trained with 0.1 and drawn with 0.3, maps lose up to 4 dB."""

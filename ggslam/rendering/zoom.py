@@ -20,10 +20,16 @@ from ggslam.rendering.types import LOW_PASS
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 
-MOST_VIEWS = 300
-"""So many views are asked, evenly chosen: the closest among them is nearly the closest of all."""
-_NEAR_M = 0.05
+
+class ZoomTuning(Tuning):
+    """Views that a map was trained from."""
+
+    max_views = 300
+    """Most views that are tested, spread evenly: the closest of them is nearly the closest of all."""
+    near_m = 0.05
+    """Smallest depth in metres."""
 
 
 @dataclass(frozen=True)
@@ -67,16 +73,18 @@ class ZoomWidening:
         """Smallest depth, float64 [N], in metres, at which a view has each of the points [N, 3] in its image; of
         points in no image, their distance from the nearest camera. Depth in views of another camera is as if `camera`
         had pixels as large there."""
-        chosen = np.unique(np.linspace(0, len(self.T_world_camera) - 1, MOST_VIEWS).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(self.T_world_camera) - 1, ZoomTuning.max_views).round().astype(int))
         depth, distance = np.full(len(points), np.inf), np.full(len(points), np.inf)
         focal = np.sqrt(self.camera.fx * self.camera.fy)
         for T, c in ((self.T_world_camera[i], self.cameras[i] if self.cameras else self.camera) for i in chosen):
             larger = 1.0 if c == self.camera else focal / np.sqrt(c.fx * c.fy)
             R, t = inverse(T)[:3, :3], inverse(T)[:3, 3]
             seen = points @ R.T + t
-            z = np.maximum(seen[:, 2], _NEAR_M)
+            z = np.maximum(seen[:, 2], ZoomTuning.near_m)
             u, v = c.fx * seen[:, 0] / z + c.cx, c.fy * seen[:, 1] / z + c.cy
-            inside = (seen[:, 2] > _NEAR_M) & (u > -0.5) & (v > -0.5) & (u < c.width - 0.5) & (v < c.height - 0.5)
+            inside = (
+                (seen[:, 2] > ZoomTuning.near_m) & (u > -0.5) & (v > -0.5) & (u < c.width - 0.5) & (v < c.height - 0.5)
+            )
             depth[inside] = np.minimum(depth[inside], larger * z[inside])
             distance = np.minimum(distance, larger * np.linalg.norm(seen, axis=1))
-        return np.where(np.isfinite(depth), depth, np.maximum(distance, _NEAR_M))
+        return np.where(np.isfinite(depth), depth, np.maximum(distance, ZoomTuning.near_m))

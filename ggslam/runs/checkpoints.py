@@ -28,12 +28,18 @@ from ggslam.system.array_file import PendingFile, WrittenFile, read_array_file, 
 from ggslam.system.atomic import make_folder, sync_folder
 from ggslam.system.kept_arrays import KeptArrays
 from ggslam.system.links import refuse_link, refuse_links_below, remove_folder
+from ggslam.system.tuning import Tuning
 
 FOLDER = "checkpoints"
 _STATE = re.compile(r"state-(\d{6,})\.bin")
 _KEPT = re.compile(r"kept-(\d{6,})\.bin")
-STATES = 2
-"""Newest states that are kept."""
+
+
+class CheckpointTuning(Tuning):
+    """How many states are kept."""
+
+    states = 2
+    """Newest states that are kept."""
 
 
 def has_checkpoints(run: Path) -> bool:
@@ -123,9 +129,9 @@ class Checkpoints:
         state.finish()
         sync_folder(self.folder)
         self._states.append(number)
-        for old in self._states[:-STATES]:
+        for old in self._states[: -CheckpointTuning.states]:
             self._path(old).unlink(missing_ok=True)
-        del self._states[:-STATES]
+        del self._states[: -CheckpointTuning.states]
 
     def settle(self) -> None:
         """Waits until the last state is on the disk.

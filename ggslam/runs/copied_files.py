@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ggslam.errors import RunFolderError
 from ggslam.runs.writing import TRAJECTORIES
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, MAX_TEXT_BYTES, copy_untrusted, copy_untrusted_folder
+from ggslam.system.untrusted_files import FileTuning, copy_untrusted, copy_untrusted_folder
 
 _TEXT = (".txt", ".json", ".yaml", ".csv")
 
@@ -28,9 +28,9 @@ def copy_files(run: Path, staged: Path, names: Iterable[str], renders: bool = Fa
     """
     for name in names:
         if (run / name).is_file():
-            limit = MAX_TEXT_BYTES if name.endswith(_TEXT) else None
+            limit = FileTuning.max_text_bytes if name.endswith(_TEXT) else None
             copy_untrusted(run / name, staged / name, limit, RunFolderError)
     if (run / TRAJECTORIES).is_dir():
-        copy_untrusted_folder(run / TRAJECTORIES, staged / TRAJECTORIES, MAX_TEXT_BYTES, RunFolderError)
+        copy_untrusted_folder(run / TRAJECTORIES, staged / TRAJECTORIES, FileTuning.max_text_bytes, RunFolderError)
     if renders and (run / "renders").is_dir():
-        copy_untrusted_folder(run / "renders", staged / "renders", MAX_IMAGE_BYTES, RunFolderError)
+        copy_untrusted_folder(run / "renders", staged / "renders", FileTuning.max_image_bytes, RunFolderError)

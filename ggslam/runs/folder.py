@@ -44,9 +44,9 @@ from ggslam.runs.map_index import MapInParts
 from ggslam.runs.publishing import change_files, publish_run
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoversRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.records.verdict import RunVerdict

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ggslam.errors import RunFolderError
 from ggslam.runs.checkpoints import FOLDER as CHECKPOINTS
-from ggslam.runs.records.mark import FileRecord, RunRecord
+from ggslam.runs.records.run_json import FileRecord, RunRecord
 from ggslam.system.untrusted_files import is_plain_name, open_untrusted
 
 Files = dict[str, FileRecord]

@@ -24,6 +24,7 @@ import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -52,13 +53,13 @@ from ggslam.runs.publishing import publish_run
 from ggslam.runs.records.container import CONTAINER_FORMAT, CONTAINER_VERSION, ContainerRecord
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import FileRecord, RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
+from ggslam.runs.records.run_json import FileRecord, RunRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import RUN_FILES, TRUTH_FILE
-from ggslam.scene.arrays import MAX_EXPANDED_BYTES, MAX_RATIO, arrays_of, arrays_to_bytes, read_all_arrays
+from ggslam.scene.arrays import ArrayLimits, arrays_of, arrays_to_bytes, read_all_arrays
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.packed_arrays import pack_arrays, pack_bytes, unpack_arrays, unpack_bytes
@@ -76,7 +77,8 @@ _NEEDED = (
 )  # fmt: skip
 _PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, *MOVER_FILES, TABLE, _CLASSIFIER)
 _MEMBERS = frozenset((_HEAD, MAP, _PLACES, PLACES_FILE, *_NEEDED, *_PERHAPS))
-_MOST_KEYFRAMES = (1 << 16) - 2
+_MOST_KEYFRAMES: Final = (1 << 16) - 2
+"""Largest number of a keyframe: 16 bits hold it plus 1."""
 
 
 @dataclass(frozen=True)
@@ -268,7 +270,7 @@ def open_container(path: Path) -> Container:
         told = head.files.get(name)
         if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
             raise FormatError(f"{path}: {name} is damaged: not the content that {_HEAD} tells the checksum of")
-    left = max(MAX_EXPANDED_BYTES, MAX_RATIO * sum(sizes.values()))
+    left = max(ArrayLimits.max_bytes, ArrayLimits.max_ratio * sum(sizes.values()))
     expanded = dict[str, bytes]()
     for member, content in members.items():
         name, inner = _expand(path, member, content, left)
@@ -286,7 +288,7 @@ def _expand(path: Path, name: str, content: bytes, left: int) -> tuple[str, byte
     if not name.endswith(_XZ):
         return name, content
     try:
-        return name.removesuffix(_XZ), unpack_bytes(content, min(MAX_EXPANDED_BYTES, left))
+        return name.removesuffix(_XZ), unpack_bytes(content, min(ArrayLimits.max_bytes, left))
     except FormatError as error:
         raise FormatError(f"{path}: {name}: {error}") from None
 

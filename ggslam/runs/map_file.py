@@ -28,22 +28,29 @@ from ggslam.runs.map_container import is_container, read_contained_map
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoversRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted, printable, read_untrusted
 
-VIEWS = 24
-"""Cameras around a map without a recording."""
+
+class MapViewTuning(Tuning):
+    """Cameras around a map without a recording."""
+
+    views = 24
+    """Number of cameras."""
+    sample = 100_000
+    """Gaussians that tell where the cameras stand, about."""
+
+
 _CAMERA = Camera(960, 720, 800.0, 800.0, 479.5, 359.5)
-_SAMPLED = 100_000
-"""Gaussians that tell where the cameras are to be, about."""
 _STREAMS = (".bin", ".gpcc")
 _log = logging.getLogger(__name__)
 
@@ -128,15 +135,17 @@ class MapFile(RunFolder):
 
     @cached_property
     def _around(self) -> np.ndarray:
-        step = max(1, len(self.opened.rows) // _SAMPLED)
-        return orbit(np.concatenate([b.means.numpy()[::step] for b in self.opened.rows.blocks()]), _CAMERA, VIEWS)
+        step = max(1, len(self.opened.rows) // MapViewTuning.sample)
+        return orbit(
+            np.concatenate([b.means.numpy()[::step] for b in self.opened.rows.blocks()]), _CAMERA, MapViewTuning.views
+        )
 
     def keyframes(self) -> KeyframesRecord:
         """Cameras around the map, or those that the file tells."""
         if self._views is not None:
             return self._views[0]
         frames = [{"frame": i, "keyframe": i, "T_keyframe_camera": np.eye(4), "status": "tracked"}
-                  for i in range(VIEWS)]  # fmt: skip
+                  for i in range(MapViewTuning.views)]  # fmt: skip
         keyframes = [{"index": i, "frame": i, "T_world_camera": pose} for i, pose in enumerate(self._around)]
         return KeyframesRecord.of({"keyframes": keyframes, "frames": frames})
 
@@ -144,7 +153,7 @@ class MapFile(RunFolder):
         """The camera of `keyframes`."""
         if self._views is not None:
             return self._views[1]
-        return SequenceRecord(open=OpenRecord(path=str(self.path)), camera=_CAMERA, frames=VIEWS)
+        return SequenceRecord(open=OpenRecord(path=str(self.path)), camera=_CAMERA, frames=MapViewTuning.views)
 
     def mark(self) -> RunRecord:
         """That of a run that lacks nothing that a map has."""

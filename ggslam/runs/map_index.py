@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -25,13 +26,21 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.atomic import write_text
 from ggslam.system.process_memory import release_early
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted_text
 
 MAP_INDEX = "map_cells.json"
-_VERSION = 1
-_ANYWHERE = 1e12
-CACHE_BYTES = 64_000_000
-"""Cells that were read and may be in view again are kept up to this size."""
+_VERSION: Final = 1
+"""Version of the index."""
+
+
+class MapIndexTuning(Tuning):
+    """How a map in cells is read."""
+
+    anywhere_m = 1e12
+    """Distance that stands for "everywhere", in metres."""
+    cache_bytes = 64_000_000
+    """Bytes of cells that are kept in memory because they may be in view again."""
 
 
 def write_map_index(path: Path, cells: GaussianCells) -> None:
@@ -63,7 +72,7 @@ class MapIndex:
     @staticmethod
     def of_whole(count: int) -> MapIndex:
         """That of a map that is one cell, whose Gaussians may be anywhere."""
-        far = np.full((1, 3), _ANYWHERE)
+        far = np.full((1, 3), MapIndexTuning.anywhere_m)
         return MapIndex(np.zeros(1, np.int64), np.array([count]), -far, far)
 
     @staticmethod
@@ -100,7 +109,7 @@ class MapInParts:
     """
 
     def __init__(
-        self, ply: Path | GaussianRows, index: MapIndex | None, cache_bytes: int = CACHE_BYTES
+        self, ply: Path | GaussianRows, index: MapIndex | None, cache_bytes: int = MapIndexTuning.cache_bytes
     ) -> None:
         self.rows = ply if isinstance(ply, GaussianRows) else GaussianRows(ply)
         """For going through all of the map."""

@@ -10,10 +10,15 @@ from ggslam.formats.point_sampling import MapPart, sample_parts
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.runs.map_index import MapInParts
 from ggslam.runs.rendered_views import RenderedViews
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.surface_points import SurfacePointTuning
 
-_FEW_BLOCKS = 8_000
-"""Of the surface, held where a map is read cell by cell because memory is scarce."""
+
+class MapPointsTuning(Tuning):
+    """How much of a surface is in memory."""
+
+    few_blocks = 8_000
+    """Blocks of the surface while a map is read cell by cell."""
 
 
 def map_points(
@@ -50,4 +55,5 @@ def points_of_views(
     if discs or not len(views):
         return sample_parts(parts, voxel_size, min_opacity, views.segmented is not None)
     voxel_size = views.usual_voxel() if voxel_size is None else voxel_size
-    return views.points(voxel_size, _FEW_BLOCKS if stored.in_cells else SurfacePointTuning.max_blocks)
+    most = MapPointsTuning.few_blocks if stored.in_cells else SurfacePointTuning.max_blocks
+    return views.points(voxel_size, most)

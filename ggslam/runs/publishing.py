@@ -12,9 +12,9 @@ from pathlib import Path
 
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.runs.manifest import files_in, without
-from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.system.atomic import make_folder, reason_of, sync_folder, write_failure
-from ggslam.system.folder_lock import WAIT_S, folder_lock
+from ggslam.system.folder_lock import LockTuning, folder_lock
 from ggslam.system.links import refuse_links_below
 from ggslam.system.staging import make_staging, publish
 
@@ -56,10 +56,10 @@ def change_files(run: Path, names: Sequence[str]) -> Iterator[None]:
     within, they are known to be unfinished.
 
     Raises:
-        RunFolderError: another process writes to the run for longer than `WAIT_S`, there is a link among the files, or
-            run.json cannot be written.
+        RunFolderError: another process writes to the run for longer than `LockTuning.wait_s`, there is a link among the
+            files, or run.json cannot be written.
     """
-    with folder_lock(run, wait_s=WAIT_S):
+    with folder_lock(run, wait_s=LockTuning.wait_s):
         refuse_links_below(run, [RunRecord.FILE, *names])
         mark = RunRecord.read(run)
         if mark.files is None:  # a run of before there were manifests

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import InputError
-from ggslam.formats.point_sampling import USUAL_VOXEL
+from ggslam.formats.point_sampling import PointSamplingTuning
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.geometry.scene_size import scale_of_depth, voxel_times
 from ggslam.mapping.keyframe import ELSEWHERE
@@ -26,22 +26,26 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.posed_view import PosedView
 from ggslam.volumes.surface_points import SurfacePointTuning, surface_points
 
-MIN_ALPHA = 0.5
-"""Where the map covers less of a pixel than this, the pixel has no rendered depth."""
-SPREAD = 0.02
-"""A pixel has no rendered depth where mean and median of what it is blended of differ by more than this share: along
-outlines it is blended of two surfaces, and its mean lies between them."""
-_COARSE = 0.25
-"""Size of views that only tell how far they reach."""
-_FINEST = 4.0
-"""Views are rendered at most at so many times the training views' size, for voxels small against their pixels."""
-LARGEST_VOXEL = 1.0
-"""Metres."""
-_PIXELS_A_VOXEL = 1.5
-"""A pixel spans no more voxels than this at the usual depth."""
+
+class RenderedViewTuning(Tuning):
+    """When a pixel has rendered depth, and at which size views are rendered."""
+
+    min_alpha = 0.5
+    """Smallest cover of a pixel with depth."""
+    max_spread = 0.02
+    """Largest difference of mean and median depth, as a share: along outlines, two surfaces are blended."""
+    coarse = 0.25
+    """Size of views that only tell how far they reach, as a share."""
+    finest = 4.0
+    """Largest size of views, in sizes of the training views, for voxels small against their pixels."""
+    max_voxel_m = 1.0
+    """Largest voxel, in metres."""
+    voxels_per_pixel = 1.5
+    """Most voxels that a pixel spans at the usual depth."""
 
 
 @dataclass
@@ -120,18 +124,20 @@ class RenderedViews:
         )
         assert drawn.median_depth is not None
         alpha, mean, median = drawn.alpha.numpy(), drawn.expected_depth.numpy(), drawn.median_depth.numpy()
-        sure = (alpha >= MIN_ALPHA) & (np.abs(mean - median) <= SPREAD * median)
+        covered, spread = alpha >= RenderedViewTuning.min_alpha, RenderedViewTuning.max_spread
+        sure = covered & (np.abs(mean - median) <= spread * median)
         depth = np.where(sure, mean, 0).astype(np.float32)
         if only_depth:
             return PosedView(depth, camera, T)
-        color = color_to_uint8(drawn.image.numpy() / np.maximum(alpha, MIN_ALPHA))  # rendered over black
+        cover = np.maximum(alpha, RenderedViewTuning.min_alpha)
+        color = color_to_uint8(drawn.image.numpy() / cover)  # rendered over black
         ids = None if self.segmented is None else object_ids(rasterizer, drawn, self.segmented(gaussians))
         return PosedView(depth, camera, T, color, ids)
 
     def usual_voxel(self) -> float:
         """Edge of voxels that suits the map, a whole number of centimetres: 1 in rooms, more where most of what is seen
         is farther away, in halls or where depth has a wrong unit."""
-        return min(USUAL_VOXEL * self._times(), LARGEST_VOXEL)
+        return min(PointSamplingTuning.voxel_m * self._times(), RenderedViewTuning.max_voxel_m)
 
     def _times(self) -> int:
         """Size of the scene against a room's, see `geometry.scene_size.voxel_times`."""
@@ -141,14 +147,14 @@ class RenderedViews:
     def zoom_for(self, voxel_size: float) -> float:
         """How many times larger than the keyframes' images views have to be for voxels of this size, metres."""
         spacings = [depth / focal for depth, focal in self._usual_depths()]
-        wanted = float(np.median(spacings)) / (_PIXELS_A_VOXEL * voxel_size) if spacings else 1.0
-        return float(np.clip(wanted, 1, _FINEST))
+        wanted = float(np.median(spacings)) / (RenderedViewTuning.voxels_per_pixel * voxel_size) if spacings else 1.0
+        return float(np.clip(wanted, 1, RenderedViewTuning.finest))
 
     def _usual_depths(self) -> list[tuple[float, float]]:
         """Median depth of some of the views, metres, and their focal length, pixels."""
         found = []
         for number in np.linspace(0, len(self) - 1, min(len(self), 8)).astype(int):
-            depth = self.view(number, _COARSE, only_depth=True).depth
+            depth = self.view(number, RenderedViewTuning.coarse, only_depth=True).depth
             if (depth > 0).any():
                 found.append((float(np.median(depth[depth > 0])), self.cameras[number].fx))
         return found
@@ -161,13 +167,14 @@ class RenderedViews:
             VoxelError: voxels too small for what a view shows.
             InputError: an impossible voxel size.
         """
-        if not 1e-3 <= voxel_size <= LARGEST_VOXEL:
-            raise InputError(f"voxel size: expected 0.001 to {LARGEST_VOXEL:g} m, found {voxel_size:g}")
+        if not 1e-3 <= voxel_size <= RenderedViewTuning.max_voxel_m:
+            most = RenderedViewTuning.max_voxel_m
+            raise InputError(f"voxel size: expected 0.001 to {most:g} m, found {voxel_size:g}")
         views = self.in_order()
         zoom, times = views.zoom_for(voxel_size), views._times()
 
         def look(number: int, coarse: bool) -> PosedView:
-            return views.view(number, _COARSE if coarse else zoom, only_depth=coarse)
+            return views.view(number, RenderedViewTuning.coarse if coarse else zoom, only_depth=coarse)
 
         with_ids = self.segmented is not None
         yield from surface_points(look, len(views), voxel_size, with_ids, most_blocks, times=times)

@@ -25,7 +25,7 @@ from ggslam.slam.result import LearnedObjects
 from ggslam.slam.saved_places import KEYFRAME_CAMERAS, PLACES_FILE
 from ggslam.slam.slam import Slam
 from ggslam.system.array_forms import Form, PoseForm, check_arrays
-from ggslam.system.images import MAX_PIXELS
+from ggslam.system.images import PictureLimits
 from ggslam.tracking.settings import DepthNoise
 
 _NEEDED = "to grow its map, the images of its keyframes are needed"
@@ -39,7 +39,7 @@ class OtherImagesError(Exception):
 def camera_of(row: np.ndarray) -> Camera:
     """The camera of a row of places.npz. Raises FormatError if it is none, or has more pixels than images may have."""
     check_arrays({"camera": row}, {"camera": Form("float", 6, finite=True)}, "places")
-    if not (row[:2] >= 1).all() or row[0] * row[1] > MAX_PIXELS or not (row[2:4] > 0).all():
+    if not (row[:2] >= 1).all() or row[0] * row[1] > PictureLimits.max_pixels or not (row[2:4] > 0).all():
         raise FormatError(f"places: 'camera': impossible: {row.tolist()}")
     return Camera(int(row[0]), int(row[1]), *(float(value) for value in row[2:]))
 

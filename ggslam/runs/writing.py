@@ -20,8 +20,8 @@ from ggslam.runs.environment import environment
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import RunRecord, VerdictRecord
 from ggslam.runs.records.movers import MOVER_FILES, MoversRecord
+from ggslam.runs.records.run_json import RunRecord, VerdictRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.records.verdict import RunVerdict

@@ -17,14 +17,21 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ggslam.errors import FormatError, GgslamError
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, check_zip, open_zip
 
 T = TypeVar("T")
-MAX_EXPANDED_BYTES = 64 << 20
-"""What compressed arrays may expand to in memory whatever their file's size; beyond it at most `MAX_RATIO` times that
-size. ggslam writes its arrays uncompressed."""
-MAX_RATIO = 16
+
+
+class ArrayLimits(Tuning):
+    """Limits of compressed arrays in untrusted files."""
+
+    max_bytes = 64 << 20
+    """Bytes that compressed arrays may expand to, whatever the size of their file. ggslam writes arrays
+    uncompressed."""
+    max_ratio = 16
+    """Largest expansion beyond that, in multiples of the file's size."""
 
 
 def arrays_to_bytes(**arrays: np.ndarray) -> bytes:
@@ -121,7 +128,9 @@ def arrays_of(file: IO[bytes], what: str, chosen: Callable[[Any], T]) -> T:
             check_zip(archive)
             members = archive.infolist()
             held = sum(member.compress_size for member in members)
-            _check_claim(sum(member.file_size for member in members), max(MAX_EXPANDED_BYTES, MAX_RATIO * held))
+            _check_claim(
+                sum(member.file_size for member in members), max(ArrayLimits.max_bytes, ArrayLimits.max_ratio * held)
+            )
             for member in members:
                 _check_member(archive, member)
         file.seek(0)

@@ -10,22 +10,25 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-
-FARTHEST_SCENE_M = 100.0
-"""No depth camera sees farther; a room in millimetres or centimetres has numbers above it."""
+from ggslam.system.tuning import Tuning
 
 
-_FARTHEST_SCENE_CM = 1000.0
-"""Larger numbers are hardly centimetres: no camera for rooms sees 10 m in half of its pixels."""
+class FrameCheckTuning(Tuning):
+    """When depth has the wrong unit."""
+
+    max_median_m = 100.0
+    """Largest median depth in metres. Millimetres or centimetres give larger numbers."""
+    max_median_cm = 1000.0
+    """Largest median depth in centimetres. Larger numbers are millimetres: half of a room is closer than 10 m."""
 
 
 def wrong_unit(depth: np.ndarray) -> str:
     """What to say of a depth image [H, W] that cannot be in metres; empty if it can. Looks at every eighth pixel and
     row."""
     median = _median(depth)
-    if median <= FARTHEST_SCENE_M:
+    if median <= FrameCheckTuning.max_median_m:
         return ""
-    if median <= _FARTHEST_SCENE_CM:
+    if median <= FrameCheckTuning.max_median_cm:
         return (
             f"depth looks like millimetres or centimetres (median {median:.0f}), expected metres: divide millimetres "
             "by 1000, centimetres by 100"

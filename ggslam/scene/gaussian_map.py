@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -15,17 +15,17 @@ from ggslam.errors import FormatError, InputError
 from ggslam.scene.harmonics import harmonic_rotations
 from ggslam.system.savable import savable
 
-SH_C0 = 0.28209479177387814
+SH_C0: Final = 0.28209479177387814
 """Zeroth spherical-harmonic constant: colour = 0.5 + SH_C0 * sh[0] for degree 0."""
 
 _PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
 _BOOKKEEPING = ("birth_keyframe", "object_id", "updates", "feature_updates", "vote_ids", "vote_weights")
-MOST_UPDATES = 2**30
-"""Steps of an optimizer that a Gaussian may have seen: counters of 32 bits go on from there."""
+MOST_UPDATES: Final = 2**30
+"""Most optimizer steps that a Gaussian may have seen: counters of 32 bits continue from there."""
 _ZERO_AT_BIRTH = ("updates", "feature_updates", "vote_ids", "vote_weights")
 _MOMENTS = ("first", "second")
-VOTE_SLOTS = 4
-"""Object ids that a Gaussian keeps votes for."""
+VOTE_SLOTS: Final = 4
+"""Object ids that a Gaussian keeps votes for. The compiled core and saved maps have as many."""
 
 
 def rgb_to_sh(rgb: torch.Tensor) -> torch.Tensor:

@@ -9,8 +9,16 @@ from functools import cache
 import numpy as np
 import torch
 
-_DIRECTIONS = 64
-_ROUNDING = 1e-12
+from ggslam.system.tuning import Tuning
+
+
+class HarmonicsTuning(Tuning):
+    """Computation of rotations of spherical harmonics."""
+
+    directions = 64
+    """Random directions that the matrices are fitted to."""
+    max_rounding = 1e-12
+    """Largest distance of an entry from a whole number that it is rounded to."""
 
 
 def spherical_harmonics(directions: torch.Tensor, count: int) -> torch.Tensor:
@@ -59,12 +67,12 @@ def harmonic_rotations(R_new_old: np.ndarray, count: int) -> np.ndarray:
     back = torch.from_numpy(directions @ np.asarray(R_new_old, np.float64))  # rows d^T R = (R^T d)^T
     matrices = inverse @ spherical_harmonics(back, count).numpy()
     whole = np.rint(matrices)
-    return np.where(np.abs(matrices - whole) < _ROUNDING, whole, matrices)
+    return np.where(np.abs(matrices - whole) < HarmonicsTuning.max_rounding, whole, matrices)
 
 
 @cache
 def _directions(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors [n, 3], and the pseudo-inverse [count, n] of their harmonics."""
-    vectors = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    vectors = np.random.default_rng(0).normal(size=(HarmonicsTuning.directions, 3))
     directions = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return directions, np.linalg.pinv(spherical_harmonics(torch.from_numpy(directions), count).numpy())

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -18,11 +18,17 @@ from ggslam.errors import FormatError
 from ggslam.scene.arrays import arrays_to_bytes, read_arrays
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-IDENTITY_CHANNELS = 16
-"""Length of an identity vector."""
-NOTHING_LOGIT = 1.0
-"""Logit of being no object. Vectors of what was never labelled stay near zero, and all logits of a zero vector too."""
+IDENTITY_CHANNELS: Final = 16
+"""Length of an identity vector: a layout of arrays that saved maps and compiled kernels share."""
+
+
+class IdentityVectorTuning(Tuning):
+    """Identity vectors and their classifier."""
+
+    nothing_logit = 1.0
+    """Logit of belonging to no object. Vectors that were never labelled stay near zero, and so do their logits."""
 
 
 @savable()
@@ -55,10 +61,10 @@ class IdentityClassifier:
     def probabilities(self, features: np.ndarray) -> np.ndarray:
         """Probability of each class, float32 [..., C]: softmax over the classes and no object (the rest)."""
         z = self.logits(features)
-        highest = z.max(-1, keepdims=True, initial=NOTHING_LOGIT)
+        highest = z.max(-1, keepdims=True, initial=IdentityVectorTuning.nothing_logit)
         z -= highest
         np.exp(z, out=z)
-        z /= z.sum(-1, keepdims=True) + np.exp(NOTHING_LOGIT - highest)
+        z /= z.sum(-1, keepdims=True) + np.exp(IdentityVectorTuning.nothing_logit - highest)
         return z
 
     def labels(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -70,8 +76,8 @@ class IdentityClassifier:
         z = self.logits(features)
         best = z.argmax(-1)
         highest = np.take_along_axis(z, best[..., None], -1)
-        probability = 1 / (np.exp(z - highest).sum(-1) + np.exp(NOTHING_LOGIT - highest[..., 0]))
-        something = highest[..., 0] > NOTHING_LOGIT
+        probability = 1 / (np.exp(z - highest).sum(-1) + np.exp(IdentityVectorTuning.nothing_logit - highest[..., 0]))
+        something = highest[..., 0] > IdentityVectorTuning.nothing_logit
         return np.where(something, self.class_ids[best], 0).astype(np.uint16), np.where(something, probability, 0)
 
     def class_of(self, object_id: int) -> int:

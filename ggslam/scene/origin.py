@@ -11,23 +11,30 @@ from __future__ import annotations
 
 import numpy as np
 
-FAR = 1000.0
-"""Metres from an origin, along an axis, beyond which another one is chosen."""
-GRID = 100.0
-"""Metres: origins are whole multiples of it."""
-_FINE = 1e-4
-"""Metres: coordinates that single precision would round more coarsely are written in double precision."""
+from ggslam.system.tuning import Tuning
+
+
+class OriginTuning(Tuning):
+    """Choice of an origin."""
+
+    far_m = 1000.0
+    """Largest distance from an origin along an axis, in metres, before another one is chosen."""
+    grid_m = 100.0
+    """Origins are multiples of this many metres."""
+    max_rounding_m = 1e-4
+    """Largest rounding error of coordinates, in metres, that are written in single precision."""
 
 
 def is_far(position: np.ndarray, origin: np.ndarray | None = None) -> bool:
-    """Whether a position [3] (metres, world) is more than `FAR` from an origin [3] along an axis; None: from zero."""
-    return bool(np.abs(np.asarray(position, np.float64) - (0 if origin is None else origin)).max() > FAR)
+    """Whether a position [3] (metres, world) is more than `OriginTuning.far_m` from an origin [3] along an axis. None
+    is the origin at zero."""
+    return bool(np.abs(np.asarray(position, np.float64) - (0 if origin is None else origin)).max() > OriginTuning.far_m)
 
 
 def local_origin(position: np.ndarray) -> np.ndarray:
     """The origin, float64 [3], to compute with around a position [3] (metres, world): zero unless that is far."""
     position = np.asarray(position, np.float64)
-    return np.rint(position / GRID) * GRID + 0.0 if is_far(position) else np.zeros(3)
+    return np.rint(position / OriginTuning.grid_m) * OriginTuning.grid_m + 0.0 if is_far(position) else np.zeros(3)
 
 
 def moved_pose(T: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -42,4 +49,4 @@ def stored_positions(points: np.ndarray) -> np.ndarray:
     1 km from zero, else float64."""
     points = np.asarray(points)
     step = np.spacing(np.float32(np.abs(points).max(initial=0)))
-    return points.astype(np.float32 if step <= _FINE else np.float64)
+    return points.astype(np.float32 if step <= OriginTuning.max_rounding_m else np.float64)

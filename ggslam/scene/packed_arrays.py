@@ -16,10 +16,19 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.scene.arrays import MAX_EXPANDED_BYTES, MAX_RATIO
+from ggslam.scene.arrays import ArrayLimits
+from ggslam.system.tuning import Tuning
 
 _MAGIC = b"ggslam-arrays-1\n"
-_MEMORY = 128 << 20
+
+
+class PackedArrayLimits(Tuning):
+    """Limits of packed arrays in untrusted files."""
+
+    max_memory = 128 << 20
+    """Most bytes of memory that the decompressor may use."""
+
+
 _PRESET = 9 | lzma.PRESET_EXTREME
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": _PRESET, "lc": 0, "lp": 0, "pb": 0}]
 
@@ -29,14 +38,14 @@ def pack_bytes(data: bytes) -> bytes:
     return lzma.compress(data, preset=_PRESET)
 
 
-def unpack_bytes(data: bytes, most: int = MAX_EXPANDED_BYTES) -> bytes:
+def unpack_bytes(data: bytes, most: int = ArrayLimits.max_bytes) -> bytes:
     """What a .xz file holds.
 
     Raises:
         FormatError: damaged, or more than `most` bytes.
     """
     try:
-        inflater = lzma.LZMADecompressor(lzma.FORMAT_XZ, _MEMORY)
+        inflater = lzma.LZMADecompressor(lzma.FORMAT_XZ, PackedArrayLimits.max_memory)
         content = inflater.decompress(data, most + 1)
     except lzma.LZMAError as error:
         raise FormatError(f"damaged: {error}") from None
@@ -65,15 +74,15 @@ def unpack_arrays(data: bytes) -> dict[str, np.ndarray]:
     """The arrays that `pack_arrays` was given.
 
     Raises:
-        FormatError: damaged, or arrays of more than `MAX_EXPANDED_BYTES` each, or of four times that or `MAX_RATIO`
-            times what is packed together.
+        FormatError: damaged, or an array of more than `ArrayLimits.max_bytes`, or all together of more than four times
+            that and more than `ArrayLimits.max_ratio` times the packed bytes.
     """
     begin = len(_MAGIC) + 4
     if data[: len(_MAGIC)] != _MAGIC or len(data) < begin:
         raise FormatError("no packed arrays of ggslam")
     at = begin + int.from_bytes(data[begin - 4 : begin], "little")
     arrays: dict[str, np.ndarray] = {}
-    left = max(4 * MAX_EXPANDED_BYTES, MAX_RATIO * len(data))
+    left = max(4 * ArrayLimits.max_bytes, ArrayLimits.max_ratio * len(data))
     try:
         for name, kind, shape, way, size in json.loads(data[begin:at]):
             arrays[str(name)] = _array(data[at : at + size], np.dtype(kind), shape, way, left)
@@ -90,7 +99,7 @@ def _array(data: bytes, kind: np.dtype, shape: Any, way: str, left: int) -> np.n
     if kind.kind not in "biuf" or any(not isinstance(n, int) or n < 0 for n in shape):
         raise FormatError(f"damaged: an array of {kind}")
     size = math.prod(shape) * kind.itemsize
-    if size > min(MAX_EXPANDED_BYTES, left):
+    if size > min(ArrayLimits.max_bytes, left):
         raise FormatError(f"damaged: an array of {size} bytes")
     content = unpack_bytes(data, size)
     if size == 0:

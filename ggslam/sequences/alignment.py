@@ -10,20 +10,30 @@ import cv2
 import numpy as np
 
 from ggslam.scene.frame import Frame
-
-WIDTH = 320
-"""Images are looked at with about so many columns."""
-JUMP = 1.06
-"""A surface counts as in front of another one that is farther by this factor."""
-LARGEST_SHIFT = 0.06
-"""Share of the image's width."""
-FEWEST_OUTLINES, FEWEST_FRAMES = 0.002, 3
-"""Share of the pixels of a frame that have to be outlines for it to count, and how many frames have to."""
-SCALES = (0.86, 0.9, 0.93, 0.96, 0.98, 1.0, 1.02, 1.04, 1.07, 1.1, 1.14)
+from ggslam.system.tuning import Tuning
 
 
-LEAST_OFF, LEAST_GAIN, LEAST_RATIO = 0.012, 0.4, 0.3
-"""Thresholds of a warning: displacement (share of the width), gain (absolute, and relative to the strength as is)."""
+class AlignmentTuning(Tuning):
+    """How depth is laid over colour, and when a displacement is reported."""
+
+    width = 320
+    """Columns of the images that are compared, about."""
+    jump = 1.06
+    """A surface lies behind another one if it is farther by this factor."""
+    max_shift = 0.06
+    """Largest displacement that is tried, as a share of the image's width."""
+    min_outlines = 0.002
+    """Fewest outlines in a frame that counts, as a share of its pixels."""
+    min_frames = 3
+    """Fewest frames that count."""
+    scales = (0.86, 0.9, 0.93, 0.96, 0.98, 1.0, 1.02, 1.04, 1.07, 1.1, 1.14)
+    """Factors by which depth is enlarged."""
+    warn_off = 0.012
+    """Displacement above which a warning is given, as a share of the image's width."""
+    warn_gain = 0.4
+    """Gain above which a warning is given, in standard deviations of the edge image."""
+    warn_gain_share = 0.3
+    """The same as a share of the strength without displacement."""
 
 
 @dataclass(frozen=True)
@@ -51,34 +61,38 @@ class Alignment:
     @property
     def doubtful(self) -> bool:
         """Whether depth fits clearly better somewhere else."""
-        return self.off > LEAST_OFF and self.gain > LEAST_GAIN and self.gain > LEAST_RATIO * self.strength
+        return (
+            self.off > AlignmentTuning.warn_off
+            and self.gain > AlignmentTuning.warn_gain
+            and self.gain > AlignmentTuning.warn_gain_share * self.strength
+        )
 
 
 def measure_alignment(frames: list[Frame]) -> Alignment | None:
     """Compares colour and depth of some frames; None if too few of them show enough outlines."""
-    width = _small_size(frames[0].depth)[0] if frames else WIDTH
-    reach = max(2, round(LARGEST_SHIFT * width))
-    surfaces, weight = np.zeros((len(SCALES), 2 * reach + 1, 2 * reach + 1)), 0
+    width = _small_size(frames[0].depth)[0] if frames else AlignmentTuning.width
+    reach = max(2, round(AlignmentTuning.max_shift * width))
+    surfaces, weight = np.zeros((len(AlignmentTuning.scales), 2 * reach + 1, 2 * reach + 1)), 0
     for frame in frames:
         outlines, edges = outlines_of(frame.depth), edges_of(frame.color)
-        if outlines.sum() < FEWEST_OUTLINES * outlines.size:
+        if outlines.sum() < AlignmentTuning.min_outlines * outlines.size:
             continue
         # Each frame counts alike: one with a picture on the wall has many edges.
-        found = np.stack([_correlation(outlines, edges, scale, reach) for scale in SCALES])
+        found = np.stack([_correlation(outlines, edges, scale, reach) for scale in AlignmentTuning.scales])
         surfaces += found / outlines.sum()
         weight += 1
-    if weight < FEWEST_FRAMES:
+    if weight < AlignmentTuning.min_frames:
         return None
     surfaces /= weight
-    at_rest = float(surfaces[SCALES.index(1.0), reach, reach])
+    at_rest = float(surfaces[AlignmentTuning.scales.index(1.0), reach, reach])
     scale, row, column = (int(i) for i in np.unravel_index(int(surfaces.argmax()), surfaces.shape))
     shift = ((column - reach) / width, (row - reach) / width)
-    return Alignment(shift, SCALES[scale], float(surfaces[scale, row, column]) - at_rest, at_rest)
+    return Alignment(shift, AlignmentTuning.scales[scale], float(surfaces[scale, row, column]) - at_rest, at_rest)
 
 
 def _small_size(image: np.ndarray) -> tuple[int, int]:
     height, width = image.shape[:2]
-    factor = min(1.0, WIDTH / width)
+    factor = min(1.0, AlignmentTuning.width / width)
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
@@ -89,9 +103,9 @@ def outlines_of(depth: np.ndarray) -> np.ndarray:
     known = small > 0
     far = cv2.dilate(small, kernel)
     near = cv2.erode(np.where(known, small, np.float32(1e9)), kernel)
-    outlines = known & (far > JUMP * small) & (small < 1.02 * near)
+    outlines = known & (far > AlignmentTuning.jump * small) & (small < 1.02 * near)
     # The outermost of them: those that touch the farther surface.
-    touching = cv2.dilate(small, np.ones((3, 3), np.uint8)) > JUMP * small
+    touching = cv2.dilate(small, np.ones((3, 3), np.uint8)) > AlignmentTuning.jump * small
     outlines &= touching
     outlines[:3], outlines[-3:], outlines[:, :3], outlines[:, -3:] = False, False, False, False
     return outlines.astype(np.float32)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, open_untrusted
+from ggslam.system.untrusted_files import FileTuning, open_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, check_zip, read_member
 
 
@@ -38,7 +38,7 @@ class Archive:
     def read(self, name: str) -> bytes:
         """Content of a member. Raises SequenceError if it is missing or damaged."""
         try:
-            return read_member(self._zip, name, MAX_IMAGE_BYTES)
+            return read_member(self._zip, name, FileTuning.max_image_bytes)
         except KeyError:
             raise SequenceError(f"{self.path}: holds no {name}") from None
         except ZIP_DAMAGE as error:

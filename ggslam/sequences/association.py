@@ -9,13 +9,19 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import se3_exp, so3_log
+from ggslam.system.plurals import agreeing
+from ggslam.system.tuning import Tuning
 
-TOLERANCE = 0.02
-"""Seconds between colour and depth, as in the TUM benchmark's own tool."""
-FEW = 0.04
-"""Share of the colour images that may lack depth without a word: two clocks of 30 Hz drift past each other."""
-WIDE_TOLERANCE = 0.08
-"""Tried when almost nothing pairs up within `TOLERANCE`."""
+
+class PairingTuning(Tuning):
+    """How colour and depth are paired by time."""
+
+    tolerance_s = 0.02
+    """Largest time between colour and depth, in seconds, as in the tool of the TUM benchmark."""
+    unpaired = 0.04
+    """Share of the colour images that may lack depth without a warning: two clocks of 30 Hz drift past each other."""
+    wide_tolerance_s = 0.08
+    """Largest time in seconds if less than half of the images pair up within `tolerance_s`."""
 
 
 def pair_times(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
@@ -44,7 +50,7 @@ def pair_times(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.nd
 
 
 def pair_images(
-    place: Path, color: np.ndarray, depth: np.ndarray, names: tuple[str, str], few: float = FEW
+    place: Path, color: np.ndarray, depth: np.ndarray, names: tuple[str, str], few: float = PairingTuning.unpaired
 ) -> tuple[list[tuple[int, int]], list[str]]:
     """Pairs (i, j) of colour images and the depth images taken at about the same time, and warnings.
 
@@ -57,19 +63,19 @@ def pair_images(
     Raises:
         SequenceError: nothing pairs up.
     """
-    pairs = pair_times(color, depth, TOLERANCE)
+    pairs = pair_times(color, depth, PairingTuning.tolerance_s)
     if len(pairs) and 2 * len(pairs) >= min(len(color), len(depth)):
         return _as_list(pairs), _left_out(len(color), len(pairs), names, few)
-    wide = pair_times(color, depth, WIDE_TOLERANCE)
+    wide = pair_times(color, depth, PairingTuning.wide_tolerance_s)
     if not len(wide):
         gap = min((np.abs(depth - t).min() for t in color), default=np.inf) if len(depth) else np.inf
         raise SequenceError(
-            f"{place}: no image of {names[0]} is within {WIDE_TOLERANCE} s of one in {names[1]} (closest: {gap:.3f} "
-            f"s); colour spans {span(color)}, depth {span(depth)}"
+            f"{place}: no image of {names[0]} is within {PairingTuning.wide_tolerance_s} s of one in {names[1]} "
+            f"(closest: {gap:.3f} s); colour spans {span(color)}, depth {span(depth)}"
         )
     warning = (
-        f"only {len(pairs)} of {len(color)} colour images have depth within {TOLERANCE} s; {len(wide)} paired within "
-        f"{WIDE_TOLERANCE} s instead"
+        f"only {len(pairs)} of {len(color)} colour images have depth within {PairingTuning.tolerance_s} s; "
+        f"{len(wide)} paired within {PairingTuning.wide_tolerance_s} s instead"
     )
     return _as_list(wide), [warning]
 
@@ -83,10 +89,10 @@ def _left_out(images: int, used: int, names: tuple[str, str], few: float) -> lis
     count = images - used
     if count <= few * images:
         return []
-    have, are = ("has", "is") if count == 1 else ("have", "are")
+    have, are = agreeing(count, "has", "have"), agreeing(count, "is", "are")
     return [
         f"{count} of {images} colour images ({names[0]}) {have} no depth image of the same time ({names[1]}) within "
-        f"{TOLERANCE:g} s and {are} left out"
+        f"{PairingTuning.tolerance_s:g} s and {are} left out"
     ]
 
 

@@ -31,10 +31,16 @@ from ggslam.sequences.camera_files.lens_models import distortion_of
 from ggslam.sequences.camera_files.reading import read_entries
 from ggslam.sequences.json_files import camera_of, check_intrinsics
 from ggslam.sequences.recording import Calibration, DepthCamera, Recording
+from ggslam.system.tuning import Tuning
 
-_LARGEST_NUMBER = 1e300
-FARTHEST_CENTRE = 100.0
-"""Image sizes; no principal point, not even that of a picture cut out of a larger one, lies farther off."""
+
+class CalibrationTuning(Tuning):
+    """Limits on numbers in calibrations."""
+
+    max_number = 1e300
+    """Largest absolute value of any number."""
+    max_centre = 100.0
+    """Largest coordinate of a principal point, in image sizes; crops have large ones."""
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
@@ -51,7 +57,7 @@ def number_entry(path: Path, settings: dict[str, Any], key: str) -> float:
     if key not in settings:
         raise SequenceError(f"{path}: entry '{key}' is missing")
     value = settings[key]
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < _LARGEST_NUMBER:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < CalibrationTuning.max_number:
         raise SequenceError(f"{path}: expected a number for '{key}', found '{value}'")
     return float(value)
 
@@ -61,7 +67,7 @@ def camera_entry(path: Path, settings: dict[str, Any]) -> Camera:
     width, height, fx, fy, cx, cy = (
         number_entry(path, settings, key) for key in ("width", "height", "fx", "fy", "cx", "cy")
     )
-    if abs(cx) > FARTHEST_CENTRE * abs(width) or abs(cy) > FARTHEST_CENTRE * abs(height):
+    if abs(cx) > CalibrationTuning.max_centre * abs(width) or abs(cy) > CalibrationTuning.max_centre * abs(height):
         raise SequenceError(f"{path}: impossible principal point {cx:g}, {cy:g} of an image of {width:g}x{height:g}")
     return camera_of(path, width, height, fx, fy, cx, cy)
 
@@ -89,7 +95,10 @@ def distortion_entry(path: Path, settings: dict[str, Any]) -> tuple[np.ndarray |
     if distortion is None:
         return None, False
     values = distortion if isinstance(distortion, list) else [None]
-    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) < _LARGEST_NUMBER for v in values):
+    if not all(
+        isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) < CalibrationTuning.max_number
+        for v in values
+    ):
         raise SequenceError(f"{path}: expected numbers for 'distortion', found '{distortion}'")
     return distortion_of(path, str(model), np.array(values, float))
 

@@ -8,23 +8,31 @@ import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.sequences.verdicts import Verdict
+from ggslam.system.tuning import Tuning
 
-LEAST_ANGLE, LARGEST_ANGLE = 20.0, 130.0
-"""Degrees: horizontal angles of view of usual lenses."""
-WIDEST_PIXEL = 1.25
-"""Width of a pixel over its height, or the reverse."""
-FARTHEST_OFF = 0.2
-"""Share of the image by which the principal point lies beside its middle."""
-OTHER_SIZE, SAME_SIZE = 1.4, 0.06
-"""Twice the principal point over the size of the image, or the reverse, from which the intrinsics seem to be of another
-size; and how nearly rows and columns have to say the same (natural logarithm)."""
 
-TURNED, LEAST_OBLONG = 0.5, 1.05
-"""Pixels by which the principal point may miss the middle of images of the exchanged size, and width over height (or
-the reverse) from which that is no chance."""
-BESIDE = 0.05
-"""Share of the image by which principal points of lenses lie beside its middle at most, mostly 0.03; those of crops lie
-farther off."""
+class IntrinsicsTuning(Tuning):
+    """When intrinsics are doubted by their own numbers."""
+
+    min_angle_deg = 20.0
+    """Smallest horizontal angle of view of usual lenses, in degrees."""
+    max_angle_deg = 130.0
+    """Largest horizontal angle of view of usual lenses, in degrees."""
+    max_aspect = 1.25
+    """Largest ratio of a pixel's width and height, or the reverse."""
+    max_off = 0.2
+    """Largest distance of the principal point from the middle, as a share of the image."""
+    other_size = 1.4
+    """Ratio of twice the principal point and the image's size, or the reverse, that suggests another size."""
+    same_size = 0.06
+    """Largest difference of that ratio between rows and columns (natural logarithm)."""
+    turned_px = 0.5
+    """Distance of the principal point from the middle of a turned image up to which it is taken for one, in pixels."""
+    min_oblong = 1.05
+    """Ratio of width and height, or the reverse, from which a turned image can be told."""
+    lens_off = 0.05
+    """Distance from the middle, as a share of the image, that lenses stay within; crops may not."""
+
 
 Size = tuple[int, int]
 """(width, height) in pixels."""
@@ -49,11 +57,11 @@ def judge_intrinsics(camera: Camera, stated: Size | None = None, source: str = "
 
 def _odd_focal(camera: Camera, told: str) -> str:
     angle = 2 * np.degrees(np.arctan(camera.width / (2 * camera.fx)))
-    if not LEAST_ANGLE <= angle <= LARGEST_ANGLE:
+    if not IntrinsicsTuning.min_angle_deg <= angle <= IntrinsicsTuning.max_angle_deg:
         size = f"fx {camera.fx:.1f} of images of {camera.width}x{camera.height}"
         return f"intrinsics{told} are suspicious: horizontal angle of view {angle:.0f} degrees ({size}); check fx"
     wide = abs(camera.fy / camera.fx)
-    if not 1 / WIDEST_PIXEL <= wide <= WIDEST_PIXEL:
+    if not 1 / IntrinsicsTuning.max_aspect <= wide <= IntrinsicsTuning.max_aspect:
         text = f"fx {camera.fx:.1f} and fy {camera.fy:.1f} mean pixels {wide:.2f} times as wide as high"
         return f"intrinsics{told} are suspicious: {text}; check fx and fy"
     return ""
@@ -62,7 +70,7 @@ def _odd_focal(camera: Camera, told: str) -> str:
 def doubt_centre(camera: Camera) -> str:
     """What to check of a principal point that lies clearly beside the middle, as that of a crop does; "": nothing. It
     may be right, so that it is no doubt of its own."""
-    if _beside(camera) <= BESIDE:
+    if _beside(camera) <= IntrinsicsTuning.lens_off:
         return ""
     middle = f"{(camera.width - 1) / 2:g}, {(camera.height - 1) / 2:g}"
     here = f"cx {camera.cx:.1f} and cy {camera.cy:.1f}"
@@ -78,7 +86,7 @@ def _quarter_turn(camera: Camera, told: str) -> str:
     """That the principal point is the middle of images with width and height exchanged; "" if it is not."""
     width, height = camera.width, camera.height
     off = max(abs(camera.cx - (height - 1) / 2), abs(camera.cy - (width - 1) / 2))
-    if off > TURNED or max(width, height) < LEAST_OBLONG * min(width, height):
+    if off > IntrinsicsTuning.turned_px or max(width, height) < IntrinsicsTuning.min_oblong * min(width, height):
         return ""
     point = f"the principal point {camera.cx:.1f}, {camera.cy:.1f} is the middle of {height}x{width}"
     return (
@@ -94,7 +102,7 @@ def _off_centre(camera: Camera, inside: bool, told: str) -> str:
         text = f"the principal point {camera.cx:.1f}, {camera.cy:.1f} lies outside of the images of {size}"
         return f"intrinsics{told} cannot be of these images: {text}; check cx and cy, and the size they are for"
     off = _beside(camera)
-    if off <= FARTHEST_OFF:
+    if off <= IntrinsicsTuning.max_off:
         return ""
     text = f"the principal point lies {off:.0%} of the image away from its middle"
     return f"intrinsics{told} are suspicious: {text} ({camera.cx:.1f}, {camera.cy:.1f} of {size}); check cx and cy"
@@ -104,10 +112,10 @@ def _other_size(camera: Camera, stated: Size | None, told: str) -> str:
     """That the principal point is the middle of images of another size; "" if it is not."""
     size = np.array([camera.width, camera.height])
     ratios = 2 * (np.array([camera.cx, camera.cy]) + 0.5) / size
-    if ratios.min() <= 0 or abs(np.log(ratios[0] / ratios[1])) > SAME_SIZE:
+    if ratios.min() <= 0 or abs(np.log(ratios[0] / ratios[1])) > IntrinsicsTuning.same_size:
         return ""
     ratio = float(np.sqrt(ratios.prod()))
-    if 1 / OTHER_SIZE < ratio < OTHER_SIZE:
+    if 1 / IntrinsicsTuning.other_size < ratio < IntrinsicsTuning.other_size:
         return ""
     said = stated or (camera.width, camera.height)
     width, height = np.rint(ratio * np.array(said)).astype(int)

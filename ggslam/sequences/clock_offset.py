@@ -14,20 +14,30 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.frame import Frame
-from ggslam.sequences.alignment import FEWEST_OUTLINES, edges_of, outlines_of
+from ggslam.sequences.alignment import AlignmentTuning, edges_of, outlines_of
 from ggslam.sequences.sequence import Sequence
+from ggslam.system.tuning import Tuning
 
-PLACES = 24
-"""Where in a recording one looks."""
-LARGEST_S, STEP_S = 0.04, 0.002
-"""Offsets that are tried."""
-SHIFTS = np.arange(-2, 3)
-"""Pixels by which outlines may lie off for another reason, of images some 320 columns wide."""
-LEAST_MOTION = 0.5
-"""Pixels that outlines have to move in 10 ms in the fastest frames, for anything to be said."""
-FEWEST_FRAMES, MOST_POINTS = 6, 500
-LARGEST_SPREAD_S = 0.004
-"""Standard error from which an offset is no measurement."""
+
+class ClockTuning(Tuning):
+    """How the time between depth and colour is measured."""
+
+    places = 24
+    """Frames spread over the recording that are compared."""
+    max_offset_s = 0.04
+    """Largest offset that is tried, in seconds."""
+    step_s = 0.002
+    """Step between offsets, in seconds."""
+    shifts_px = np.arange(-2, 3)
+    """Displacements that outlines may have for other reasons, in pixels of the small images."""
+    min_motion_px = 0.5
+    """Motion of outlines in 10 ms in the fastest frames from which an offset can be told, in pixels."""
+    min_frames = 6
+    """Fewest frames with outlines."""
+    max_points = 500
+    """Most outline pixels of a frame."""
+    max_error_s = 0.004
+    """Largest standard error of an offset that is reported, in seconds."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +73,7 @@ class _Outlines:
 def measure_clock_offset(sequence: Sequence) -> ClockOffset | None:
     """Compares depth with colour in frames spread over a recording; None if little moves or few outlines are seen."""
     seen = []
-    for index in np.unique(np.linspace(0, max(len(sequence) - 2, 0), PLACES).round().astype(int)):
+    for index in np.unique(np.linspace(0, max(len(sequence) - 2, 0), ClockTuning.places).round().astype(int)):
         try:
             frame, later = (sequence.frame(int(index) + k, masks=False) for k in (0, 1))
         except SequenceError:
@@ -72,7 +82,7 @@ def measure_clock_offset(sequence: Sequence) -> ClockOffset | None:
         if found is not None:
             seen.append(found)
     motion = [float(np.median(np.linalg.norm(outlines.speeds, axis=1))) * 0.01 for outlines in seen]
-    if len(seen) < FEWEST_FRAMES or np.percentile(motion, 80) < LEAST_MOTION:
+    if len(seen) < ClockTuning.min_frames or np.percentile(motion, 80) < ClockTuning.min_motion_px:
         return None
     scores = np.stack([_scores(outlines) for outlines in seen])
     return _best_offset(scores)
@@ -81,7 +91,7 @@ def measure_clock_offset(sequence: Sequence) -> ClockOffset | None:
 def _outlines(frame: Frame, later: Frame) -> _Outlines | None:
     outlines = outlines_of(frame.depth)
     interval = later.timestamp - frame.timestamp
-    if outlines.sum() < FEWEST_OUTLINES * outlines.size or not interval > 0:
+    if outlines.sum() < AlignmentTuning.min_outlines * outlines.size or not interval > 0:
         return None
     height, width = outlines.shape
     one, other = (
@@ -97,9 +107,13 @@ def _outlines(frame: Frame, later: Frame) -> _Outlines | None:
 def _scores(outlines: _Outlines) -> np.ndarray:
     """Mean strength of edges under the outlines for every offset and shift, float64 [offsets, shifts, shifts]."""
     offsets = _offsets()
-    scores = np.empty((len(offsets), len(SHIFTS), len(SHIFTS)))
-    shifts = np.stack(np.meshgrid(SHIFTS, SHIFTS, indexing="ij"), -1).reshape(-1, 1, 2).astype(np.float32)
-    step = -(-len(outlines.places) // MOST_POINTS)
+    scores = np.empty((len(offsets), len(ClockTuning.shifts_px), len(ClockTuning.shifts_px)))
+    shifts = (
+        np.stack(np.meshgrid(ClockTuning.shifts_px, ClockTuning.shifts_px, indexing="ij"), -1)
+        .reshape(-1, 1, 2)
+        .astype(np.float32)
+    )
+    step = -(-len(outlines.places) // ClockTuning.max_points)
     places, speeds = outlines.places[::step], outlines.speeds[::step]
     for k, offset in enumerate(offsets):
         at = places - offset * speeds + shifts
@@ -109,8 +123,8 @@ def _scores(outlines: _Outlines) -> np.ndarray:
 
 
 def _offsets() -> np.ndarray:
-    count = round(LARGEST_S / STEP_S)
-    return np.arange(-count, count + 1, dtype=np.float32) * np.float32(STEP_S)
+    count = round(ClockTuning.max_offset_s / ClockTuning.step_s)
+    return np.arange(-count, count + 1, dtype=np.float32) * np.float32(ClockTuning.step_s)
 
 
 def _best_offset(scores: np.ndarray) -> ClockOffset | None:
@@ -120,9 +134,9 @@ def _best_offset(scores: np.ndarray) -> ClockOffset | None:
     without = np.array([_peak(part) for part in parts])
     best = _peak(scores.mean(0))
     error = float(np.sqrt((groups - 1) / groups * ((without - without.mean()) ** 2).sum()))
-    if error > LARGEST_SPREAD_S or abs(best) > LARGEST_S - 2 * STEP_S:
+    if error > ClockTuning.max_error_s or abs(best) > ClockTuning.max_offset_s - 2 * ClockTuning.step_s:
         return None
-    return ClockOffset(best, max(error, STEP_S / 2), len(scores))
+    return ClockOffset(best, max(error, ClockTuning.step_s / 2), len(scores))
 
 
 def _peak(scores: np.ndarray) -> float:
@@ -132,4 +146,4 @@ def _peak(scores: np.ndarray) -> float:
     at = int(np.clip(curve.argmax(), 1, len(curve) - 2))
     left, middle, right = curve[at - 1 : at + 2]
     bend = left - 2 * middle + right
-    return float(_offsets()[at] + STEP_S * (0.5 * (left - right) / bend if bend < 0 else 0.0))
+    return float(_offsets()[at] + ClockTuning.step_s * (0.5 * (left - right) / bend if bend < 0 else 0.0))

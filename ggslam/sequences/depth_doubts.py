@@ -37,21 +37,29 @@ from ggslam.sequences.pose_doubts import pairs_apart
 from ggslam.sequences.repeats import find_repeats
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.triangulation import TruePoints, triangulate
-from ggslam.sequences.verdicts import USUAL_MEDIAN_DEPTH, Verdict, judge_inverse_scale
+from ggslam.sequences.verdicts import Verdict, VerdictTuning, judge_inverse_scale
+from ggslam.system.tuning import Tuning
 
 CODES = frozenset({
     "orientation", "depth_side", "depth_kind", "depth_delay", "registration", "depth_repeats", "color_repeats",
     "depth_codes", "depth_noise", "unrelated",
 })  # fmt: skip
 """Of the verdicts that doubt depth itself."""
-LOOKS = 8
-"""Frames spread over the recording that planes are looked for in."""
-POSED = 5
-"""Frames whose points are triangulated by true poses."""
-LEAST_SPREAD = 0.6
-"""Share of the spread as z that another reading may leave at most, by true poses."""
-LARGEST_SPREAD = 0.15
-"""Logarithm: spread from which that says nothing."""
+
+
+class DepthDoubtTuning(Tuning):
+    """How frames are chosen, and when another reading of depth is reported."""
+
+    frames = 8
+    """Frames spread over the recording in which planes are looked for."""
+    posed_frames = 5
+    """Frames whose points are triangulated from true poses."""
+    max_spread_share = 0.6
+    """Largest spread that another reading may leave, as a share of the spread as z, with true poses."""
+    max_spread = 0.15
+    """Largest spread that another reading may leave (natural logarithm)."""
+
+
 UNDONE_BY_TAG = {2: "mirrored", 3: "mirrored,flipped", 4: "flipped"}
 """Of orientation tags that keep the size of the image: how depth lies on colour as stored then."""
 SIDES = {
@@ -98,14 +106,14 @@ class DepthDoubts:
     def spread(self) -> list[Frame]:
         """Frames spread over the recording."""
         count = len(self.sequence)
-        chosen = np.unique(np.linspace(0, count - 1, min(LOOKS, count)).round().astype(int))
+        chosen = np.unique(np.linspace(0, count - 1, min(DepthDoubtTuning.frames, count)).round().astype(int))
         return self.frames or [frame for k in chosen.tolist() if (frame := _read(self.sequence, k)) is not None]
 
     @cached_property
     def points(self) -> TruePoints:
         """Points whose distance true poses tell; none without poses."""
         posed = [frame for frame in self.spread if frame.T_world_camera is not None]
-        return triangulate(pairs_apart(self.sequence, posed[:: -(-len(posed) // POSED) or 1]))
+        return triangulate(pairs_apart(self.sequence, posed[:: -(-len(posed) // DepthDoubtTuning.posed_frames) or 1]))
 
     @cached_property
     def planes(self) -> PlaneEvidence:
@@ -205,7 +213,7 @@ class DepthDoubts:
             return None
         spreads = {name: points.spread(name) for name in ("ray", "inverse")}  # type: ignore[arg-type]
         best = min(spreads, key=lambda name: spreads[name])
-        clear = spreads[best] < min(LARGEST_SPREAD, LEAST_SPREAD * points.spread("z"))
+        clear = spreads[best] < min(DepthDoubtTuning.max_spread, DepthDoubtTuning.max_spread_share * points.spread("z"))
         return best if clear else None
 
     def _inverse_units(self) -> float:
@@ -214,7 +222,7 @@ class DepthDoubts:
             units = self.points.factor("inverse") * self.sequence.depth_scale
         else:
             depths = np.concatenate([frame.depth[frame.depth > 0] for frame in self.spread])
-            units = USUAL_MEDIAN_DEPTH * float(np.median(depths)) * self.sequence.depth_scale
+            units = VerdictTuning.usual_median_m * float(np.median(depths)) * self.sequence.depth_scale
         return float(f"{units:.2g}")
 
     def _step_verdict(self, frames: int, better: Better) -> Verdict:

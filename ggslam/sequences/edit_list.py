@@ -16,10 +16,16 @@ from typing import BinaryIO
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted
 
-LARGEST_TABLE = 1 << 26
-"""Bytes of a table; what a damaged file may claim is not believed beyond."""
+
+class EditListTuning(Tuning):
+    """A limit on damaged videos."""
+
+    max_table_bytes = 1 << 26
+    """Largest table of a file, in bytes."""
+
 
 Box = tuple[int, int]
 """Where the content of a box begins and ends in the file."""
@@ -76,7 +82,7 @@ def _find(file: BinaryIO, inside: Box, *kinds: bytes) -> Box | None:
 
 
 def _content(file: BinaryIO, box: Box) -> bytes:
-    if box[1] - box[0] > LARGEST_TABLE:
+    if box[1] - box[0] > EditListTuning.max_table_bytes:
         raise ValueError("impossible size")
     file.seek(box[0])
     return file.read(box[1] - box[0])
@@ -117,6 +123,6 @@ def _runs(file: BinaryIO, table: Box, kind: bytes, number: str) -> np.ndarray:
         return np.zeros(0, np.int64)
     content = _content(file, box)
     entries = np.frombuffer(content[8 : 8 + 8 * struct.unpack(">I", content[4:8])[0]], [("n", ">u4"), ("v", number)])
-    if entries["n"].sum(dtype=np.int64) > LARGEST_TABLE:
+    if entries["n"].sum(dtype=np.int64) > EditListTuning.max_table_bytes:
         raise ValueError("impossible count")
     return np.repeat(entries["v"].astype(np.int64), entries["n"])

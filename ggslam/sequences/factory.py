@@ -39,6 +39,7 @@ from ggslam.sequences.rig import NAME as RIG
 from ggslam.sequences.rig import open_rig
 from ggslam.sequences.rig_file import find_rig_file
 from ggslam.sequences.sequence import OnBadFrame, Sequence
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import given_path, refuse_links
 
 FORMATS: tuple[RecordingFormat, ...] = (
@@ -62,8 +63,13 @@ FORMATS: tuple[RecordingFormat, ...] = (
     Ros2Format(),
 )
 """Known formats in the order in which they are tried."""
-SMALLEST_SCALE = 1e-6
-"""Units of depth images a metre, and one over it the largest: nobody counts in others, and float32 bears them."""
+
+
+class DepthScaleTuning(Tuning):
+    """A limit on units of depth."""
+
+    min_scale = 1e-6
+    """Smallest depth scale, in units per metre; the largest is its reciprocal. float32 holds both."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +121,7 @@ def open_sequence(
         depth_camera: file with the calibration of a depth camera beside the colour camera (see `calibration`); its
             depth images are registered to the colour images.
         min_confidence: depth less sure than this (0 low, 1 medium, 2 high) is dropped where the recording tells how
-            sure it is; None: `DEFAULT_CONFIDENCE`.
+            sure it is; None: `RecordingTuning.confidence`.
         topics: of a ROS bag, "role=topic" each, where they are not found by themselves; see `ros_topics`.
         pose_convention: what the recording's poses really are, if not what its format says; see `pose_conventions`.
         camera: file with the calibration of the colour camera, instead of the recording's own (see `calibration` and
@@ -216,7 +222,7 @@ def _read_recording(
     recording.void_id = stored.void_id
     if stored.depth_delay is not None:
         delay_depth(recording, stored.depth_delay)
-    if not SMALLEST_SCALE <= recording.depth_scale <= 1 / SMALLEST_SCALE:
+    if not DepthScaleTuning.min_scale <= recording.depth_scale <= 1 / DepthScaleTuning.min_scale:
         found_scale = f"found {recording.depth_scale}"
         raise SequenceError(f"{folder}: depth scale must be a positive number of usual size, {found_scale}")
     return recording

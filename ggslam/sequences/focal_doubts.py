@@ -14,25 +14,42 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import fit_similarity
 from ggslam.sequences.sequence import Sequence
+from ggslam.system.tuning import Tuning
 
-FACTORS = np.geomspace(1 / 2.6, 2.6, 29)
-"""By which focal lengths are multiplied; 1 is among them."""
-FEATURES, FEWEST_MATCHES, PAIRS = 600, 40, 3000
-SMALLEST = 320
-"""Columns to which smaller images are enlarged: features need a margin of 31 pixels."""
-GAPS = (12, 6, 3, 1)
-"""Frames between two that are compared: the first number that leaves enough matches."""
-LEAST_SHIFT = 1.0
-"""Pixels that most points have to move: images of a still camera, or that got stuck, tell nothing of a focal length."""
-MOST_ALIKE = 0.75
-"""Ratio of the best and second best distance of descriptors (D. Lowe, IJCV 2004)."""
-LEAST_FACTOR, LEAST_ERROR, MOST_LEFT = 1.15, 0.01, 0.75
-"""How far the best focal length has to be off, the least error as it stands, and the share of it that may be left with
-the best. Sound recordings have a factor of 1.00 and an error of 0.006 to 0.016."""
-SAME_FACTOR = 1.15
-"""Within which distances of pairs and one rigid motion have to tell the same: where big things move they do not."""
-TRIES, TOLERANCE, MOST_POINTS = 120, 0.02, 150
-"""Motions that are tried, share of the depth within which a point follows one, and points that are looked at."""
+
+class FocalTuning(Tuning):
+    """When a focal length is doubted."""
+
+    factors = np.geomspace(1 / 2.6, 2.6, 29)
+    """Factors that the focal length is multiplied by; 1 is in the middle."""
+    features = 600
+    """ORB features of an image."""
+    min_matches = 40
+    """Fewest matched points with depth."""
+    point_pairs = 3000
+    """Pairs of points whose distances are compared."""
+    min_width = 320
+    """Columns to which smaller images are enlarged: features need a margin of 31 pixels."""
+    gaps = (12, 6, 3, 1)
+    """Frames between two that are compared; the first one that leaves enough matches is used."""
+    min_shift_px = 1.0
+    """Median motion of points from which two images are compared, in pixels: still images tell nothing."""
+    max_match_ratio = 0.75
+    """Largest ratio of the best and second best distance of descriptors (D. Lowe, IJCV 2004)."""
+    min_factor = 1.15
+    """Factor, or its reciprocal, from which another focal length is reported. Sound recordings have 1.00."""
+    min_error = 0.01
+    """Error with the given focal length from which another one is reported. Sound recordings have 0.006 to 0.016."""
+    max_error_left = 0.75
+    """Largest share of the error that another focal length may leave."""
+    same_factor = 1.15
+    """Factor within which distances and rigid motion must agree; where large things move they do not."""
+    tries = 120
+    """Rigid motions that are tried."""
+    inlier = 0.02
+    """Distance of a point that follows a motion, as a share of its depth."""
+    max_points = 150
+    """Most points that motions are tried on."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +71,13 @@ class FocalDoubt:
     @property
     def suspicious(self) -> bool:
         """Whether distances agree clearly better with another focal length."""
-        off = abs(np.log(self.factor)) > np.log(LEAST_FACTOR)
-        return bool(off) and self.best < MOST_LEFT * self.error and self.error > LEAST_ERROR
+        off = abs(np.log(self.factor)) > np.log(FocalTuning.min_factor)
+        return bool(off) and self.best < FocalTuning.max_error_left * self.error and self.error > FocalTuning.min_error
 
     @property
     def wrong(self) -> bool:
         """Whether another focal length fits clearly better, and one motion of the camera says so, too."""
-        return self.suspicious and bool(abs(np.log(self.rigid / self.factor)) < np.log(SAME_FACTOR))
+        return self.suspicious and bool(abs(np.log(self.rigid / self.factor)) < np.log(FocalTuning.same_factor))
 
     @property
     def likely(self) -> float:
@@ -72,7 +89,7 @@ def pairs_matched(sequence: Sequence, frames: list[Frame]) -> list[tuple[Frame, 
     """Each frame with a later one, as far on as enough points can be matched; without those that have none."""
     pairs = []
     for frame in frames:
-        for gap in GAPS:
+        for gap in FocalTuning.gaps:
             try:
                 later = sequence.frame(frame.index + gap, masks=False) if frame.index + gap < len(sequence) else None
             except SequenceError:
@@ -91,16 +108,18 @@ def doubt_focal_length(pairs: list[tuple[Frame, Frame]]) -> FocalDoubt | None:
     """
     generator = np.random.default_rng(0)
     matched = [(*found, first.camera) for first, second in pairs if (found := match_points(first, second)) is not None]
-    matched = [found for found in matched if _median_shift(*found[:2]) >= LEAST_SHIFT]
+    matched = [found for found in matched if _median_shift(*found[:2]) >= FocalTuning.min_shift_px]
     if not matched:
         return None
     medians = np.median(np.concatenate([_errors(*found, generator) for found in matched], 1), axis=1)
     best = int(medians.argmin())
-    doubt = FocalDoubt(float(medians[len(FACTORS) // 2]), float(FACTORS[best]), float(medians[best]))
+    doubt = FocalDoubt(
+        float(medians[len(FocalTuning.factors) // 2]), float(FocalTuning.factors[best]), float(medians[best])
+    )
     if not doubt.suspicious:
         return doubt
     misfits = np.sum([_misfits(*found, generator) for found in matched], axis=0)
-    return replace(doubt, rigid=float(FACTORS[int(misfits.argmin())]))
+    return replace(doubt, rigid=float(FocalTuning.factors[int(misfits.argmin())]))
 
 
 def _median_shift(a: np.ndarray, b: np.ndarray) -> float:
@@ -113,32 +132,32 @@ def match_points(first: Frame, second: Frame) -> tuple[np.ndarray, np.ndarray] |
     seen = []
     for frame in (first, second):
         grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
-        factor = max(1.0, SMALLEST / grey.shape[1])
+        factor = max(1.0, FocalTuning.min_width / grey.shape[1])
         large = grey if factor == 1 else cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_LINEAR)
-        points, descriptors = cv2.ORB_create(FEATURES).detectAndCompute(large, None)  # type: ignore[attr-defined]
-        if descriptors is None or len(points) < FEWEST_MATCHES:
+        points, descriptors = cv2.ORB_create(FocalTuning.features).detectAndCompute(large, None)  # type: ignore[attr-defined]
+        if descriptors is None or len(points) < FocalTuning.min_matches:
             return None
         pixels = (np.array([point.pt for point in points]) + 0.5) / factor - 0.5
         columns, rows = np.clip(np.rint(pixels).astype(int), 0, (grey.shape[1] - 1, grey.shape[0] - 1)).T
         seen.append((np.column_stack([pixels, frame.depth[rows, columns]]), descriptors))
     (a, words), (b, others) = seen
     two = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(words, others, k=2)
-    good = [m[0] for m in two if len(m) == 2 and m[0].distance < MOST_ALIKE * m[1].distance]
+    good = [m[0] for m in two if len(m) == 2 and m[0].distance < FocalTuning.max_match_ratio * m[1].distance]
     a, b = a[[m.queryIdx for m in good]], b[[m.trainIdx for m in good]]
     known = (a[:, 2] > 0) & (b[:, 2] > 0) if good else np.zeros(0, bool)
-    return (a[known], b[known]) if known.sum() >= FEWEST_MATCHES else None
+    return (a[known], b[known]) if known.sum() >= FocalTuning.min_matches else None
 
 
 def _errors(a: np.ndarray, b: np.ndarray, camera: Camera, generator: np.random.Generator) -> np.ndarray:
     """Relative differences of distances between pairs of points, [factors, pairs]."""
-    i, j = generator.integers(0, len(a), (2, PAIRS))
+    i, j = generator.integers(0, len(a), (2, FocalTuning.point_pairs))
     lengths = []
     for seen in (a, b):
         rays = _across(seen, camera)
         across = ((rays[i] - rays[j]) ** 2).sum(1)
         along = (seen[i, 2] - seen[j, 2]) ** 2
-        lengths.append(np.sqrt(across / FACTORS[:, None] ** 2 + along))
-    far = lengths[0][len(FACTORS) // 2] > 0.2 * np.median(a[:, 2])
+        lengths.append(np.sqrt(across / FocalTuning.factors[:, None] ** 2 + along))
+    far = lengths[0][len(FocalTuning.factors) // 2] > 0.2 * np.median(a[:, 2])
     return np.abs(lengths[0] - lengths[1])[:, far] / np.maximum(lengths[0], lengths[1])[:, far]
 
 
@@ -149,19 +168,21 @@ def _across(seen: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _misfits(a: np.ndarray, b: np.ndarray, camera: Camera, generator: np.random.Generator) -> np.ndarray:
     """How badly points follow the rigid motion that most of them follow, of each factor [factors]: sums of residuals
-    over depth, each at most `TOLERANCE`."""
-    kept = generator.permutation(len(a))[:MOST_POINTS]
+    over depth, each at most `FocalTuning.inlier`."""
+    kept = generator.permutation(len(a))[: FocalTuning.max_points]
     a, b = a[kept], b[kept]
-    chosen, misfits = generator.integers(0, len(a), (TRIES, 3)), []
-    for factor in FACTORS:
+    chosen, misfits = generator.integers(0, len(a), (FocalTuning.tries, 3)), []
+    for factor in FocalTuning.factors:
         source, target = (np.column_stack([_across(seen, camera) / factor, seen[:, 2]]) for seen in (a, b))
         T, _ = fit_similarity(source[chosen], target[chosen])
         off = _residuals(T, source, target)
-        best = off[int(np.minimum(off, TOLERANCE).sum(1).argmin())]
-        if (best < TOLERANCE).sum() >= 10:
-            refined, _ = fit_similarity(source[best < TOLERANCE][None], target[best < TOLERANCE][None])
+        best = off[int(np.minimum(off, FocalTuning.inlier).sum(1).argmin())]
+        if (best < FocalTuning.inlier).sum() >= 10:
+            refined, _ = fit_similarity(
+                source[best < FocalTuning.inlier][None], target[best < FocalTuning.inlier][None]
+            )
             best = _residuals(refined, source, target)[0]
-        misfits.append(float(np.minimum(best, TOLERANCE).sum()))
+        misfits.append(float(np.minimum(best, FocalTuning.inlier).sum()))
     return np.array(misfits)
 
 

@@ -11,34 +11,49 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.frame import Frame
 from ggslam.sequences.sequence import Sequence
+from ggslam.system.tuning import Tuning
 
-MOST = 24
-"""Frames of a recording that are looked at."""
-SIZE = (40, 30)
-"""Columns and rows of a small view."""
-SAME_GREY, EVERYWHERE = 2.0, 98.0
-"""Grey levels by which an image differs from itself at most, in this percentile of the pixels, once it was compressed
-again."""
-SAME_VIEW = 3.0
-"""The same, of images of other compression: once a stream hangs on both sides, views that are so near are one."""
-SAME_DEPTH, MOST_DEPTHS, SAME_JUMPS = 0.004, 0.02, 0.02
-"""Shares of the depth by which half of the pixels, nine in ten, and half of those at jumps of depth differ at most if a
-depth image comes again with fresh noise. A camera at rest has 0.001 and 0.004, a frame of slow motion 0.008."""
-JUMP, FEWEST_JUMPS = 0.1, 8
-"""Share of the depth by which neighbours in a small view differ at a jump, and how many there have to be across and
-down: along walls and floors one may move far and measure the same."""
-OTHER_EDGES = 0.3
-"""Correlation of edges below which two colour images show other things, whatever the light."""
-LEAST_CONTRAST = 8.0
-"""Standard deviation in grey levels."""
-OTHER_GREY, OTHER_DEPTH, MOVED = 4.0, 0.04, 0.25
-"""Grey levels, and share of the depth, by which this share of the pixels differs once the camera has moved. Noise is
-far below: each pixel is the mean of many."""
-FEWEST_DEPTHS = 100
-"""Pixels with depth in both of two views, or nothing is said of it."""
-SAME_NEIGHBOUR = 0.05
-"""Share of the depth by which neighbours on a surface differ at most."""
-FEWEST_NEIGHBOURS = 200
+
+class GlanceTuning(Tuning):
+    """When small views of two frames show the same, and when they do not."""
+
+    frames = 24
+    """Frames spread over a recording."""
+    size = (40, 30)
+    """Columns and rows of a small view."""
+    same_grey = 2.0
+    """Largest difference of an image compressed twice, in grey levels."""
+    same_percentile = 98.0
+    """Percentile of the pixels that this is said of."""
+    like_grey = 3.0
+    """Largest difference of two images that may be the same, compressed differently, in grey levels."""
+    same_depth = 0.004
+    """Largest median difference of a depth image repeated with fresh noise, as a share of the depth. A camera at rest
+    has 0.001, slow motion 0.008."""
+    most_same_depth = 0.02
+    """Largest 90th percentile of that difference. A camera at rest has 0.004."""
+    same_jumps = 0.02
+    """Largest median of that difference at jumps of depth."""
+    jump = 0.1
+    """Difference of neighbours at a jump of depth, as a share of the depth."""
+    min_jumps = 8
+    """Fewest jumps across and down: along walls and floors, depth stays the same while a camera moves."""
+    other_edges = 0.3
+    """Correlation of edges below which two colour images show different things in any light."""
+    min_contrast = 8.0
+    """Smallest standard deviation of an image that shows something, in grey levels."""
+    other_grey = 4.0
+    """Difference of a pixel once the camera has moved, in grey levels."""
+    other_depth = 0.04
+    """Difference of a pixel once the camera has moved, as a share of the depth."""
+    moved = 0.25
+    """Share of the pixels that differ once the camera has moved."""
+    min_depths = 100
+    """Fewest pixels with depth in both of two views."""
+    same_neighbour = 0.05
+    """Largest difference of neighbours on one surface, as a share of the depth."""
+    min_neighbours = 200
+    """Fewest neighbours with depth."""
 
 
 @dataclass(frozen=True)
@@ -62,16 +77,21 @@ class Glance:
     @property
     def blank(self) -> bool:
         """Whether its colour image shows one colour and nothing else."""
-        return bool(np.ptp(self.grey) < SAME_GREY)
+        return bool(np.ptp(self.grey) < GlanceTuning.same_grey)
 
     def same_color(self, other: Glance) -> bool:
         """Whether both hold one colour image that shows something: bare walls look alike wherever one stands."""
         change = np.abs(self.grey - other.grey)
-        return bool(self.grey.std() > LEAST_CONTRAST and np.percentile(change, EVERYWHERE) < SAME_GREY)
+        return bool(
+            self.grey.std() > GlanceTuning.min_contrast
+            and np.percentile(change, GlanceTuning.same_percentile) < GlanceTuning.same_grey
+        )
 
     def like_color(self, other: Glance) -> bool:
         """Whether both may hold one colour image, compressed otherwise."""
-        return bool(np.percentile(np.abs(self.grey - other.grey), EVERYWHERE) < SAME_VIEW)
+        return bool(
+            np.percentile(np.abs(self.grey - other.grey), GlanceTuning.same_percentile) < GlanceTuning.like_grey
+        )
 
     def same_depth(self, other: Glance) -> bool:
         """Whether both hold one depth image: bit by bit, or but for noise, where jumps of depth would move."""
@@ -79,13 +99,18 @@ class Glance:
 
     def _depth_again(self, other: Glance) -> bool:
         known = (self.depth > 0) & (other.depth > 0)
-        if known.sum() < FEWEST_DEPTHS:
+        if known.sum() < GlanceTuning.min_depths:
             return False
         change = np.abs(self.depth - other.depth) / np.maximum(np.minimum(self.depth, other.depth), 1e-6)
-        if np.median(change[known]) > SAME_DEPTH or np.percentile(change[known], 90) > MOST_DEPTHS:
+        if (
+            np.median(change[known]) > GlanceTuning.same_depth
+            or np.percentile(change[known], 90) > GlanceTuning.most_same_depth
+        ):
             return False
         jumps = [at & known for at in _jumps(self.depth)]
-        return all(at.sum() >= FEWEST_JUMPS and np.median(change[at]) < SAME_JUMPS for at in jumps)
+        return all(
+            at.sum() >= GlanceTuning.min_jumps and np.median(change[at]) < GlanceTuning.same_jumps for at in jumps
+        )
 
     def color_moved_on(self, other: Glance) -> bool:
         """Whether the colour images show other things beside what `same_depth` calls the same: a lamp that is switched
@@ -95,38 +120,38 @@ class Glance:
         if np.array_equal(self.depth, other.depth):
             return True
         here, there = _edges(self.grey), _edges(other.grey)
-        return float((here * there).mean()) < OTHER_EDGES
+        return float((here * there).mean()) < GlanceTuning.other_edges
 
     def color_moved(self, other: Glance) -> bool:
         """Whether the colour images show other things, exposure forgiven."""
         if self.blank or other.blank:
             return False
         here, there = ((view.grey - view.grey.mean()) / view.grey.std() for view in (self, other))
-        level = OTHER_GREY / min(float(self.grey.std()), float(other.grey.std()))
-        return bool((np.abs(here - there) > max(level, 0.1)).mean() > MOVED)
+        level = GlanceTuning.other_grey / min(float(self.grey.std()), float(other.grey.std()))
+        return bool((np.abs(here - there) > max(level, 0.1)).mean() > GlanceTuning.moved)
 
     def depth_moved(self, other: Glance) -> bool:
         """Whether the depth images show other things."""
         known = (self.depth > 0) & (other.depth > 0)
-        if known.sum() < FEWEST_DEPTHS:
+        if known.sum() < GlanceTuning.min_depths:
             return False
         change = np.abs(self.depth - other.depth)[known] / np.minimum(self.depth, other.depth)[known]
-        return bool((change > OTHER_DEPTH).mean() > MOVED)
+        return bool((change > GlanceTuning.other_depth).mean() > GlanceTuning.moved)
 
 
 def glance_at(frame: Frame) -> Glance:
     """A frame in small."""
     grey = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    share = cv2.resize((frame.depth > 0).astype(np.float32), SIZE, interpolation=cv2.INTER_AREA)
-    depth = cv2.resize(frame.depth, SIZE, interpolation=cv2.INTER_AREA)
+    share = cv2.resize((frame.depth > 0).astype(np.float32), GlanceTuning.size, interpolation=cv2.INTER_AREA)
+    depth = cv2.resize(frame.depth, GlanceTuning.size, interpolation=cv2.INTER_AREA)
     depth = np.where(share > 0.5, depth / np.maximum(share, 1e-6), np.float32(0))
-    small = cv2.resize(grey, SIZE, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(grey, GlanceTuning.size, interpolation=cv2.INTER_AREA)
     return Glance(frame.index, small, depth, _grain(grey), _surface(frame.depth))
 
 
 def look_over(sequence: Sequence) -> list[Glance]:
     """Frames spread over a recording; damaged ones are left out."""
-    chosen = np.unique(np.linspace(0, len(sequence) - 1, min(MOST, len(sequence))).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(sequence) - 1, min(GlanceTuning.frames, len(sequence))).round().astype(int))
     return [found for k in chosen.tolist() if (found := glance_of(sequence, k)) is not None]
 
 
@@ -144,7 +169,7 @@ def _jumps(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for axis in (1, 0):
         there = np.roll(depth, -1, axis)
         nearer = np.minimum(depth, there)
-        at = (nearer > 0) & (np.abs(depth - there) > JUMP * nearer)
+        at = (nearer > 0) & (np.abs(depth - there) > GlanceTuning.jump * nearer)
         (at[:, -1:] if axis else at[-1:])[:] = False
         found.append(at)
     return found[0], found[1]
@@ -167,6 +192,6 @@ def _surface(depth: np.ndarray) -> float:
     left, right = depth[::2, :-1], depth[::2, 1:]
     known = (left > 0) & (right > 0)
     left, right = left[known], right[known]
-    if len(left) < FEWEST_NEIGHBOURS:
+    if len(left) < GlanceTuning.min_neighbours:
         return float("nan")
-    return float((np.abs(left - right) < SAME_NEIGHBOUR * np.minimum(left, right)).mean())
+    return float((np.abs(left - right) < GlanceTuning.same_neighbour * np.minimum(left, right)).mean())

@@ -13,22 +13,30 @@ from ggslam.sequences.glances import Glance, glance_of
 from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.verdicts import Verdict
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, read_untrusted
+from ggslam.system.plurals import counted
+from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
-FEWEST = 4
-"""Frames that hold one image, from which a stream hangs: cameras of other rates repeat images once or twice."""
-CLOSE = 3
-"""Frames from the end of a stretch to the beginning of another one that may be its continuation."""
-MOST_COMPARED, MOST_STRETCHES = 64, 12
-"""Neighbouring files of one size that are read though they differ, and stretches that are looked at, of each stream."""
+
+class HungTuning(Tuning):
+    """When a stream is said to hang."""
+
+    min_frames = 4
+    """Fewest frames that hold one image: cameras of other rates repeat images once or twice."""
+    close = 3
+    """Frames between two stretches that may be one."""
+    max_compared = 64
+    """Most neighbouring files of one size and different content that are read, in each stream."""
+    max_stretches = 12
+    """Most stretches that are looked at, in each stream."""
+    max_named = 3
+    """Most stretches that a sentence names."""
 
 
 Test = Callable[[Glance, Glance], bool]
 """Whether two views are the same, or are not."""
 
 Spans = dict[str, list[tuple[int, int]]]
-MOST_NAMED = 3
-"""Stretches that a sentence names."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +67,8 @@ def _judge(sequence: Sequence, glances: list[Glance], kind: str, spans: Spans) -
         return []
     frames = sum(one.last - one.first + 1 for one in found)
     where = numbers_of(sequence, found)
-    where += f" and in {len(found) - MOST_NAMED} more places" if len(found) > MOST_NAMED else ""
+    more = len(found) - HungTuning.max_named
+    where += f" and in {counted(more, 'more place')}" if more > 0 else ""
     same, other = ("colour", "depth") if kind == "color" else ("depth", "colour")
     told = f"{frames} of {len(sequence)} frames, {where},"
     if all(one.blank for one in found):
@@ -70,9 +79,9 @@ def _judge(sequence: Sequence, glances: list[Glance], kind: str, spans: Spans) -
 
 
 def numbers_of(sequence: Sequence, found: list[Stretch]) -> str:
-    """The first `MOST_NAMED` stretches, by the numbers that their frames have in the recording."""
+    """The first `HungTuning.max_named` stretches, by the numbers that their frames have in the recording."""
     numbers = sequence.selection
-    return ", ".join(f"{numbers[one.first]} to {numbers[one.last]}" for one in found[:MOST_NAMED])
+    return ", ".join(f"{numbers[one.first]} to {numbers[one.last]}" for one in found[: HungTuning.max_named])
 
 
 def remedy_for(sequence: Sequence, found: list[Stretch]) -> str:
@@ -89,7 +98,7 @@ def find_hung(sequence: Sequence, glances: list[Glance], kind: str, spans: Spans
     """Stretches in which "color" or "depth" (`kind`) hangs, in order; `spans`: see `spans_of`."""
     same, moved = _tests(kind)
     files = (spans_of(sequence) if spans is None else spans)[kind]
-    found = [one for span in files[:MOST_STRETCHES] if (one := _confirm(sequence, *span, same, moved))]
+    found = [one for span in files[: HungTuning.max_stretches] if (one := _confirm(sequence, *span, same, moved))]
     for first, last in _same_views(sequence, glances, same, moved):
         if not any(one.first <= last and first <= one.last for one in found):
             found.append(Stretch(first, last))
@@ -102,7 +111,11 @@ def _merge(sequence: Sequence, found: list[Stretch], like: Test) -> list[Stretch
     merged: list[Stretch] = []
     for one in found:
         last = merged[-1] if merged else None
-        if last is not None and one.first - last.last <= CLOSE and _are_alike(sequence, last.last, one.first, like):
+        if (
+            last is not None
+            and one.first - last.last <= HungTuning.close
+            and _are_alike(sequence, last.last, one.first, like)
+        ):
             merged[-1] = Stretch(last.first, one.last, last.blank and one.blank)
         else:
             merged.append(one)
@@ -125,7 +138,7 @@ def _same_views(sequence: Sequence, glances: list[Glance], same: Test, moved: Te
             before = glances[begin - 1].index + 1 if begin else 0
             after = glances[end].index - 1 if end < len(glances) else len(sequence) - 1
             span = _edge(sequence, a, a.index, before, same), _edge(sequence, a, glances[end - 1].index, after, same)
-            spans += [span] if span[1] - span[0] + 1 >= FEWEST else []
+            spans += [span] if span[1] - span[0] + 1 >= HungTuning.min_frames else []
         begin = end
     return spans
 
@@ -161,12 +174,14 @@ def _same_files(files: list[ImageFile]) -> list[tuple[int, int]]:
     """First and last of the frames whose files hold the same bytes, the longest first; none of other images."""
     spans, begin, unequal = [], 0, 0
     for k in range(1, len(files) + 1):
-        alike = k < len(files) and unequal < MOST_COMPARED and _size(files[k]) == _size(files[k - 1]) is not None
+        alike = (
+            k < len(files) and unequal < HungTuning.max_compared and _size(files[k]) == _size(files[k - 1]) is not None
+        )
         if alike:
             alike = _read(files[k]) == _read(files[k - 1])
             unequal += not alike
         if not alike:
-            spans += [(begin, k - 1)] if k - begin >= FEWEST else []
+            spans += [(begin, k - 1)] if k - begin >= HungTuning.min_frames else []
             begin = k
     return sorted(spans, key=lambda span: span[0] - span[1])
 
@@ -180,6 +195,6 @@ def _size(file: ImageFile) -> int | None:
 
 def _read(file: ImageFile) -> bytes | None:
     try:
-        return read_untrusted(file, MAX_IMAGE_BYTES, SequenceError) if isinstance(file, Path) else None
+        return read_untrusted(file, FileTuning.max_image_bytes, SequenceError) if isinstance(file, Path) else None
     except SequenceError:
         return None

@@ -12,6 +12,7 @@ from ggslam.errors import SequenceError
 from ggslam.sequences.association import pair_images
 from ggslam.sequences.recording import image_files, last_number
 from ggslam.sequences.stamps import times_of_names
+from ggslam.system.plurals import agreeing, counted
 
 OF_NAMES = "names of the images"
 """Where times come from, for reports."""
@@ -91,9 +92,9 @@ def _without_color(folder: Path, depths: list[Path], used: list[Path]) -> list[s
     unused = [path.name for path in depths if path not in taken]
     if not unused:
         return []
-    are = "image has" if len(unused) == 1 else "images have"
-    left = "is" if len(unused) == 1 else "are"
-    return [f"{folder}: {len(unused)} {are} no colour image and {left} left out; the first: {unused[0]}"]
+    have, are = agreeing(len(unused), "has", "have"), agreeing(len(unused), "is", "are")
+    what = counted(len(unused), "image")
+    return [f"{folder}: {what} {have} no colour image and {are} left out; the first: {unused[0]}"]
 
 
 def _other_file(folder: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
@@ -15,8 +16,8 @@ from ggslam.sequences.recording import ImageFile, ImageSource
 from ggslam.system.images import decode_image, read_image_bytes
 from ggslam.system.opencv import opencv_errors
 
-LARGEST_CODE = 65535
-"""Of 16-bit depth images: "nothing measured", or cut off there."""
+LARGEST_CODE: Final = 65535
+"""Largest number of 16-bit depth images; it means that nothing was measured."""
 
 
 def read_color(file: ImageFile, upright: bool = False) -> np.ndarray:

@@ -20,8 +20,7 @@ from ggslam.sequences.pose_conventions import CONVENTIONS, OURS
 from ggslam.sequences.pose_doubts import SIDES, PoseDoubt, doubt_poses, pairs_apart
 from ggslam.sequences.scale_doubts import measure_scale_signs
 from ggslam.sequences.sequence import Sequence
-from ggslam.sequences.step_doubts import REACH as STEP_REACH
-from ggslam.sequences.step_doubts import doubt_steps
+from ggslam.sequences.step_doubts import StepTuning, doubt_steps
 from ggslam.sequences.verdicts import (
     Verdict,
     judge_depth_scale,
@@ -30,10 +29,18 @@ from ggslam.sequences.verdicts import (
     judge_times,
 )
 from ggslam.sequences.void_ids import has_void_id
+from ggslam.system.tuning import Tuning
 
-LARGEST_RATIO, SCALE_TOLERANCE = 1.25, 0.05
-"""Factor between depth and true poses from which the depth scale is doubted, and how exactly (natural logarithm) it is
-known."""
+
+class InspectionTuning(Tuning):
+    """When the depth scale is doubted by true poses."""
+
+    max_ratio = 1.25
+    """Factor between depth and true poses, or its reciprocal, from which the depth scale is doubted."""
+    scale_error = 0.05
+    """Accuracy of that factor (natural logarithm)."""
+
+
 VOID_TEXT = (
     "id 255 stands in most masks and is far from all other ids: it seems to mean that nobody decided what is there; "
     "`void_id` 255 leaves it out"
@@ -235,9 +242,9 @@ def _check_poses(report: SequenceReport, doubt: PoseDoubt | None, doubts: DepthD
     if points.tell and not misread:
         report.scale_known = True
         factor = points.factor("z")
-        if abs(np.log(factor)) > np.log(LARGEST_RATIO) and points.agree("z"):
+        if abs(np.log(factor)) > np.log(InspectionTuning.max_ratio) and points.agree("z"):
             how = f"points triangulated by the true poses are {1 / factor:.3g} times as far as depth has them"
-            report.judge(judge_scale_by(report.depth_scale, factor, how, SCALE_TOLERANCE))
+            report.judge(judge_scale_by(report.depth_scale, factor, how, InspectionTuning.scale_error))
             return
     if doubt is None:
         return
@@ -284,7 +291,7 @@ def _check_steps(report: SequenceReport, sequence: Sequence) -> None:
     if doubt is None or not doubt.wrong:
         return
     steps = abs(doubt.behind)
-    count = f"{steps} or more frames" if steps == STEP_REACH else "1 frame"
+    count = f"{steps} or more frames" if steps == StepTuning.reach else "1 frame"
     side = "before" if doubt.behind > 0 else "after"
     text = (
         f"colour and depth are out of step: depth fits the colour of {count} {side} it better (strength of edges "

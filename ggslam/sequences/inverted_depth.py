@@ -9,15 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.scene.frame import Frame
-from ggslam.sequences.plane_evidence import FLAT, residual_of, windows_of
+from ggslam.sequences.plane_evidence import PlaneTuning, residual_of, windows_of
+from ggslam.system.tuning import Tuning
 
-CONSTANTS = np.geomspace(1.02, 4, 16)
-"""That are tried, over the largest depth that is stored."""
-LARGEST = 99.9
-"""Percentile of depth that counts as the largest."""
-FEWEST_WINDOWS, LEAST_RATIO = 12, 0.88
-"""Windows that show a plane, and the median residual against that of inverse depth, from which it is told. Depth
-subtracted from 1.3 times the largest has 0.75, disparity 0.99."""
+
+class InversionTuning(Tuning):
+    """When depth is taken for a constant minus the distance."""
+
+    percentile = 99.9
+    """Percentile of depth that counts as the largest."""
+    min_windows = 12
+    """Fewest windows that show a plane."""
+    max_ratio = 0.88
+    """Largest median residual, as a share of that of inverse depth. Depth subtracted from 1.3 times the largest has
+    0.75, disparity 0.99."""
+    constants = np.geomspace(1.02, 4, 16)
+    """Constants that are tried, over the largest stored depth."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +42,18 @@ def find_inversion(frames: list[Frame]) -> Inversion | None:
     known = [frame.depth[frame.depth > 0] for frame in frames]
     if not sum(map(len, known)):
         return None
-    constants = CONSTANTS * float(np.percentile(np.concatenate(known), LARGEST))
+    constants = InversionTuning.constants * float(np.percentile(np.concatenate(known), InversionTuning.percentile))
     rows = [_residuals(window.depth, window.rays, constants) for frame in frames for window in windows_of(frame)]
-    flat = np.array([row for row in rows if min(row) < FLAT])
-    if len(flat) < FEWEST_WINDOWS:
+    flat = np.array([row for row in rows if min(row) < PlaneTuning.flat])
+    if len(flat) < InversionTuning.min_windows:
         return None
     inverse, *others = np.median(flat, axis=0).tolist()
     best = int(np.argmin(others))
-    return Inversion(float(constants[best]), others[best], inverse) if others[best] < LEAST_RATIO * inverse else None
+    return (
+        Inversion(float(constants[best]), others[best], inverse)
+        if others[best] < InversionTuning.max_ratio * inverse
+        else None
+    )
 
 
 def _residuals(stored: np.ndarray, rays: np.ndarray, constants: np.ndarray) -> list[float]:

@@ -12,13 +12,19 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.recording import read_text
+from ggslam.system.tuning import Tuning
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns a camera frame with y up and z backwards (OpenGL, Blender, ARKit) into one with y down and z forward."""
 
-SHORTEST_FOCAL, LONGEST_FOCAL = 0.05, 100.0
-"""Of the longer side of the image: it would see to 84 degrees from the axis, or half a degree in all. Shorter ones are
-in units of the image's width or in millimetres, longer ones in other units of length."""
+
+class FocalLimitTuning(Tuning):
+    """Focal lengths outside of these limits are no pixels but shares of the width, or millimetres."""
+
+    min_focal = 0.05
+    """Shortest focal length, in longer sides of the image: it sees 84 degrees from the axis."""
+    max_focal = 100.0
+    """Longest focal length, in longer sides of the image: it sees half a degree in all."""
 
 
 def read_object(path: Path) -> dict[str, Any]:
@@ -66,10 +72,10 @@ def camera_of(name: object, width: float, height: float, fx: float, fy: float, c
     except ValueError as error:
         raise SequenceError(f"{name}: {error}") from None
     side = max(camera.width, camera.height)
-    if not SHORTEST_FOCAL * side <= min(fx, fy) <= max(fx, fy) <= LONGEST_FOCAL * side:
+    if not FocalLimitTuning.min_focal * side <= min(fx, fy) <= max(fx, fy) <= FocalLimitTuning.max_focal * side:
         raise SequenceError(
             f"{name}: impossible focal lengths fx {fx:g}, fy {fy:g} of an image of {camera.width}x{camera.height}: "
-            f"expected pixels, {SHORTEST_FOCAL * side:g} to {LONGEST_FOCAL * side:g}"
+            f"expected pixels, {FocalLimitTuning.min_focal * side:g} to {FocalLimitTuning.max_focal * side:g}"
         )
     return camera
 

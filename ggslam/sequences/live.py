@@ -19,7 +19,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -33,8 +33,8 @@ from ggslam.system.atomic import make_folder, write_bytes, write_text
 from ggslam.system.named_code import load_named
 
 SCHEMES = ("realsense", "python")
-DEPTH_SCALE = 1000.0
-"""Of recorded depth images: units per metre."""
+DEPTH_SCALE: Final = 1000.0
+"""Units per metre of recorded depth images: this is our own format."""
 
 
 @runtime_checkable

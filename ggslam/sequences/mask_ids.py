@@ -12,17 +12,19 @@ import logging
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.mask_images import EQUAL_CHANNELS, MaskImage, read_mask_image
 from ggslam.sequences.recording import read_text
-from ggslam.system.images import MAX_PIXELS
+from ggslam.system.images import PictureLimits
 
-LARGEST_ID = 65535
-_CODES = 1 << 24
+LARGEST_ID: Final = 65535
+"""Largest instance id: masks are 16-bit."""
+_CODES: Final = 1 << 24
+"""Colours of 8-bit RGB images."""
 
 _log = logging.getLogger(__name__)
 
@@ -57,7 +59,7 @@ class InstanceCodes:
         return np.where(listed, ids, 0).astype(np.uint16), (codes > 0) & ~listed
 
 
-def read_id_table(files: list[Path], most: int = MAX_PIXELS) -> InstanceCodes:
+def read_id_table(files: list[Path], most: int = PictureLimits.max_pixels) -> InstanceCodes:
     """The codes of a set of masks: those that pred.json lists beside or above them, else all that occur in the files of
     at most so many pixels.
 

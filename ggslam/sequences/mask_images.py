@@ -7,30 +7,36 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 import cv2
 import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.sequences.images import describe_channels
-from ggslam.system.images import MAX_PIXELS, PNG_SIGNATURE, decode_image, read_image_bytes
+from ggslam.system.images import PNG_SIGNATURE, PictureLimits, decode_image, read_image_bytes
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted
 
 MaskKind = Literal["grey", "palette", "RGB"]
 
-EQUAL_CHANNELS = 1 + 256 + 65536
-"""The code of a pixel whose three channels are v is v times this."""
+EQUAL_CHANNELS: Final = 1 + 256 + 65536
+"""A pixel whose three channels are v has the code v times this."""
 
-FINER_MASK = 4
-"""Masks are at most so many times as wide and high as the images."""
-SMALL = 4_000_000
-"""Pixels that a mask may have beside images of any size."""
+
+class MaskTuning(Tuning):
+    """Limits on the size of masks."""
+
+    max_finer = 4
+    """Most columns and rows of a mask, in columns and rows of the images."""
+    small_pixels = 4_000_000
+    """Pixels that a mask may have beside images of any size."""
+
 
 _KINDS: dict[int, MaskKind] = {0: "grey", 2: "RGB", 3: "palette", 4: "RGB", 6: "RGB"}
 """PNG colour types; grey with alpha (4) is decoded to three equal channels and alpha."""
-_HEADER_SIZE = 29
-"""Bytes up to the end of the first chunk's data: signature, length, "IHDR", 13 bytes."""
+_HEADER_SIZE: Final = 29
+"""Bytes of a PNG file up to the end of IHDR's data: signature, length, name, 13 bytes."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +74,12 @@ def _format(content: bytes) -> tuple[int, MaskKind | None]:
 def most_pixels(*sizes: tuple[int, int]) -> int:
     """Pixels that a mask may have beside images of these sizes (width, height): a black one of 100 megapixels is a
     small file, and would take 2 GB."""
-    return max(SMALL, FINER_MASK**2 * max((width * height for width, height in sizes), default=0))
+    return max(
+        MaskTuning.small_pixels, MaskTuning.max_finer**2 * max((width * height for width, height in sizes), default=0)
+    )
 
 
-def read_mask_image(path: Path, most: int = MAX_PIXELS) -> MaskImage:
+def read_mask_image(path: Path, most: int = PictureLimits.max_pixels) -> MaskImage:
     """Reads a PNG of grey ids (1 to 16 bits), palette indices, or RGB-coded ids.
 
     Args:

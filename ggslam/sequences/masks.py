@@ -16,7 +16,7 @@ from ggslam.sequences.mask_ids import InstanceCodes, read_id_table
 from ggslam.sequences.mask_images import EQUAL_CHANNELS, MaskImage, mask_kind, read_mask_image
 from ggslam.sequences.pixel_grid import Size, same_aspect
 from ggslam.sequences.recording import ImageFile, image_files, last_number
-from ggslam.system.images import MAX_PIXELS
+from ggslam.system.images import PictureLimits
 
 USUAL_FOLDERS = ("semantic_instance", "Annotations", "instance-filt", "instance", "masks", "object_mask")
 """Where masks lie in a folder that is laid out like a recording, or that a segmenter wrote."""
@@ -82,7 +82,7 @@ class MaskReader:
     """
 
     def __init__(
-        self, files: Iterable[Path | None], void_id: int | None = None, most: int = MAX_PIXELS
+        self, files: Iterable[Path | None], void_id: int | None = None, most: int = PictureLimits.max_pixels
     ) -> None:
         """Takes the mask files of all frames of the recording; none is opened yet. `void_id`: means "unlabelled".
         `most`: pixels that a mask may have, see `most_pixels`."""

@@ -21,7 +21,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.scene.frame import Frame
 from ggslam.system.array_forms import Form
-from ggslam.system.images import MAX_PIXELS
+from ggslam.system.images import PictureLimits
 from ggslam.system.savable import savable
 
 MOVERS_FILE = "movers.npz"
@@ -111,7 +111,7 @@ class MovingPixels:
         frames, size, offsets, data = (np.asarray(arrays.get(name)) for name in names)
         typed = [array.dtype for array in (frames, size, offsets, data)] == [np.int32, np.int32, np.int64, np.uint8]
         shaped = typed and size.shape == (2,) and data.ndim == frames.ndim == 1 and offsets.shape == (len(frames) + 1,)
-        if not shaped or not (size >= 1).all() or int(size[0]) * int(size[1]) > MAX_PIXELS:
+        if not shaped or not (size >= 1).all() or int(size[0]) * int(size[1]) > PictureLimits.max_pixels:
             raise FormatError("no masks of frames")
         if offsets[0] != 0 or offsets[-1] != len(data) or (np.diff(offsets) < 0).any():
             raise FormatError("offsets of masks that do not fit their data")

@@ -11,24 +11,33 @@ import numpy as np
 from ggslam.sequences.glances import Glance
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.verdicts import Verdict
+from ggslam.system.tuning import Tuning
 
-LEAST_GRAIN = 0.4
-"""Correlation of neighbouring pixels. Recordings, real and generated, have 0.87 and more, noise 0.01."""
-LEAST_SURFACE = 0.4
-"""Share of neighbours at about the same depth. Recordings have 0.94 and more, random depth 0.05."""
-FEWEST, LEAST_SHARE = 2, 0.1
-"""Frames that show noise, and their share, from which it is told: a decoder's broken frame is one."""
-MOST_NOISE = 0.9
-"""Share of the frames from which all are taken to do so."""
+
+class NoiseTuning(Tuning):
+    """When images are said to show noise instead of a scene."""
+
+    min_grain = 0.4
+    """Smallest correlation of neighbouring grey values. Recordings have 0.87 and more, noise 0.01."""
+    min_surface = 0.4
+    """Smallest share of neighbours at about the same depth. Recordings have 0.94 and more, random depth 0.05."""
+    min_frames = 2
+    """Fewest frames that show noise: a decoder's broken frame is one."""
+    min_share = 0.1
+    """Smallest share of the frames that show noise."""
+    all_share = 0.9
+    """Share of the frames from which all are said to."""
+    min_tracked = 3
+    """Fewest frames of a recording for its tracking to be judged."""
+
+
 REMEDY = "look how the images were written: order of bytes, 8 or 16 bits, compression, a loose cable"
-FEWEST_FRAMES = 3
-"""Frames of a recording that show whether it is tracked well."""
 
 
 def judge_noise(glances: list[Glance], numbers: range) -> list[Verdict]:
     """Whether colour or depth is noise; `numbers`: of the frames, by their index."""
-    color = [view for view in glances if view.grain < LEAST_GRAIN]
-    depth = [view for view in glances if view.surface < LEAST_SURFACE]
+    color = [view for view in glances if view.grain < NoiseTuning.min_grain]
+    depth = [view for view in glances if view.surface < NoiseTuning.min_surface]
     found = []
     if _many(color, glances):
         value = max(0.0, float(np.median([view.grain for view in color])))
@@ -39,18 +48,18 @@ def judge_noise(glances: list[Glance], numbers: range) -> list[Verdict]:
         value = float(np.median([view.surface for view in depth]))
         how = f"{value:.0%} of neighbouring pixels are about equally far, of scenes more than 90%"
         text = f"depth images show noise {_where(depth, glances, numbers)}: {how}"
-        certain = len(depth) >= MOST_NOISE * len(glances)
+        certain = len(depth) >= NoiseTuning.all_share * len(glances)
         text += ", and nothing can be tracked by them" if certain else ""
         found.append(Verdict("depth_noise", "wrong" if certain else "doubtful", text))
     return [replace(verdict, text=f"{verdict.text}; {REMEDY}") for verdict in found]
 
 
 def _many(noisy: list[Glance], glances: list[Glance]) -> bool:
-    return len(noisy) >= min(FEWEST, len(glances)) and len(noisy) > LEAST_SHARE * len(glances)
+    return len(noisy) >= min(NoiseTuning.min_frames, len(glances)) and len(noisy) > NoiseTuning.min_share * len(glances)
 
 
 def _where(noisy: list[Glance], glances: list[Glance], numbers: range) -> str:
-    if len(noisy) >= MOST_NOISE * len(glances):
+    if len(noisy) >= NoiseTuning.all_share * len(glances):
         return "in all frames"
     first, last = numbers[noisy[0].index], numbers[noisy[-1].index]
     return f"in {len(noisy)} of {len(glances)} frames that were looked at, from {first} to {last}"
@@ -58,15 +67,20 @@ def _where(noisy: list[Glance], glances: list[Glance], numbers: range) -> str:
 
 def judge_views(sequence: Sequence, glances: list[Glance]) -> list[Verdict]:
     """Whether there is but one view, once or again and again: then no motion is seen."""
-    if len(sequence) < FEWEST_FRAMES:
+    if len(sequence) < NoiseTuning.min_tracked:
         number = "one frame shows" if len(sequence) == 1 else f"{len(sequence)} frames show"
-        text = f"{number} no motion that could be checked; record {FEWEST_FRAMES} frames at least, with a moving camera"
+        text = (
+            f"{number} no motion that could be checked; record at least {NoiseTuning.min_tracked} frames with a moving "
+            "camera"
+        )
         return [Verdict("no_motion", "doubtful", text)]
     same = all(
         np.array_equal(a.grey, b.grey) and np.array_equal(a.depth, b.depth)
         for a, b in zip(glances, glances[1:], strict=False)
     )
-    if not same or len(glances) < FEWEST_FRAMES or glances[0].blank:  # along a bare wall, all images are alike
+    if (
+        not same or len(glances) < NoiseTuning.min_tracked or glances[0].blank
+    ):  # along a bare wall, all images are alike
         return []
     text = f"all {len(sequence)} frames hold the same images: one frame, repeated, shows no motion"
     return [Verdict("no_motion", "doubtful", f"{text}; record with a moving camera")]

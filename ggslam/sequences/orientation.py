@@ -4,21 +4,30 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from ggslam.errors import SequenceError
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted
 
-HEAD = 1 << 16
-"""Bytes at the beginning of a file that are looked at: the tag comes before the picture."""
-ORIENTATION = 0x0112
+
+class OrientationTuning(Tuning):
+    """How much of an image file is read for its orientation."""
+
+    head_bytes = 1 << 16
+    """Bytes at the start of a file: the tag comes before the picture."""
+
+
+ORIENTATION: Final = 0x0112
+"""Number of the Exif tag "Orientation"."""
 WORDS = {
     2: "mirrored", 3: "turned by 180 degrees", 4: "upside down and mirrored", 5: "turned by 90 degrees and mirrored",
     6: "turned by 90 degrees", 7: "turned by 270 degrees and mirrored", 8: "turned by 270 degrees",
 }  # fmt: skip
 """How the pixels of a file with each tag lie; 1 is upright (CIPA DC-008, Exif 2.32, table 6)."""
 
-QUARTER_TURNS = (5, 6, 7, 8)
-"""Tags that exchange width and height."""
+QUARTER_TURNS: Final = (5, 6, 7, 8)
+"""Its values that exchange width and height."""
 
 
 def orientation_of(file: object) -> int:
@@ -27,7 +36,7 @@ def orientation_of(file: object) -> int:
         return 1
     try:
         with open_untrusted(file, SequenceError) as opened:
-            return orientation_in(opened.read(HEAD))
+            return orientation_in(opened.read(OrientationTuning.head_bytes))
     except (OSError, SequenceError):
         return 1
 

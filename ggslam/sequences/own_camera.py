@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -13,8 +14,8 @@ from ggslam.sequences.calibration import camera_or_calibration, distortion_entry
 from ggslam.sequences.json_files import check_intrinsics
 from ggslam.sequences.recording import Calibration, OwnCamera, Recording
 
-COUNTS = (0, 4, 5, 8)
-"""Of coefficients of distortion that OpenCV takes; fewer are filled up with zeros."""
+COUNTS: Final = (0, 4, 5, 8)
+"""Numbers of distortion coefficients of OpenCV's models; fewer are filled up with zeros."""
 
 
 def read_own_camera(camera: Path | None, intrinsics: str | None) -> OwnCamera | None:

@@ -16,16 +16,22 @@ from ggslam.sequences.registration import DepthRegistration, undistorted_rays
 from ggslam.sequences.resampling import resize_color, resize_depth, resize_mask
 from ggslam.sequences.upsampling import upsample_depth
 from ggslam.sequences.valid_pixels import within_source
+from ggslam.system.tuning import Tuning
 
-FINER = 2.5
-"""Colour with so many times as many columns as depth is not cut to the size of depth: depth is brought to colour."""
-USUAL_PIXELS = 640 * 480
-"""Pixels of an image that two processors map as quickly as they usually do: the default scale of finer colour."""
-ASPECT_TOLERANCE = 0.01
-"""Relative difference of width/height up to which two sizes count as the same view (1296x968 and 640x480: 0.4 %)."""
 
-_VERY_FAR_M = np.float32(1e4)
-"""Stands for depth where the sensor found nothing, where the way of its pixels into another image is looked for."""
+class GridTuning(Tuning):
+    """When depth is brought to colour's pixels, and colour is made smaller."""
+
+    finer = 2.5
+    """Columns of colour, in columns of depth, from which depth is brought to colour."""
+    usual_pixels = 640 * 480
+    """Pixels of an image that two processors map at usual speed; finer colour is scaled to it."""
+    aspect = 0.01
+    """Relative difference of width/height up to which two sizes are of one view (1296x968, 640x480: 0.4 %)."""
+    far_m = np.float32(1e4)
+    """Depth in metres that stands for "nothing measured" while pixels are brought to another image."""
+
+
 
 Size = tuple[int, int]
 """(width, height) in pixels."""
@@ -38,7 +44,7 @@ def image_size(image: np.ndarray) -> Size:
 
 def same_aspect(a: Size, b: Size) -> bool:
     """Whether two sizes can be the same view at different resolution."""
-    return abs(a[0] * b[1] - a[1] * b[0]) <= ASPECT_TOLERANCE * a[0] * b[1]
+    return abs(a[0] * b[1] - a[1] * b[0]) <= GridTuning.aspect * a[0] * b[1]
 
 
 def _text(size: Size) -> str:
@@ -56,7 +62,7 @@ class ImageGeometry:
     Attributes:
         camera: intrinsics of the images that come out.
         native_camera: the same before scaling.
-        usual: scale of one to the other that is usual: 1, of much finer colour what leaves `USUAL_PIXELS`.
+        usual: scale of one to the other that is usual: 1, of much finer colour what leaves `GridTuning.usual_pixels`.
         scale: of `camera` to that of usual size.
         finer: whether depth is brought to finer colour.
         valid: bool [H, W], where images of `camera` show something; None: everywhere.
@@ -81,10 +87,10 @@ class ImageGeometry:
             self.native_camera = camera_of(recording.path, *depth_size, *recording.depth_calibration)
             self._align_color(color_camera.resize(*depth_size))
         else:
-            self.finer = color_size[0] >= FINER * depth_size[0]
+            self.finer = color_size[0] >= GridTuning.finer * depth_size[0]
             size = color_size if self.finer else min(color_size, depth_size, key=lambda s: s[0] * s[1])
             self.native_camera = color_camera.resize(*size)
-        most = USUAL_PIXELS / (self.native_camera.width * self.native_camera.height)
+        most = GridTuning.usual_pixels / (self.native_camera.width * self.native_camera.height)
         self.usual: float = min(1.0, most**0.5) if self.finer else 1.0
         self.scale: float = 1.0 if scale is None else scale
         if self.scale * self.usual > 1 + 1e-6:
@@ -203,8 +209,8 @@ class ImageGeometry:
             color: steadied colour.
             files: the frame.
         """
-        far = self.steady(np.where(found, _VERY_FAR_M, stored), files, cv2.INTER_NEAREST)
-        return (depth == 0) & (self.depth(far, color) > _VERY_FAR_M / 2)
+        far = self.steady(np.where(found, GridTuning.far_m, stored), files, cv2.INTER_NEAREST)
+        return (depth == 0) & (self.depth(far, color) > GridTuning.far_m / 2)
 
     def _depth_of_camera(self, depth: np.ndarray) -> np.ndarray:
         if self._registration is not None:

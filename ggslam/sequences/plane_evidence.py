@@ -10,21 +10,34 @@ import numpy as np
 
 from ggslam.scene.frame import Frame
 from ggslam.sequences.depth_kind import Measure
+from ggslam.system.tuning import Tuning
 
 MEASURES: tuple[Measure, ...] = ("z", "ray", "inverse")
-COLUMNS = 96
-"""Of the images that are looked at, about."""
-WINDOW = 3
-"""Windows are so many times smaller than the image, and overlap by half."""
-SMALLEST = 4
-"""Rows or columns of a window."""
-FULL = 0.7
-"""Share of a window's pixels that must have depth."""
-FLAT = 0.01
-"""Median relative residual up to which a window shows a plane, read in one way at least."""
-FEWEST_WINDOWS, FEWEST_FRAMES, FEWEST_PLACES = 12, 4, 6
-MOST, LEAST_RATIO = 0.67, 0.75
-"""Share of the windows in which a reading has to be the flattest, and by which factor in their median."""
+
+
+class PlaneTuning(Tuning):
+    """When planes tell how depth was measured."""
+
+    columns = 96
+    """Columns of the images that are looked at, about."""
+    window_share = 3
+    """An image is so many times as wide as a window; windows overlap by half."""
+    min_side = 4
+    """Fewest rows and columns of a window."""
+    full = 0.7
+    """Smallest share of a window's pixels with depth."""
+    flat = 0.01
+    """Largest median relative residual of a window that shows a plane, in one reading at least."""
+    min_windows = 12
+    """Fewest windows that show a plane."""
+    min_frames = 4
+    """Fewest frames that they are in."""
+    min_places = 6
+    """Fewest places in the image that they are at."""
+    min_wins = 0.67
+    """Smallest share of the windows in which a reading is the flattest."""
+    max_ratio = 0.75
+    """Its largest median residual, as a share of that of the others."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +62,15 @@ class PlaneEvidence:
     @property
     def measure(self) -> Measure | None:
         """The reading that fits clearly better than all others; None: none does."""
-        if self.windows < FEWEST_WINDOWS or self.frames < FEWEST_FRAMES or self.places < FEWEST_PLACES:
+        if (
+            self.windows < PlaneTuning.min_windows
+            or self.frames < PlaneTuning.min_frames
+            or self.places < PlaneTuning.min_places
+        ):
             return None
         best = int(np.argmax(self.wins))
         others = [ratio for k, ratio in enumerate(self.ratios) if k != best]
-        clear = self.wins[best] >= MOST and self.ratios[best] <= LEAST_RATIO * min(others)
+        clear = self.wins[best] >= PlaneTuning.min_wins and self.ratios[best] <= PlaneTuning.max_ratio * min(others)
         return MEASURES[best] if clear else None
 
 
@@ -82,7 +99,7 @@ def _residuals(frame: Frame) -> dict[tuple[int, int], list[float]]:
     for window in windows_of(frame):
         d, rays = window.depth, window.rays
         row = [residual_of(values, rays) for values in (1 / d, np.linalg.norm(rays, axis=1) / d, d)]
-        if min(row) < FLAT:
+        if min(row) < PlaneTuning.flat:
             found[window.place] = row
     return found
 
@@ -98,18 +115,18 @@ class Window:
 
 def windows_of(frame: Frame) -> list[Window]:
     """Parts of a frame, overlapping by half, that are full of depth."""
-    step = max(1, frame.depth.shape[1] // COLUMNS)
+    step = max(1, frame.depth.shape[1] // PlaneTuning.columns)
     depth = frame.depth[::step, ::step].astype(np.float64)
     rays = frame.camera.rays()[::step, ::step].astype(np.float64)
-    height, width = depth.shape[0] // WINDOW, depth.shape[1] // WINDOW
+    height, width = depth.shape[0] // PlaneTuning.window_share, depth.shape[1] // PlaneTuning.window_share
     found: list[Window] = []
-    if min(height, width) < SMALLEST:
+    if min(height, width) < PlaneTuning.min_side:
         return found
     for top in range(0, depth.shape[0] - height + 1, max(1, height // 2)):
         for left in range(0, depth.shape[1] - width + 1, max(1, width // 2)):
             part = np.s_[top : top + height, left : left + width]
             known = depth[part] > 0
-            if known.mean() >= FULL:
+            if known.mean() >= PlaneTuning.full:
                 found.append(Window((top, left), depth[part][known], rays[part][known]))
     return found
 

@@ -11,13 +11,24 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.images import LARGEST_CODE, read_stored_depth
 from ggslam.sequences.sequence import Sequence
+from ggslam.system.tuning import Tuning
 
-LOOKS = 6
-LEAST_SHARE, NEAR, LARGEST_NEAR = 0.005, 0.9, 0.1
-"""Share of the known pixels that hold the largest number; what is at least so large a part of it counts as near; so
-many times as many pixels may be near."""
-FRAMES, LEAST_REST = 0.6, 0.3
-"""Share of the images that hold it, and of the known pixels that hold a number much smaller."""
+
+class PlantedCodeTuning(Tuning):
+    """When a number in depth images is said to mean "not measured"."""
+
+    frames = 6
+    """Frames spread over the recording."""
+    min_share = 0.005
+    """Smallest share of the known pixels that hold the largest number."""
+    near = 0.9
+    """Share of the largest number from which another one is near it."""
+    max_near = 0.1
+    """Most pixels near it, as a share of those that hold it."""
+    min_frames = 0.6
+    """Smallest share of the images that hold it."""
+    min_rest = 0.3
+    """Smallest share of the known pixels with a much smaller number."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +42,7 @@ class PlantedCode:
 def find_planted_code(sequence: Sequence) -> PlantedCode | None:
     """Looks at some depth images as stored; None: nothing of the kind, or it is left out already."""
     images = []
-    for number in np.unique(np.linspace(0, len(sequence) - 1, LOOKS).round().astype(int)):
+    for number in np.unique(np.linspace(0, len(sequence) - 1, PlantedCodeTuning.frames).round().astype(int)):
         try:
             raw = read_stored_depth(sequence.files(int(number)).depth).astype(np.float64)
         except SequenceError:
@@ -43,8 +54,16 @@ def find_planted_code(sequence: Sequence) -> PlantedCode | None:
         return None
     values = np.concatenate(images)
     top = float(values.max())
-    held, near = float((values == top).mean()), float(((values >= NEAR * top) & (values < top)).mean())
+    held, near = (
+        float((values == top).mean()),
+        float(((values >= PlantedCodeTuning.near * top) & (values < top)).mean()),
+    )
     rest = 1 - held - near
-    often = float(np.mean([(known == top).mean() > LEAST_SHARE / 5 for known in images]))
-    planted = held > LEAST_SHARE and near < LARGEST_NEAR * held and often >= FRAMES and rest > LEAST_REST
+    often = float(np.mean([(known == top).mean() > PlantedCodeTuning.min_share / 5 for known in images]))
+    planted = (
+        held > PlantedCodeTuning.min_share
+        and near < PlantedCodeTuning.max_near * held
+        and often >= PlantedCodeTuning.min_frames
+        and rest > PlantedCodeTuning.min_rest
+    )
     return PlantedCode(top, held) if planted else None

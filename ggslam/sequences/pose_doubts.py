@@ -14,13 +14,24 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sequences.pose_conventions import CONVENTIONS, OURS, PoseConvention
 from ggslam.sequences.sequence import Sequence
+from ggslam.system.tuning import Tuning
 
-BASELINE_M, TURN_DEG, LOOKAHEAD = 0.15, 12.0, 40
-"""Two frames are compared that far apart: as soon as one of the first two is reached, at most so many frames on."""
-GRID = 24
-"""Rows and columns of the pixels that are compared."""
-FEWEST = 200
-"""Pixels that have to be seen twice for anything to be said."""
+
+class PoseDoubtTuning(Tuning):
+    """How true poses are compared with depth."""
+
+    baseline_m = 0.15
+    """Distance from which two frames are compared, in metres."""
+    turn_deg = 12.0
+    """Rotation from which two frames are compared, in degrees."""
+    lookahead = 40
+    """Most frames between the two."""
+    grid = 24
+    """Rows and columns of the pixels that are compared."""
+    min_pixels = 200
+    """Fewest pixels that are seen twice."""
+    ratios = np.geomspace(1 / 12, 12, 35)
+    """Factors that depth is multiplied by in search of its unit; 1 is in the middle."""
 
 
 def _with_axes(x: float, y: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -37,9 +48,6 @@ SIDES = {
 """How colour and depth may be stored together, so that one fits the other and the world is another one than that of
 the poses."""
 READINGS = {**CONVENTIONS, **SIDES}
-
-RATIOS = np.geomspace(1 / 12, 12, 35)
-"""By which depth is multiplied in search of its unit; 1 is among them."""
 
 
 @dataclass(frozen=True)
@@ -88,26 +96,26 @@ def _later(sequence: Sequence, index: int) -> int | None:
     poses = sequence.ground_truth
     if poses is None or index + 1 >= len(poses):
         return None
-    steps = inverse(poses[index][None]) @ poses[index + 1 : index + 1 + LOOKAHEAD]
+    steps = inverse(poses[index][None]) @ poses[index + 1 : index + 1 + PoseDoubtTuning.lookahead]
     known = np.flatnonzero(np.isfinite(steps).all((1, 2)))
     if not len(known):
         return None
     turn = np.degrees(np.arccos(np.clip((np.trace(steps[known, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    far = (np.linalg.norm(steps[known, :3, 3], axis=1) > BASELINE_M) | (turn > TURN_DEG)
+    far = (np.linalg.norm(steps[known, :3, 3], axis=1) > PoseDoubtTuning.baseline_m) | (turn > PoseDoubtTuning.turn_deg)
     return index + 1 + int(known[int(far.argmax())] if far.any() else known[-1])
 
 
 def doubt_poses(pairs: list[tuple[Frame, Frame]]) -> PoseDoubt | None:
     """Looks for the reading of the poses and the unit of depth that agree best; None if too little is seen twice."""
-    error = _error(pairs, CONVENTIONS[OURS], 1.0, FEWEST)
+    error = _error(pairs, CONVENTIONS[OURS], 1.0, PoseDoubtTuning.min_pixels)
     if error is None:
         return None
     # A reading that sees less than half as much twice can look good by chance.
-    fewest = max(FEWEST, _seen_twice(pairs) // 2)
+    fewest = max(PoseDoubtTuning.min_pixels, _seen_twice(pairs) // 2)
     best = PoseDoubt(error, OURS, 1.0, error)
     for name, convention in READINGS.items():
-        for ratio in RATIOS if name == OURS else (1.0,):
-            found = _error(pairs, convention, float(ratio), fewest if name == OURS else FEWEST)
+        for ratio in PoseDoubtTuning.ratios if name == OURS else (1.0,):
+            found = _error(pairs, convention, float(ratio), fewest if name == OURS else PoseDoubtTuning.min_pixels)
             if found is not None and found < best.best:
                 best = PoseDoubt(error, name, float(ratio), found)
     return best
@@ -126,7 +134,7 @@ def _error(pairs: list[tuple[Frame, Frame]], convention: PoseConvention, ratio: 
 def _differences(frame: Frame, other: Frame, convention: PoseConvention, ratio: float) -> np.ndarray:
     """|seen - predicted| / predicted for pixels of `frame` that fall into `other`."""
     assert frame.T_world_camera is not None and other.T_world_camera is not None
-    step = max(1, min(frame.depth.shape) // GRID)
+    step = max(1, min(frame.depth.shape) // PoseDoubtTuning.grid)
     points = frame.camera.rays()[::step, ::step] * frame.depth[::step, ::step, None].astype(np.float32)
     points = points.reshape(-1, 3) * np.float32(ratio)
     points = points[points[:, 2] > 0]

@@ -7,16 +7,18 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import is_valid_pose, quaternion_to_matrix
-from ggslam.sequences.association import TOLERANCE, poses_at, span
+from ggslam.sequences.association import PairingTuning, poses_at, span
 from ggslam.sequences.camera_files.matrices import intrinsics_of_matrix
 from ggslam.sequences.recording import Calibration, Recording, image_numbers, read_text
 from ggslam.sequences.stamps import unit_of_stamps
 from ggslam.system.clock_units import UNITS
+from ggslam.system.tuning import Tuning
 
 
 def data_lines(path: Path) -> list[tuple[int, str]]:
@@ -36,10 +38,15 @@ def invalid_pose_reason(T: np.ndarray) -> str | None:
     return None
 
 
-MOST = 1e6
-"""Of a number of a quaternion, which has unit length but for rounding."""
-MATRIX = 16
-"""Numbers of a line that is a matrix; 12 are the same without its last row."""
+class PoseTuning(Tuning):
+    """A limit on damaged files."""
+
+    max_number = 1e6
+    """Largest number of a quaternion, which has unit length but for rounding."""
+
+
+MATRIX: Final = 16
+"""Numbers of a line that is a 4x4 matrix; 12 lack its last row."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +109,7 @@ def _no_rotation_reason(values: np.ndarray, count: int) -> str | None:
         return None
     quaternion = values[3:7] if count == 7 else values[4:8]
     length = float(np.linalg.norm(quaternion))
-    return None if 0.5 < length <= MOST else f"pose holds a quaternion of length {length:.3g}, not 1"
+    return None if 0.5 < length <= PoseTuning.max_number else f"pose holds a quaternion of length {length:.3g}, not 1"
 
 
 def _names_columns(line: str, count: int) -> bool:
@@ -129,7 +136,11 @@ def pose_of_numbers(values: np.ndarray) -> np.ndarray:
         T[: len(values) // 4] = values.reshape(-1, 4)
         return T
     tx, ty, tz, qx, qy, qz, qw = values[-7:]
-    if not np.isfinite(values).all() or np.abs(values[-4:]).max() > MOST or np.linalg.norm(values[-4:]) <= 0.5:
+    if (
+        not np.isfinite(values).all()
+        or np.abs(values[-4:]).max() > PoseTuning.max_number
+        or np.linalg.norm(values[-4:]) <= 0.5
+    ):
         return np.full((4, 4), np.nan)
     T[:3, :3], T[:3, 3] = quaternion_to_matrix(np.array([qw, qx, qy, qz])), (tx, ty, tz)
     return T
@@ -208,8 +219,8 @@ def take_rows_by_time(recording: Recording, rows: PoseRows) -> None:
     poses = poses_at(images, stamps[known], rows.poses[known])
     if not np.isfinite(poses).any():
         raise SequenceError(
-            f"{rows.path}: no pose within {TOLERANCE} s of any image; poses span {span(stamps[known])}, images "
-            f"{span(images)}"
+            f"{rows.path}: no pose within {PairingTuning.tolerance_s} s of any image; poses span "
+            f"{span(stamps[known])}, images {span(images)}"
         )
     if unit != "s":
         recording.warnings.append(f"{name}: its times are read as {unit}, which goes with the times of the images")

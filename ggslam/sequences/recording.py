@@ -15,12 +15,23 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.depth_kind import PLAIN, DepthKind
+from ggslam.system.plurals import agreeing
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted_text
 
 T = TypeVar("T")
 
-NOMINAL_RATE = 30.0
-"""Frames per second assumed when a recording tells no time."""
+
+class RecordingTuning(Tuning):
+    """What is assumed of recordings."""
+
+    rate_hz = 30.0
+    """Frames per second of a recording without times."""
+    confidence = 1
+    """Smallest confidence of a phone's depth: medium drops the fringes around objects and keeps walls."""
+    max_digits = 1000
+    """Most digits of a number in a file's name; Python refuses to read some thousands."""
+
 
 Calibration = tuple[float, float, float, float]
 """(fx, fy, cx, cy) in pixels."""
@@ -133,7 +144,7 @@ class ReadOptions:
     Attributes:
         depth_camera: YAML file with intrinsics of a depth camera that is not the colour camera, see `calibration`.
         topics: of a bag: role (color, depth, color_info, depth_info, pose) -> topic.
-        min_confidence: depth less sure than this (0 to 2) is dropped; None: `DEFAULT_CONFIDENCE`.
+        min_confidence: depth less sure than this (0 to 2) is dropped; None: `RecordingTuning.confidence`.
         own_camera: of colour, instead of what the recording tells.
         depth_scale: units of the depth images per metre, instead of what the recording tells.
         truth: whether true poses are read.
@@ -201,8 +212,6 @@ def _read_with_hint(read: Callable[[], T], instead: str) -> T:
 
 
 NO_OPTIONS = ReadOptions()
-DEFAULT_CONFIDENCE = 1
-"""Medium: of a phone's LiDAR this drops the fringes around objects and keeps the walls."""
 
 
 @dataclass
@@ -252,12 +261,12 @@ class Recording:
     depth_camera: DepthCamera | None = None
     distortion: np.ndarray | None = None
     fisheye: bool = False
-    min_confidence: int = DEFAULT_CONFIDENCE
+    min_confidence: int = RecordingTuning.confidence
     poses: np.ndarray | None = None
     pose_source: str = "none"
     pose_problem: str = ""
     camera_source: str = ""
-    time_source: str = f"nominal {NOMINAL_RATE:g} frames/s"
+    time_source: str = f"nominal {RecordingTuning.rate_hz:g} frames/s"
     depth_delays: np.ndarray | None = None
     instance_names: dict[int, str] = field(default_factory=dict)
     problems: dict[int, str] = field(default_factory=dict)
@@ -275,7 +284,7 @@ class Recording:
         self.poses, self.pose_source = poses, source
         without = len(poses) - known
         if without or reasons:
-            have = "has" if without == 1 else "have"
+            have = agreeing(without, "has", "have")
             self.warnings.append(
                 f"{source}: {without} of {len(poses)} frames {have} no true pose; scores are over the other "
                 f"{known}{first}"
@@ -309,10 +318,6 @@ class RecordingFormat(Protocol):
         ...
 
 
-MOST_DIGITS = 1000
-"""Of a number in a name; Python refuses to read some thousands."""
-
-
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sorting key that puts "frame2" before "frame10"."""
     parts = [part for part in re.split(r"(\d+)", name) if part]  # numbers of any length: by digits, then by value
@@ -323,7 +328,7 @@ def last_number(name: str) -> int | None:
     """The last run of digits in a name as a number: 12 for "frame-000012.color.png"; None when there is none, or a
     number that no camera counts to."""
     digits = re.findall(r"\d+", name)
-    return int(digits[-1]) if digits and len(digits[-1]) <= MOST_DIGITS else None
+    return int(digits[-1]) if digits and len(digits[-1]) <= RecordingTuning.max_digits else None
 
 
 def image_files(folder: Path, suffixes: tuple[str, ...] = COLOR_SUFFIXES) -> list[Path]:
@@ -354,7 +359,7 @@ def image_numbers(files: Iterable[ImageFile]) -> np.ndarray | None:
     return found if (np.diff(found) > 0).all() else None
 
 
-def nominal_timestamps(count: int, rate: float = NOMINAL_RATE) -> np.ndarray:
+def nominal_timestamps(count: int, rate: float = RecordingTuning.rate_hz) -> np.ndarray:
     """Evenly spaced times, float64 [count], seconds."""
     return np.arange(count, dtype=np.float64) / rate
 

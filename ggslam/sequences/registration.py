@@ -11,10 +11,14 @@ import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.sequences.recording import DepthCamera
+from ggslam.system.tuning import Tuning
 
-SPLAT = 1.4
-"""Side of the square that a depth pixel covers, in depth pixels: more than one, so that surfaces seen a little nearer
-or turned towards the other camera have no pinholes."""
+
+class RegistrationTuning(Tuning):
+    """How depth is brought to another camera."""
+
+    splat = 1.4
+    """Side of the square that a depth pixel covers, in depth pixels: more than 1, so that surfaces have no pinholes."""
 
 
 class DepthRegistration:
@@ -33,7 +37,10 @@ class DepthRegistration:
         # Coordinate by coordinate: arrays of points are several times slower to work on.
         self._rays = np.ascontiguousarray((rays.reshape(-1, 3) @ rotation.T).T.astype(np.float32))
         self._target = target
-        self._side = (SPLAT * max(1.0, target.fx / camera.fx), SPLAT * max(1.0, target.fy / camera.fy))
+        self._side = (
+            RegistrationTuning.splat * max(1.0, target.fx / camera.fx),
+            RegistrationTuning.splat * max(1.0, target.fy / camera.fy),
+        )
 
     def __call__(self, depth: np.ndarray) -> np.ndarray:
         """Depth float32 [H, W] of the depth camera, 0 = none -> float32 of the target camera, metres."""

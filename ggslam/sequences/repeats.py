@@ -13,12 +13,21 @@ from ggslam.errors import SequenceError
 from ggslam.sequences.images import read_color
 from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, read_untrusted
+from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
-PLACES, LENGTH = 3, 9
-"""Where in a recording one looks, and how many successive frames there."""
-FEWEST, LEAST_SHARE = 3, 0.1
-"""Pairs of neighbours that are alike, and their share, from which it is told."""
+
+class RepeatTuning(Tuning):
+    """When images are said to repeat."""
+
+    stretches = 3
+    """Stretches of a recording that are read."""
+    stretch_frames = 9
+    """Successive frames of a stretch."""
+    min_pairs = 3
+    """Fewest pairs of equal neighbours."""
+    min_share = 0.1
+    """Smallest share of them among all pairs."""
 
 
 @dataclass(frozen=True)
@@ -39,15 +48,19 @@ class Repeats:
 
     def many(self, count: int) -> bool:
         """Whether so many pairs are worth a word."""
-        return count >= FEWEST and count >= LEAST_SHARE * self.pairs
+        return count >= RepeatTuning.min_pairs and count >= RepeatTuning.min_share * self.pairs
 
 
 def find_repeats(sequence: Sequence) -> Repeats:
     """Compares neighbours at some places of a recording, byte by byte."""
     pairs = depth = color = 0
     blank = True
-    first = np.unique(np.linspace(0, max(len(sequence) - LENGTH, 0), PLACES).round().astype(int))
-    numbers = sorted({k for at in first.tolist() for k in range(at, min(at + LENGTH, len(sequence)) - 1)})
+    first = np.unique(
+        np.linspace(0, max(len(sequence) - RepeatTuning.stretch_frames, 0), RepeatTuning.stretches).round().astype(int)
+    )
+    numbers = sorted(
+        {k for at in first.tolist() for k in range(at, min(at + RepeatTuning.stretch_frames, len(sequence)) - 1)}
+    )
     for number in numbers:
         try:
             here, there = sequence.files(number), sequence.files(number + 1)
@@ -70,8 +83,8 @@ def _is_blank(file: ImageFile) -> bool:
 def _alike(a: ImageFile, b: ImageFile) -> bool:
     """Whether two images are the same: files by their bytes, others by their pixels."""
     if isinstance(a, Path) and isinstance(b, Path):
-        return a == b or read_untrusted(a, MAX_IMAGE_BYTES, SequenceError) == read_untrusted(
-            b, MAX_IMAGE_BYTES, SequenceError
+        return a == b or read_untrusted(a, FileTuning.max_image_bytes, SequenceError) == read_untrusted(
+            b, FileTuning.max_image_bytes, SequenceError
         )
     if isinstance(a, Path) or isinstance(b, Path):
         return False

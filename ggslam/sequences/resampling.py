@@ -8,10 +8,16 @@ import math
 import cv2
 import numpy as np
 
-LEAST_WEIGHT = np.float32(0.1)
-"""Share of what samples cover on average that one has to cover to tell which surface a pixel shows."""
-DEPTH_TOLERANCE = np.float32(1.02)
-"""Depths under a pixel that are within 2 % of the nearest one belong to the same surface."""
+from ggslam.system.tuning import Tuning
+
+
+class ResamplingTuning(Tuning):
+    """How depth is brought to another pixel grid."""
+
+    min_weight = np.float32(0.1)
+    """Smallest share of a usual sample's cover that tells which surface a pixel shows."""
+    same_surface = np.float32(1.02)
+    """Depths under a pixel up to this factor of the nearest one belong to one surface."""
 
 
 def resize_color(color: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -42,7 +48,7 @@ def resize_depth(depth: np.ndarray, width: int, height: int) -> np.ndarray:
     for z in samples:
         missing += z == far
         np.minimum(nearest, z, out=nearest)
-    limit = nearest * DEPTH_TOLERANCE
+    limit = nearest * ResamplingTuning.same_surface
     total, count = np.zeros((height, width), np.float32), np.zeros((height, width), np.float32)
     for z in samples:
         same = z < limit
@@ -64,8 +70,10 @@ def _resize_depth_by_area(depth: np.ndarray, width: int, height: int) -> np.ndar
     ]
     nearest = np.zeros((height, width), np.float32)
     for inverse_z, weight in samples:  # what no more than touches a pixel does not decide which surface it shows
-        np.maximum(nearest, inverse_z, out=nearest, where=weight * np.float32(len(samples)) > LEAST_WEIGHT)
-    limit, most = nearest / DEPTH_TOLERANCE, nearest * DEPTH_TOLERANCE
+        np.maximum(
+            nearest, inverse_z, out=nearest, where=weight * np.float32(len(samples)) > ResamplingTuning.min_weight
+        )
+    limit, most = nearest / ResamplingTuning.same_surface, nearest * ResamplingTuning.same_surface
     total, same, known = (np.zeros((height, width), np.float32) for _ in range(3))
     for inverse_z, weight in samples:
         near = weight * ((inverse_z > limit) & (inverse_z < most))

@@ -19,12 +19,20 @@ from ggslam.sequences.recording import FrameFiles, select
 from ggslam.sequences.rig_file import RigCamera, RigFile, find_rig_file, read_rig_file
 from ggslam.sequences.rig_times import find_instants, gaps
 from ggslam.sequences.sequence import OnBadFrame, ReadMasks, Sequence, SkippedFrame
+from ggslam.system.tuning import Tuning
 
 NAME = "rig"
 """Of the format."""
 LAYOUT = "rig.yaml: cameras, each with a recording of any format and T_rig_camera"
-TRUTH_NEAR_M, TRUTH_NEAR_DEG = 0.25, 10.0
-"""True poses of two cameras are of one world if they have the cameras so near to where rig.yaml has them."""
+
+
+class RigTuning(Tuning):
+    """When true poses of two cameras are in one world."""
+
+    near_m = 0.25
+    """Largest distance between a camera's true pose and its place in rig.yaml, in metres."""
+    near_deg = 10.0
+    """Largest rotation between them, in degrees."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +205,7 @@ class RigSequence(Sequence):
         T_first_b = self.rig.T_first_camera[a] @ inverse(each[both, a]) @ each[both, b]
         apart = [separation(T, self.rig.T_first_camera[b]) for T in T_first_b]
         shift, turn = np.median(np.array(apart), axis=0)
-        return bool(shift < TRUTH_NEAR_M and turn < TRUTH_NEAR_DEG)
+        return bool(shift < RigTuning.near_m and turn < RigTuning.near_deg)
 
 
 def one_camera(sequence: Sequence, what: str) -> Sequence:

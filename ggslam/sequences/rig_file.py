@@ -30,10 +30,11 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.sequences.association import TOLERANCE
+from ggslam.sequences.association import PairingTuning
 from ggslam.sequences.calibration import number_entry, transform_entry
 from ggslam.sequences.recording import read_text
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml, repeated_key
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import given_path
 
 FILE = "rig.yaml"
@@ -44,8 +45,17 @@ _KEYS = (
     "name", "recording", "T_rig_camera", "time_offset", "scale", "intrinsics", "topics", "depth_scale",
     "min_confidence", "upright", "void_id", *_PATHS, *_TEXTS,
 )  # fmt: skip
-_LARGEST_TOLERANCE = 10.0
-_LARGEST_OFFSET = 1e12
+
+
+class RigFileTuning(Tuning):
+    """Limits on numbers in rig.yaml."""
+
+    max_tolerance_s = 10.0
+    """Largest tolerance of times, in seconds."""
+    max_offset_s = 1e12
+    """Largest offset of a clock, in seconds."""
+
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
@@ -112,8 +122,8 @@ def read_rig_file(path: Path) -> RigFile:
     if not isinstance(content, dict) or not isinstance(entries, list) or not entries:
         raise SequenceError(f"{path}: expected an entry 'cameras' with a list of cameras")
     _refuse_unknown(str(path), content, ("cameras", "tolerance"))
-    tolerance = number_entry(path, content, "tolerance") if "tolerance" in content else TOLERANCE
-    if not 0 < tolerance <= _LARGEST_TOLERANCE:
+    tolerance = number_entry(path, content, "tolerance") if "tolerance" in content else PairingTuning.tolerance_s
+    if not 0 < tolerance <= RigFileTuning.max_tolerance_s:
         raise SequenceError(f"{path}: expected 'tolerance' above 0 and at most 10 seconds, found {tolerance:g}")
     cameras: list[RigCamera] = []
     for number, entry in enumerate(entries, start=1):
@@ -151,7 +161,7 @@ def _camera(path: Path, number: int, entry: Any) -> RigCamera:
         raise SequenceError(f"{place}: expected 'recording' to name a folder or file, found '{recording}'")
     return RigCamera(
         name, path.parent / given_path(recording, where=place), transform_entry(place, entry, "T_rig_camera"),
-        _number(place, entry, "time_offset", -_LARGEST_OFFSET, _LARGEST_OFFSET) or 0.0,
+        _number(place, entry, "time_offset", -RigFileTuning.max_offset_s, RigFileTuning.max_offset_s) or 0.0,
         _number(place, entry, "scale", 1e-3, 1.0), _options(path, place, entry),
     )  # fmt: skip
 

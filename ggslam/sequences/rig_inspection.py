@@ -11,13 +11,20 @@ from ggslam.scene.poses import inverse, separation
 from ggslam.sequences.inspection import SequenceReport, inspect_sequence
 from ggslam.sequences.rig import RigSequence, camera_gaps
 from ggslam.sequences.verdicts import Verdict
+from ggslam.system.tuning import Tuning
 
-FAR_M, FAR_DEG = 0.05, 2.0
-"""True poses have the cameras elsewhere than rig.yaml from so far on."""
-FEWEST = 5
-"""Instants at which two true poses have to be known for anything to be said."""
-LACKING = 0.05
-"""Share of the instants at which a camera has no frame from which it is told."""
+
+class RigInspectionTuning(Tuning):
+    """When rig.yaml is doubted."""
+
+    far_m = 0.05
+    """Distance of a camera's true pose from its place in rig.yaml, in metres."""
+    far_deg = 2.0
+    """Rotation between them, in degrees."""
+    min_instants = 5
+    """Fewest instants with two true poses."""
+    max_lacking = 0.05
+    """Largest share of the instants at which a camera may lack a frame."""
 
 
 @dataclass
@@ -92,7 +99,7 @@ def _off(sequence: RigSequence, number: int) -> tuple[float, float] | None:
         return None
     T_first_camera = inverse(first[at[:, 0]]) @ part[at[:, number]]
     T_first_camera = T_first_camera[np.isfinite(T_first_camera).all((1, 2))]
-    if len(T_first_camera) < FEWEST:
+    if len(T_first_camera) < RigInspectionTuning.min_instants:
         return None
     expected = sequence.rig.T_first_camera[number]
     shift, turn = np.median([separation(T, expected) for T in T_first_camera], axis=0)
@@ -101,11 +108,13 @@ def _off(sequence: RigSequence, number: int) -> tuple[float, float] | None:
 
 def _warn(report: RigReport, camera: RigCameraReport) -> None:
     lacking = report.instants - camera.frames
-    if lacking > LACKING * report.instants:
+    if lacking > RigInspectionTuning.max_lacking * report.instants:
         report.warnings.append(
             f"{camera.name}: no frame at {lacking} of {report.instants} instants; there the others alone are tracked"
         )
-    if camera.off is not None and (camera.off[0] > FAR_M or camera.off[1] > FAR_DEG):
+    if camera.off is not None and (
+        camera.off[0] > RigInspectionTuning.far_m or camera.off[1] > RigInspectionTuning.far_deg
+    ):
         text = (
             f"{camera.name}: true poses have it {100 * camera.off[0]:.1f} cm and {camera.off[1]:.1f} degrees from "
             "where T_rig_camera has it; check T_rig_camera (from the camera to the rig), or the poses are of two worlds"

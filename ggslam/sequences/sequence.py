@@ -30,16 +30,23 @@ from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
 from ggslam.sequences.valid_pixels import common_fill, fill_of
 from ggslam.system.opencv import opencv_errors
+from ggslam.system.plurals import agreeing, counted
+from ggslam.system.tuning import Tuning
 
 OnBadFrame = Literal["error", "skip"]
 ReadMasks = bool | Literal["lazy", "unshared"]
 """True: masks are read with the frame; "unshared": so, too, but pixels of a smaller image that several things have like
 shares of get id 0; "lazy": when `Frame.load_mask` is called; False: never."""
 
-FILL_LOOKS = 4
-"""Images that are compared with the first one where that is of one colour from a corner on."""
-SMALLEST_SIDE = 8
-"""Pixels that `scale` has to leave of both sides of an image: windows of trackers and filters need so many."""
+
+class SequenceTuning(Tuning):
+    """How images are judged when a recording is opened."""
+
+    fill_frames = 4
+    """Images that are compared with the first one if that has a corner of one colour."""
+    min_side = 8
+    """Fewest rows and columns that `scale` may leave: trackers and filters have windows."""
+
 
 _log = logging.getLogger(__name__)
 
@@ -132,10 +139,11 @@ class Sequence:
         self.warnings: list[str] = list(recording.warnings)
         masked = self._select(selection)
         if masked < len(self) and any(entry.mask is not None for entry in recording.files):
-            self.warnings.append(f"{len(self) - masked} of {len(self)} frames have no mask")
+            without = len(self) - masked
+            self.warnings.append(f"{without} of {len(self)} frames {agreeing(without, 'has', 'have')} no mask")
         known = [i for i in selection if i in recording.problems]
         if on_bad_frame == "error" and known:
-            more = f" (and {len(known) - 1} more damaged frames)" if len(known) > 1 else ""
+            more = f" (and {counted(len(known) - 1, 'more damaged frame')})" if len(known) > 1 else ""
             raise SequenceError(recording.problems[known[0]] + more)
         self._geometry = self._measure(scale)
         self._masks = self._mask_reader()
@@ -148,9 +156,9 @@ class Sequence:
             self.camera_source += _scale_note(recording.camera, self.color_size)
         self.camera: Camera = self._geometry.camera
         self.scale: float = self._geometry.scale
-        if self.scale < 1 and min(self.camera.width, self.camera.height) < SMALLEST_SIDE:
+        if self.scale < 1 and min(self.camera.width, self.camera.height) < SequenceTuning.min_side:
             size = f"{self.camera.width}x{self.camera.height}"
-            needed = f"needed are {SMALLEST_SIDE} pixels a side"
+            needed = f"needed are {SequenceTuning.min_side} pixels a side"
             raise SequenceError(f"`scale`: {self.scale:g} leaves images of {size}, {needed}")
         self.native_camera: Camera = self._geometry.native_camera
         self.finer: bool = self._geometry.finer
@@ -382,7 +390,9 @@ class Sequence:
         if fill is None:
             return
         others = []
-        for source in self._selection[:: max(1, len(self._selection) // FILL_LOOKS)][1 : FILL_LOOKS + 1]:
+        for source in self._selection[:: max(1, len(self._selection) // SequenceTuning.fill_frames)][
+            1 : SequenceTuning.fill_frames + 1
+        ]:
             try:
                 others.append(read_color(self._recording.files[source].color, self._recording.upright))
             except SequenceError:

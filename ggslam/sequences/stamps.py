@@ -9,9 +9,14 @@ import numpy as np
 
 from ggslam.sequences.recording import ImageFile
 from ggslam.system.clock_units import EPOCH_DIGITS, UNITS
+from ggslam.system.tuning import Tuning
 
-LONGEST_STEP = 10.0
-"""Seconds from one pose to the next, at most, where nothing else tells the unit."""
+
+class StampTuning(Tuning):
+    """How the unit of times is told."""
+
+    max_step_s = 10.0
+    """Longest time between two poses if nothing else tells the unit, in seconds."""
 
 
 def times_of_names(files: Iterable[ImageFile]) -> np.ndarray | None:
@@ -47,7 +52,7 @@ def unit_of_stamps(stamps: np.ndarray, times: np.ndarray | None) -> str:
 
     Returns:
         The unit in which the file covers most images; without their times, or if it covers none in any, the first in
-        which poses follow one another within `LONGEST_STEP`.
+        which poses follow one another within `StampTuning.max_step_s`.
     """
     stamps = stamps[np.isfinite(stamps)]
     if times is not None and len(stamps) and len(times):
@@ -62,7 +67,7 @@ def unit_of_stamps(stamps: np.ndarray, times: np.ndarray | None) -> str:
     steps = steps[steps > 0]
     if not len(steps):
         return "s"
-    return next((unit for unit, size in UNITS.items() if np.median(steps) * size < LONGEST_STEP), "ns")
+    return next((unit for unit, size in UNITS.items() if np.median(steps) * size < StampTuning.max_step_s), "ns")
 
 
 def are_counted(stamps: np.ndarray) -> bool:

@@ -10,16 +10,24 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.frame import Frame
-from ggslam.sequences.alignment import FEWEST_OUTLINES, edges_of, outlines_of
+from ggslam.sequences.alignment import AlignmentTuning, edges_of, outlines_of
 from ggslam.sequences.sequence import Sequence
+from ggslam.system.tuning import Tuning
 
-REACH = 2
-"""Frames before and after."""
-PLACES, FEWEST_PLACES = 6, 3
-"""Where in a recording one looks, and at how many of them outlines have to be seen."""
-LEAST_GAIN, LEAST_SHARE = 0.05, 0.1
-"""By how much another frame's colour must fit better, in standard deviations of the edge images, and as a share of how
-well that fits; without any one of the places, too: a black, blurred or overexposed start is sharper later on."""
+
+class StepTuning(Tuning):
+    """When depth is said to be some frames late."""
+
+    reach = 2
+    """Frames before and after."""
+    places = 6
+    """Frames spread over the recording."""
+    min_places = 3
+    """Fewest of them with outlines."""
+    min_gain = 0.05
+    """Smallest gain, in standard deviations of the edge image, also without any one of the places."""
+    min_gain_share = 0.1
+    """The same as a share of the best strength."""
 
 
 @dataclass(frozen=True)
@@ -45,34 +53,39 @@ class StepDoubt:
 
 
 def _is_clear(strength: float, best: float) -> bool:
-    return best - strength > max(LEAST_GAIN, LEAST_SHARE * best)
+    return best - strength > max(StepTuning.min_gain, StepTuning.min_gain_share * best)
 
 
 def doubt_steps(sequence: Sequence) -> StepDoubt | None:
     """Compares depth with the colour of neighbouring frames; None if too few outlines are seen or frames are few."""
-    if len(sequence) < 2 * REACH + 1:
+    if len(sequence) < 2 * StepTuning.reach + 1:
         return None
     found = []
-    for middle in np.unique(np.linspace(REACH, len(sequence) - 1 - REACH, PLACES).round().astype(int)):
+    for middle in np.unique(
+        np.linspace(StepTuning.reach, len(sequence) - 1 - StepTuning.reach, StepTuning.places).round().astype(int)
+    ):
         try:
-            frames = [sequence.frame(int(k), masks=False) for k in range(middle - REACH, middle + REACH + 1)]
+            frames = [
+                sequence.frame(int(k), masks=False)
+                for k in range(middle - StepTuning.reach, middle + StepTuning.reach + 1)
+            ]
         except SequenceError:
             continue
         strengths = _strengths(frames)
         found += [] if strengths is None else [strengths]
-    if len(found) < FEWEST_PLACES:
+    if len(found) < StepTuning.min_places:
         return None
     places = np.stack(found)
     mean, others = places.mean(0), (places.sum(0) - places) / (len(places) - 1)
     best = int(mean.argmax())
-    agreed = all(_is_clear(float(rest[REACH]), float(rest[best])) for rest in others)
-    return StepDoubt(REACH - best, float(mean[REACH]), float(mean[best]), agreed)
+    agreed = all(_is_clear(float(rest[StepTuning.reach]), float(rest[best])) for rest in others)
+    return StepDoubt(StepTuning.reach - best, float(mean[StepTuning.reach]), float(mean[best]), agreed)
 
 
 def _strengths(frames: list[Frame]) -> np.ndarray | None:
     """Mean strength of the edges of each frame's colour under the outlines of the middle one's depth."""
-    outlines = outlines_of(frames[REACH].depth)
-    if outlines.sum() < FEWEST_OUTLINES * outlines.size:
+    outlines = outlines_of(frames[StepTuning.reach].depth)
+    if outlines.sum() < AlignmentTuning.min_outlines * outlines.size:
         return None
     at = outlines > 0
     return np.array([edges_of(frame.color)[at].mean() for frame in frames])

@@ -13,18 +13,32 @@ import numpy as np
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sequences.depth_kind import Measure
+from ggslam.system.tuning import Tuning
 
-COLUMNS = (320, 480)
-"""Images are enlarged or made smaller to have so many, if less or more."""
-FEATURES, CONTRAST, MOST_ALIKE = 500, 0.015, 0.8
-"""SIFT (D. Lowe, IJCV 2004): of one image; threshold, lower than usual for plain walls; ratio of the best match and the
-second."""
-LEAST_ANGLE, LARGEST_OFF = 1.0, 1.5
-"""Degrees between the rays of a point, and pixels by which it may lie off its epipolar line."""
-FEWEST, FEWEST_PAIRS, FEWEST_OF_PAIR = 60, 2, 8
-"""Points, pairs of frames, and points of a pair, for anything to be said."""
-ALIKE = np.log(1.3)
-"""Pairs of frames agree on a ratio within this factor."""
+
+class TriangulationTuning(Tuning):
+    """How points are triangulated from true poses."""
+
+    columns = (320, 480)
+    """Fewest and most columns of the images that features are found in."""
+    features = 500
+    """SIFT features of an image (D. Lowe, IJCV 2004)."""
+    contrast = 0.015
+    """Their contrast threshold, lower than usual for plain walls."""
+    max_match_ratio = 0.8
+    """Largest ratio of the best and second best distance of descriptors."""
+    min_angle_deg = 1.0
+    """Smallest angle between the rays of a point, in degrees."""
+    max_off_px = 1.5
+    """Largest distance from the epipolar line, in pixels."""
+    min_points = 60
+    """Fewest points in all."""
+    min_pairs = 2
+    """Fewest pairs of frames that count."""
+    min_points_of_pair = 8
+    """Fewest points of a pair that counts."""
+    alike = np.log(1.3)
+    """Largest difference of the depth ratio between pairs of frames that agree (natural logarithm)."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +61,10 @@ class TruePoints:
     def tell(self) -> bool:
         """Whether there are enough."""
         _, counts = np.unique(self.pair, return_counts=True)
-        return len(self.z) >= FEWEST and int((counts >= FEWEST_OF_PAIR).sum()) >= FEWEST_PAIRS
+        return (
+            len(self.z) >= TriangulationTuning.min_points
+            and int((counts >= TriangulationTuning.min_points_of_pair).sum()) >= TriangulationTuning.min_pairs
+        )
 
     def logs(self, measure: Measure) -> np.ndarray:
         """Logarithm of what stays the same over all points if depth is such, float64 [n]: of the ratio to the right z,
@@ -70,8 +87,8 @@ class TruePoints:
         """Whether each pair of frames tells about the same factor."""
         logs, whole = self.logs(measure), np.log(self.factor(measure))
         pairs, counts = np.unique(self.pair, return_counts=True)
-        own = [np.median(logs[self.pair == k]) for k in pairs[counts >= FEWEST_OF_PAIR]]
-        return float(np.mean(np.abs(np.array(own) - whole) < ALIKE)) >= 0.75
+        own = [np.median(logs[self.pair == k]) for k in pairs[counts >= TriangulationTuning.min_points_of_pair]]
+        return float(np.mean(np.abs(np.array(own) - whole) < TriangulationTuning.alike)) >= 0.75
 
 
 def triangulate(pairs: ListOf[tuple[Frame, Frame]]) -> TruePoints:
@@ -100,7 +117,12 @@ def _points(number: int, first: Frame, second: Frame) -> np.ndarray:
     sine = length / np.linalg.norm(b, axis=1) / np.linalg.norm(turned, axis=1)
     columns, rows = np.rint(here).astype(int).T
     depth = first.depth[np.clip(rows, 0, c.height - 1), np.clip(columns, 0, c.width - 1)].astype(np.float64)
-    good = (off < LARGEST_OFF) & (z > 0) & (sine > np.sin(np.radians(LEAST_ANGLE))) & (depth > 0)
+    good = (
+        (off < TriangulationTuning.max_off_px)
+        & (z > 0)
+        & (sine > np.sin(np.radians(TriangulationTuning.min_angle_deg)))
+        & (depth > 0)
+    )
     ray = np.linalg.norm(a, axis=1)
     return np.column_stack([depth, z, ray, np.full(len(z), number)])[good]
 
@@ -112,15 +134,17 @@ def _match(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarra
     if words is None or others is None or len(a) < 2 or len(b) < 2:
         return None
     two = cv2.BFMatcher().knnMatch(words, others, k=2)
-    good = [m[0] for m in two if m[0].distance < MOST_ALIKE * m[1].distance]
+    good = [m[0] for m in two if m[0].distance < TriangulationTuning.max_match_ratio * m[1].distance]
     return (a[[m.queryIdx for m in good]], b[[m.trainIdx for m in good]]) if good else None
 
 
 def _features(color: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     width = color.shape[1]
-    factor = float(np.clip(width, *COLUMNS)) / width
+    factor = float(np.clip(width, *TriangulationTuning.columns)) / width
     grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
     way = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
     grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=way) if factor != 1 else grey
-    points, words = cv2.SIFT_create(FEATURES, contrastThreshold=CONTRAST).detectAndCompute(grey, None)  # type: ignore[attr-defined]
+    limits = {"contrastThreshold": TriangulationTuning.contrast}
+    sift = cv2.SIFT_create(TriangulationTuning.features, **limits)  # type: ignore[attr-defined]
+    points, words = sift.detectAndCompute(grey, None)
     return (np.array([point.pt for point in points]).reshape(-1, 2) + 0.5) / factor - 0.5, words

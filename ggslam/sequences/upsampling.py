@@ -10,14 +10,20 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-SAME_SURFACE = np.float32(1.05)
-"""Neighbouring samples whose depths differ by less are of one surface: a floor seen flat falls by 2 % a sample."""
-COLOR_SIGMA = 18.0
-"""Grey values by which a pixel may differ from a sample of its surface."""
-PLACE_SIGMA = 0.8
-"""Distance in samples at which a sample counts little."""
-REACH = 1
-"""Samples to each side that are looked at."""
+from ggslam.system.tuning import Tuning
+
+
+class UpsamplingTuning(Tuning):
+    """How depth is brought to finer pixels."""
+
+    color_sigma = 18.0
+    """Difference at which a sample's weight falls off, in grey values."""
+    place_sigma = 0.8
+    """Distance at which a sample's weight falls off, in samples."""
+    reach = 1
+    """Samples to each side."""
+    same_surface = np.float32(1.05)
+    """Neighbouring samples within this factor are of one surface: a floor seen flat falls by 2 % per sample."""
 
 
 def upsample_depth(depth: np.ndarray, color: np.ndarray) -> np.ndarray:
@@ -71,7 +77,7 @@ def _several_surfaces(inverse: np.ndarray, rows: np.ndarray, columns: np.ndarray
     # Of the cell between samples (i, j) and (i + 1, j + 1); what lies outside counts for nothing.
     most = cv2.dilate(inverse, kernel, anchor=(0, 0))
     least = cv2.erode(inverse, kernel, anchor=(0, 0))
-    mixed = most > SAME_SURFACE * least
+    mixed = most > UpsamplingTuning.same_surface * least
     cells = [np.minimum(np.floor(at).astype(int), max(size - 2, 0)) for at, size in
              ((rows, inverse.shape[0]), (columns, inverse.shape[1]))]  # fmt: skip
     return np.asarray(mixed[np.ix_(*cells)])
@@ -88,13 +94,13 @@ def _choose(
     here = color[v, u].astype(np.float32)
     first_row, first_column = np.rint(at_row).astype(int), np.rint(at_column).astype(int)
     samples, weights = [], []
-    for down in range(-REACH, REACH + 1):
-        for right in range(-REACH, REACH + 1):
+    for down in range(-UpsamplingTuning.reach, UpsamplingTuning.reach + 1):
+        for right in range(-UpsamplingTuning.reach, UpsamplingTuning.reach + 1):
             row, column = first_row + down, first_column + right
             inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
             row, column = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
-            far = ((row - at_row) ** 2 + (column - at_column) ** 2) / (2 * PLACE_SIGMA**2)
-            unlike = ((coarse[row, column] - here) ** 2).mean(1) / (2 * COLOR_SIGMA**2)
+            far = ((row - at_row) ** 2 + (column - at_column) ** 2) / (2 * UpsamplingTuning.place_sigma**2)
+            unlike = ((coarse[row, column] - here) ** 2).mean(1) / (2 * UpsamplingTuning.color_sigma**2)
             value = inverse[row, column]
             samples.append(value)
             weights.append(np.where(inside & (value > 0), np.exp(-far - unlike), 0).astype(np.float32))
@@ -105,10 +111,10 @@ def _strongest_surface(samples: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Weighted mean of the samples [k, n] around the one that has most weight about it, float32 [n]."""
     best, support = samples[0], np.full(samples.shape[1], -1.0, np.float32)
     for sample, weight in zip(samples, weights, strict=True):
-        near = (samples < sample * SAME_SURFACE) & (samples * SAME_SURFACE > sample)
+        near = (samples < sample * UpsamplingTuning.same_surface) & (samples * UpsamplingTuning.same_surface > sample)
         found = np.where(weight > 0, (near * weights).sum(0), -1).astype(np.float32)
         better = found > support
         best, support = np.where(better, sample, best), np.where(better, found, support)
-    near = (samples < best * SAME_SURFACE) & (samples * SAME_SURFACE > best)
+    near = (samples < best * UpsamplingTuning.same_surface) & (samples * UpsamplingTuning.same_surface > best)
     total = (near * weights).sum(0)
     return np.asarray(np.where(total > 0, (near * weights * samples).sum(0) / np.maximum(total, 1e-30), best))

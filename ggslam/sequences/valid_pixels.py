@@ -7,14 +7,20 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-ALIKE = 3
-"""Grey values by which pixels of one fill may differ, after compression too."""
-LEAST_SHARE = 0.002
-"""Of the image, below which a fill is none."""
-LEAST_OVERLAP = 0.98
-"""Intersection over union of a fill in two images: what is filled stays where it is, what a camera sees does not."""
-LEAST_CHANGE = 3.0
-"""Mean grey values by which two images have to differ beside the fill, to say that the camera moved."""
+from ggslam.system.tuning import Tuning
+
+
+class FillTuning(Tuning):
+    """When pixels of one colour are fill and no image."""
+
+    alike = 3
+    """Largest difference of pixels of one fill, in grey values, also after compression."""
+    min_share = 0.002
+    """Smallest fill, as a share of the image."""
+    min_overlap = 0.98
+    """Smallest intersection over union of a fill in two images: fill stays where it is."""
+    min_change = 3.0
+    """Mean difference of two images beside the fill once the camera has moved, in grey values."""
 
 
 def within_source(columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -31,9 +37,9 @@ def fill_of(color: np.ndarray) -> np.ndarray | None:
     flags = 4 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | 1 << 8
     image = np.array(color, order="C")  # OpenCV takes no read-only array here, though with this flag it writes nothing
     for corner in ((0, 0), (width - 1, 0), (0, height - 1), (width - 1, height - 1)):
-        cv2.floodFill(image, found, corner, 0, (ALIKE,) * 3, (ALIKE,) * 3, flags)
+        cv2.floodFill(image, found, corner, 0, (FillTuning.alike,) * 3, (FillTuning.alike,) * 3, flags)
     fill = found[1:-1, 1:-1] > 0
-    return fill if fill.mean() >= LEAST_SHARE else None
+    return fill if fill.mean() >= FillTuning.min_share else None
 
 
 def common_fill(first: np.ndarray, fill: np.ndarray, others: list[np.ndarray]) -> np.ndarray | None:
@@ -46,11 +52,11 @@ def common_fill(first: np.ndarray, fill: np.ndarray, others: list[np.ndarray]) -
     common, moved = fill, False
     for other in others:
         same = fill_of(other) if other.shape == first.shape else None
-        if same is None or (same & fill).sum() < LEAST_OVERLAP * (same | fill).sum():
+        if same is None or (same & fill).sum() < FillTuning.min_overlap * (same | fill).sum():
             return None
         difference = np.abs(other.astype(np.int16) - first).mean(2)
-        if difference[same].max(initial=0) > 2 * ALIKE:
+        if difference[same].max(initial=0) > 2 * FillTuning.alike:
             return None
-        moved = moved or bool(difference[~same].mean() > LEAST_CHANGE) if not same.all() else moved
+        moved = moved or bool(difference[~same].mean() > FillTuning.min_change) if not same.all() else moved
         common = common | same
     return common if moved else None

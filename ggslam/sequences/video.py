@@ -13,11 +13,16 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.sequences.edit_list import count_hidden_frames
 from ggslam.sequences.recording import NumberedImage
-from ggslam.system.images import MAX_PIXELS
+from ggslam.system.images import PictureLimits
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted
 
-FORWARD = 90
-"""So many frames are decoded and dropped rather than sought past: seeking starts at a key frame anyway."""
+
+class VideoTuning(Tuning):
+    """When a video is decoded on instead of being searched."""
+
+    forward = 90
+    """Frames that are decoded and dropped at most: seeking starts at a key frame."""
 
 
 class Video:
@@ -48,8 +53,10 @@ class Video:
         if not capture.isOpened() or capture.get(cv2.CAP_PROP_FRAME_COUNT) < 1:
             raise SequenceError(f"{self.path}: cannot be opened as a video (truncated, or a codec that is not known)")
         width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        if width * height > MAX_PIXELS:
-            raise SequenceError(f"{self.path}: claims {width}x{height} pixels; at most {MAX_PIXELS:,} are read")
+        if width * height > PictureLimits.max_pixels:
+            raise SequenceError(
+                f"{self.path}: claims {width}x{height} pixels; at most {PictureLimits.max_pixels:,} are read"
+            )
         return capture
 
     def frame(self, index: int) -> np.ndarray:
@@ -59,20 +66,20 @@ class Video:
             SequenceError: it cannot be decoded.
         """
         with self._lock:
-            if not 0 <= index - self._next <= FORWARD:
+            if not 0 <= index - self._next <= VideoTuning.forward:
                 self._seek(index)
             while self._next < index and self._capture.grab():
                 self._next += 1
             read, image = self._capture.read() if self._next == index else (False, None)
             if not read or image is None:
-                self._next = -1 - FORWARD  # nothing is known about the place now: the next one seeks
+                self._next = -1 - VideoTuning.forward  # nothing is known about the place now: the next one seeks
                 raise SequenceError(f"{self.path}: frame {index} cannot be decoded (the video is truncated or damaged)")
             self._next = index + 1
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
     def _seek(self, index: int) -> None:
         """Puts the capture before frame `index`, or at the start where containers do not seek exactly."""
-        if index > FORWARD and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index):
+        if index > VideoTuning.forward and self._capture.set(cv2.CAP_PROP_POS_FRAMES, index):
             at = self._capture.get(cv2.CAP_PROP_POS_FRAMES)
             if round(at) == index:
                 self._next = index

@@ -14,13 +14,19 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
 from ggslam.sight.margin import Margin
 from ggslam.sight.view import Sight, View
+from ggslam.system.tuning import Tuning
 
 SAME = Margin.usual()
 PAST = SAME.times(3)
 """The other view has to look past a surface by more than one margin: small images have the nearest depth of each cell,
 so that slanted surfaces and outlines differ by more. Of pixels of the world half as many are taken for fixed so."""
-LEAST_SHIFT = 0.03
-"""Of the image's width: what would have to move less says nothing."""
+
+
+class FixedTuning(Tuning):
+    """What two views tell about what is fixed to the camera."""
+
+    min_shift = 0.03
+    """Smallest expected shift of a world point between two views, as a share of the image width."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,7 @@ def compare_views(depth: np.ndarray, other: np.ndarray, T_other_camera: np.ndarr
     u, v = (f * moved[:, k] / z + c for k, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy)))
     rows, columns = np.mgrid[: camera.height, : camera.width]
     shift = np.hypot(u.reshape(depth.shape) - columns, v.reshape(depth.shape) - rows)
-    moves = (depth > 0) & (shift > LEAST_SHIFT * camera.width)
+    moves = (depth > 0) & (shift > FixedTuning.min_shift * camera.width)
     still = moves & (view.classify_depth(depth) == Sight.SAME)
     past = replace(view, margin=PAST).classify_points(moved).before.reshape(depth.shape)
     world = moves & view.classify_points(moved).same.reshape(depth.shape)

@@ -8,9 +8,15 @@ from typing import Protocol
 
 import numpy as np
 
-SIGMAS = 5.0
-"""Standard deviations of the depth camera's noise up to which depths are of one surface: neighbouring pixels share a
-part of their noise, so that a few of many pixels are off by more than three."""
+from ggslam.system.tuning import Tuning
+
+
+class MarginTuning(Tuning):
+    """Margin between depths of one surface."""
+
+    sigmas = 5.0
+    """Standard deviations of the depth noise within which depths belong to one surface. Neighbouring pixels share
+    noise, so that three would be too few."""
 
 
 class Noise(Protocol):
@@ -48,13 +54,13 @@ class Margin:
     @staticmethod
     def of(noise: Noise) -> Margin:
         """The margin where depths of a camera with this noise are compared."""
-        return Margin(sigmas=SIGMAS, constant=noise.constant, square=noise.square)
+        return Margin(sigmas=MarginTuning.sigmas, constant=noise.constant, square=noise.square)
 
     @staticmethod
     def usual() -> Margin:
         """The margin of a structured-light camera (Khoshelham and Oude Elberink, Sensors 2012), for depth of which the
         noise is not known yet."""
-        return Margin(sigmas=SIGMAS, constant=0.0012, square=0.0019)
+        return Margin(sigmas=MarginTuning.sigmas, constant=0.0012, square=0.0019)
 
     def times(self, factor: float) -> Margin:
         """A margin `factor` times as wide."""

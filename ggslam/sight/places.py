@@ -31,21 +31,26 @@ from ggslam.scene.poses import inverse
 from ggslam.sight.margin import Margin
 from ggslam.system.array_forms import DepthImage, Mask, Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-SMOOTH = 2.5
-"""Where depth varies by no more standard deviations of the camera than this its mean is compared."""
-KNOWN = 0.9
-"""Share of the pixels about a place that have depth where their mean is compared."""
-ROUGH = 1.3
-"""Standard deviations of a pixel's depth by which those of rough places differ: the nearest of several is compared."""
-LEAST_SHARE = 0.2
-"""...and means of smooth ones, at least..."""
-NEAREST = 0.7
-"""...and so many times what is measured there, for the nearest of them is compared too."""
-EVERY = 7
-"""Of so many smooth places one tells how much depths differ."""
-FEWEST = 40
-"""If there are so many of them."""
+
+class PlaceTuning(Tuning):
+    """Comparison of reduced views."""
+
+    smooth_sigmas = 2.5
+    """Largest spread of depth in a smooth place, in standard deviations of the camera. Its mean is compared."""
+    min_known = 0.9
+    """Smallest share of pixels with depth around a place whose mean is compared."""
+    rough_sigmas = 1.3
+    """Spread of the nearest depth in a rough place, in standard deviations of one pixel."""
+    min_noise_share = 0.2
+    """Smallest spread of the means of smooth places, as a share of the camera's standard deviation."""
+    nearest_factor = 0.7
+    """Spread of the nearest of several means, as a share of the spread measured there."""
+    stride = 7
+    """One smooth place in this many tells how much depths differ..."""
+    min_places = 40
+    """...if there are at least this many of them."""
 
 
 @savable(fixed="depth near far whole smooth")
@@ -91,7 +96,9 @@ class CoarseView:
         nearest, farthest, least, count, total, squares = _depth_places(depth, factor, window // 2, context)
         mean = total / np.maximum(count, 1)
         spread = squares / np.maximum(count, 1) - mean * mean
-        smooth = (count >= KNOWN * window**2) & (spread < (SMOOTH * margin.sigma(mean)) ** 2)
+        smooth = (count >= PlaceTuning.min_known * window**2) & (
+            spread < (PlaceTuning.smooth_sigmas * margin.sigma(mean)) ** 2
+        )
         value = np.where(smooth, mean, thin_out(depth, factor))
         near, far = np.where(smooth, mean, nearest), np.where(smooth, mean, farthest)
         whole = cv2.erode(((least > 0) | smooth).astype(np.uint8), around) > 0
@@ -163,7 +170,9 @@ def compare(
     if moved is not None:
         job.moved = address(_of_places(moved, np.uint8, view, alive))
     job.margin = SightMargin(margin.least, margin.share, margin.sigmas, margin.constant, margin.square)
-    job.rough, job.least_share, job.nearest, job.every, job.fewest = ROUGH, LEAST_SHARE, NEAREST, EVERY, FEWEST
+    t = PlaceTuning
+    job.rough, job.least_share, job.nearest = t.rough_sigmas, t.min_noise_share, t.nearest_factor
+    job.every, job.fewest = t.stride, t.min_places
     job.found = address(found)
     load_library().ggslam_places_evidence(context.handle, ctypes.byref(job))
     return [PairEvidence(*images) for images in found]

@@ -16,30 +16,39 @@ from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import ViewAlignmentSettings
-from ggslam.mapping.view_alignment import BLURS, align_view, grey_of
+from ggslam.mapping.view_alignment import AlignmentTuning, align_view, grey_of
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.result import TrackedFrame
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackerState, TrackingResult, TrackingStatus
 
-UNDECIDED = 32
-"""Of so many first frames images are kept in case frames are to be aligned, of later ones once they are."""
-KEPT_BYTES = 1 << 26
-"""Memory for coded images of frames that are aligned at the end; later ones stay where the tracker found them: laid
-onto the young map of their moment they would be a decibel worse."""
-KEPT_BYTES_PAGED = 1 << 23
-"""The same where memory is limited."""
-JPEG_QUALITY = 90
-"""Of kept images: 21 KB at 320x240, where one costs 77 KB uncoded."""
-LAST_BLURS, LAST_POINTS, LAST_ITERATIONS = (0.7,), 3000, 4
-"""Of the alignment at the end, whose start is near: as good as with the settings of `ViewAlignmentSettings`, in half
-the time."""
-REPORT_EVERY = 20
-HIDDEN_MARGIN = 9
-"""Pixels across, around those that show something else."""
+
+class ColorPoseTuning(Tuning):
+    """Alignment of frames to the map by colour."""
+
+    undecided_frames = 32
+    """Frames at the start whose images are kept before it is known whether they will be aligned."""
+    kept_bytes = 1 << 26
+    """Most bytes of coded images kept for the alignment at the end. Later frames keep the tracker's pose."""
+    kept_bytes_paged = 1 << 23
+    """The same limit, in bytes, where the memory of the run is limited."""
+    jpeg_quality = 90
+    """JPEG quality of kept images, of 100: 21 KB at 320x240 instead of 77 KB uncoded."""
+    last_blurs = (0.7,)
+    """Blurs of the alignment at the end, in pixels, one pass each. Its start is close, so one pass suffices."""
+    last_points = 3000
+    """Most points of a frame in the alignment at the end."""
+    last_iterations = 4
+    """Iterations of the alignment at the end."""
+    report_every = 20
+    """Aligned frames between two reports of progress."""
+    hidden_margin_pixels = 9
+    """Side, in pixels, of the square by which masks of hidden surfaces are dilated. Odd."""
+
 
 _Coded = Annotated[np.ndarray, Form("u1", None)]
 
@@ -97,12 +106,16 @@ class ColorPoses:
         if not self.active or found.still or found.status in (TrackingStatus.LOST, TrackingStatus.FIRST):
             return
         number, depth = len(self.poses.frames) - 1, found.median_depth_m
-        if not self._tells_more(depth) and number >= UNDECIDED:
+        if not self._tells_more(depth) and number >= ColorPoseTuning.undecided_frames:
             return
-        if self.held_bytes >= (KEPT_BYTES if self.mapper.residency is None else KEPT_BYTES_PAGED):
+        if self.held_bytes >= (
+            ColorPoseTuning.kept_bytes if self.mapper.residency is None else ColorPoseTuning.kept_bytes_paged
+        ):
             return
         grey, hidden = grey_of(frame.color), _find_hidden(frame.moving, frame.valid)
-        coded = cv2.imencode(".jpg", np.rint(255 * grey).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+        coded = cv2.imencode(
+            ".jpg", np.rint(255 * grey).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, ColorPoseTuning.jpeg_quality]
+        )[1]
         mask = np.zeros(0, np.uint8) if hidden is None else cv2.imencode(".png", hidden.view(np.uint8))[1]
         self.images.append((number, depth, coded.reshape(-1), mask.reshape(-1)))
         self.held_bytes += coded.nbytes + mask.nbytes
@@ -120,7 +133,7 @@ class ColorPoses:
                 grey = self._decode(coded).astype(np.float32) / 255
                 hidden = self._decode(mask) > 0 if len(mask) else None
                 aligned[number] = self._align_frame(number, depth, grey, hidden)
-                if len(aligned) % REPORT_EVERY == 0:
+                if len(aligned) % ColorPoseTuning.report_every == 0:
                     report()
         for number, frame in aligned.items():  # all or none: `report` may end the run
             self.poses.frames[number] = frame
@@ -138,7 +151,14 @@ class ColorPoses:
                     continue  # keyframes of a rig stay as the rig has them
                 depth = float(np.median(known[known > 0]))
                 hidden = _find_hidden(None, self.mapper.valid_of(keyframe))
-                T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, BLURS[-1:])
+                T = self._pose(
+                    grey_of(keyframe.color),
+                    keyframe.T_world_camera,
+                    depth,
+                    hidden,
+                    settings,
+                    AlignmentTuning.blurs[-1:],
+                )
                 if T is not None:
                     keyframe.T_camera_world = inverse(orthonormalize(T))
 
@@ -175,15 +195,21 @@ class ColorPoses:
         """A frame with its pose as of the finished map."""
         frame, settings = self.poses.frames[number], self.mapper.settings.view_alignment
         T_world_keyframe = self.mapper.keyframes[frame.keyframe].T_world_camera
-        last = replace(settings, points=min(LAST_POINTS, settings.points), iterations=LAST_ITERATIONS)
-        T = self._pose(grey, T_world_keyframe @ frame.T_keyframe_camera, depth, hidden, last, LAST_BLURS)
+        last = replace(
+            settings,
+            points=min(ColorPoseTuning.last_points, settings.points),
+            iterations=ColorPoseTuning.last_iterations,
+        )
+        T = self._pose(
+            grey, T_world_keyframe @ frame.T_keyframe_camera, depth, hidden, last, ColorPoseTuning.last_blurs
+        )
         if T is None:
             return frame
         return replace(frame, T_keyframe_camera=orthonormalize(inverse(T_world_keyframe) @ T))
 
     def _pose(
         self, grey: np.ndarray, T_world_camera: np.ndarray, median_depth: float, hidden: np.ndarray | None,
-        settings: ViewAlignmentSettings, blurs: Sequence[float] = BLURS,
+        settings: ViewAlignmentSettings, blurs: Sequence[float] = AlignmentTuning.blurs,
     ) -> np.ndarray | None:  # fmt: skip
         """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed."""
         camera, T_camera_world = self.state.camera, inverse(T_world_camera)
@@ -210,4 +236,5 @@ def _find_hidden(moving: np.ndarray | None, valid: np.ndarray | None) -> np.ndar
         hidden = ~valid if hidden is None else hidden | ~valid
     if hidden is None or not hidden.any():
         return None
-    return cv2.dilate(hidden.astype(np.uint8), np.ones((HIDDEN_MARGIN, HIDDEN_MARGIN), np.uint8)) > 0
+    side = ColorPoseTuning.hidden_margin_pixels
+    return cv2.dilate(hidden.astype(np.uint8), np.ones((side, side), np.uint8)) > 0

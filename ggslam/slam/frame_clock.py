@@ -7,11 +7,16 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 
 from ggslam.scene.frame import Frame
+from ggslam.system.tuning import Tuning
 
-MAX_LAG_FRAMES = 3
-"""A frame that is this many frame times late is dropped: a live camera would have overwritten it."""
-WAITED_S = 1e-3
-"""Seconds; a frame that took longer to come was not there yet when it was asked for."""
+
+class ClockTuning(Tuning):
+    """When a frame counts as late."""
+
+    max_lag_frames = 3
+    """Delay, in frame intervals, from which a frame is dropped: a live camera would have overwritten it."""
+    waited_s = 1e-3
+    """Waiting time, in seconds, above which a frame was not available yet when it was requested."""
 
 
 class FrameClock:
@@ -59,9 +64,11 @@ class FrameClock:
     def _is_late(self, frame: Frame, waited: float) -> bool:
         """Whether the frame is to be dropped; sleeps until it is due."""
         late = self._now() - (self._begin + self._offset(frame))
-        if late > MAX_LAG_FRAMES * self.period:
+        if late > ClockTuning.max_lag_frames * self.period:
             # Behind its buffer a recording has to be read, which takes a part of a period: that is catching up still.
-            self._catching_up = waited <= (self.period / 2 if self._catching_up and not self.live else WAITED_S)
+            self._catching_up = waited <= (
+                self.period / 2 if self._catching_up and not self.live else ClockTuning.waited_s
+            )
             if self._catching_up:
                 return True
             self._begin += late

@@ -13,11 +13,16 @@ from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.submaps.paging_settings import PagingSettings
+from ggslam.system.tuning import Tuning
 
-_AT_ONCE = 64
-"""Keyframes that are asked together what they see."""
-_TILES = (6, 8)
-"""Rows and columns of parts of a view: each is as deep as what was measured in it, cells behind that are hidden."""
+
+class VisibilityTuning(Tuning):
+    """How the visibility of cells is computed."""
+
+    keyframes_at_once = 64
+    """Keyframes whose visibility is computed in one batch."""
+    tiles = (6, 8)
+    """Rows and columns of tiles of a view. Each tile has its own depth, beyond which cells are hidden."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,7 @@ class KeyframeSights:
             depth: what it measured, metres [H, W].
         """
         s = self._settings
-        deep = s.view_margin * depth_reach(depth, *_TILES) + s.view_spare
+        deep = s.view_margin * depth_reach(depth, *VisibilityTuning.tiles) + s.view_spare
         self._reach.append(np.minimum(deep, s.view_range))
         return SightedPose(T_world_camera, self._reach[-1])
 
@@ -69,15 +74,15 @@ class KeyframeSights:
 
     def batches(self, numbers: Sequence[int]) -> Iterable[tuple[Sequence[int], Frustums]]:
         """So many keyframes at a time as may be asked together, and their visible spaces."""
-        for begin in range(0, len(numbers), _AT_ONCE):
-            asked = numbers[begin : begin + _AT_ONCE]
+        for begin in range(0, len(numbers), VisibilityTuning.keyframes_at_once):
+            asked = numbers[begin : begin + VisibilityTuning.keyframes_at_once]
             yield asked, self.frustums(self.of(asked))
 
     def last_seen(self, boxes: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """Number of the last keyframe that sees each box (lower and upper corners [M, 3]), int64 [M], -1 for none."""
         last, unseen = np.full(len(boxes[0]), -1), np.arange(len(boxes[0]))
-        for end in range(len(self.keyframes), 0, -_AT_ONCE):
-            numbers = np.arange(max(0, end - _AT_ONCE), end)
+        for end in range(len(self.keyframes), 0, -VisibilityTuning.keyframes_at_once):
+            numbers = np.arange(max(0, end - VisibilityTuning.keyframes_at_once), end)
             seen = self.frustums(self.of(numbers.tolist())).touch(boxes[0][unseen], boxes[1][unseen])
             last[unseen] = np.where(seen, numbers[:, None], -1).max(0)
             unseen = unseen[last[unseen] < 0]

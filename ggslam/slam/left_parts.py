@@ -16,12 +16,17 @@ from ggslam.scene.poses import inverse
 from ggslam.slam.loop_closing import LoopCloser
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
 
-REMEMBERED = 3
-"""Parts that are gone back to at most, those left last."""
+
+class LeftPartTuning(Tuning):
+    """Memory of the parts of the map that the camera left."""
+
+    max_parts = 3
+    """Most parts that are searched for the camera, the last ones left."""
 
 
 @savable(not_saved="target")
@@ -65,7 +70,7 @@ class LeftParts:
         """
         motion = replace(tracker.state.motion, views=list(tracker.state.motion.views))
         if motion.reference_view is not None:
-            self.parts = [*self.parts, LeftPart(keyframe, T_world_keyframe.copy(), motion)][-REMEMBERED:]
+            self.parts = [*self.parts, LeftPart(keyframe, T_world_keyframe.copy(), motion)][-LeftPartTuning.max_parts:]
 
     def settle(self) -> None:
         """The camera is located: what was gathered to find it is not needed."""

@@ -31,14 +31,20 @@ from ggslam.slam.keyframe_sights import KeyframeSights, SightedPose
 from ggslam.slam.memory_budget import MB, MemoryBudget
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.paging_settings import PagingSettings
+from ggslam.system.tuning import Tuning
 
-MEASURED_AFTER = 3
-"""Keyframes after which the program's own need is measured: by then every part of it has run."""
-_RENDERER_BYTES = 110
-"""The rasterizer's own memory for each Gaussian of the map: a splat of 64 bytes and a footprint, with room to grow."""
-_GROWTH = 0.1
-_INSERTIONS = 8
-"""As much room is kept as the largest of so many last keyframes took (the first, for which all is new, aside)."""
+
+class PagingTuning(Tuning):
+    """How much memory paging keeps free."""
+
+    measured_after = 3
+    """Keyframes after which the memory of the program is measured. By then every part of it has run."""
+    renderer_bytes = 110
+    """Memory of the rasterizer per Gaussian, in bytes: a splat of 64 bytes and a footprint, with spare room."""
+    growth = 0.1
+    """Spare capacity of the map, as a share of its size."""
+    insertions = 8
+    """Latest keyframes whose largest insertion sets the room that is kept. The first keyframe is left out."""
 
 
 class MapPager:
@@ -68,7 +74,7 @@ class MapPager:
         self._gaussians.serve(mapper)
         self._sights.keyframes = mapper.keyframes
         mapper.residency = self
-        mapper.map.growth = _GROWTH
+        mapper.map.growth = PagingTuning.growth
 
     @property
     def cells(self) -> GaussianCells | None:
@@ -90,7 +96,7 @@ class MapPager:
             depth: what it measured, metres [H, W].
         """
         sight = self._sights.add(T_world_camera, depth)
-        self._bring([sight], max(self._new[1:][-_INSERTIONS:], default=0))
+        self._bring([sight], max(self._new[1:][-PagingTuning.insertions:], default=0))
 
     def finish_insertion(self, keyframe: Keyframe, added: int, place_bytes: int = 0) -> None:
         """After a keyframe was inserted and its points are in the surface: images are handed over, what is too much
@@ -106,7 +112,7 @@ class MapPager:
         self._trainable = None
         keyframe.put_away(self.archive)
         self._gaussians.note_size()
-        if len(self._new) == MEASURED_AFTER:
+        if len(self._new) == PagingTuning.measured_after:
             self.budget.measure(self._held_bytes())
         reduced = self.budget.check(self._held_bytes())
         if self.budget.map_bytes is None:
@@ -200,7 +206,7 @@ class MapPager:
         return self._gaussians.map
 
     def _row_bytes(self) -> float:
-        return (1 + _GROWTH) * self._map.bytes_per_gaussian + _RENDERER_BYTES
+        return (1 + PagingTuning.growth) * self._map.bytes_per_gaussian + PagingTuning.renderer_bytes
 
     def _held_bytes(self) -> int:
         return int(self._map.capacity * self._row_bytes()) + self.archive.held_bytes + self._place_bytes

@@ -4,15 +4,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from ggslam.errors import ConfigError
 from ggslam.system.process_memory import peak_memory_bytes, release_early, resident_bytes, trim
+from ggslam.system.tuning import Tuning
 
-MB = 1_000_000
-_STEP = 4 * MB
-"""Measured budgets are whole multiples of this: memory differs a little from run to run, budgets then mostly do not."""
-_LEAST = 8 * MB
-"""A map's budget is never made smaller."""
+MB: Final = 1_000_000
+"""Bytes of a megabyte (SI)."""
+
+
+class BudgetTuning(Tuning):
+    """How the memory of the map is budgeted."""
+
+    step_bytes = 4 * MB
+    """Budgets are multiples of this many bytes, so that they mostly repeat from run to run."""
+    min_bytes = 8 * MB
+    """Smallest budget of a map, in bytes."""
 
 
 @dataclass
@@ -39,11 +47,11 @@ class MemoryBudget:
         """The most that was found to be not map: what stays, and what passes within a step."""
         self._peak = 0
         self.notes: list[str] = []
-        if self.limit and self.program_bytes + _LEAST > self.limit:
+        if self.limit and self.program_bytes + BudgetTuning.min_bytes > self.limit:
             raise ConfigError(
                 f"memory_limit_mb={self.limit / MB:g}: the program itself takes {self.program_bytes / MB:.0f} MB "
-                f"before the first frame; expected at least {(self.program_bytes + _LEAST) / MB:.0f}, and more for "
-                "images and a map"
+                f"before the first frame; expected at least "
+                f"{(self.program_bytes + BudgetTuning.min_bytes) / MB:.0f}, and more for images and a map"
             )
 
     def measure(self, held: int) -> None:
@@ -57,12 +65,12 @@ class MemoryBudget:
         self.program_bytes = 0
         self._measure_program(held)
         left = self.limit - self.program_bytes
-        if left < _LEAST:
+        if left < BudgetTuning.min_bytes:
             self.notes.append(
                 f"memory_limit_mb={self.limit / MB:g} cannot be kept: the program itself takes "
-                f"{self.program_bytes / MB:.0f} MB with these images; the map gets {_LEAST / MB:.0f} MB"
+                f"{self.program_bytes / MB:.0f} MB with these images; the map gets {BudgetTuning.min_bytes / MB:.0f} MB"
             )
-        self.map_bytes = max(_LEAST, left // _STEP * _STEP)
+        self.map_bytes = max(BudgetTuning.min_bytes, left // BudgetTuning.step_bytes * BudgetTuning.step_bytes)
 
     def check(self, held: int) -> bool:
         """After each further keyframe: what the program took more since then is taken from the map; whether it is.
@@ -72,12 +80,15 @@ class MemoryBudget:
         """
         if not self.limit or self.map_bytes is None:
             return False
-        if resident_bytes() > self.limit - _STEP:
+        if resident_bytes() > self.limit - BudgetTuning.step_bytes:
             trim()
         self._measure_program(held)
-        if self.given or self.map_bytes <= _LEAST or self.program_bytes <= self.limit - self.map_bytes:
+        if self.given or self.map_bytes <= BudgetTuning.min_bytes or self.program_bytes <= self.limit - self.map_bytes:
             return False
-        left = max(_LEAST, (self.limit - self.program_bytes) // _STEP * _STEP)
+        left = max(
+            BudgetTuning.min_bytes,
+            (self.limit - self.program_bytes) // BudgetTuning.step_bytes * BudgetTuning.step_bytes,
+        )
         before, self.map_bytes = self.map_bytes, min(self.map_bytes, left)
         return self.map_bytes < before
 

@@ -13,7 +13,7 @@ from ggslam.sight.margin import Margin
 from ggslam.sight.view import View
 
 _MARGIN = Margin().times(2.5)
-"""Wider than between surfaces: the Gaussian in the middle of an object may lie within it, behind its surface."""
+"""Wider than between two surfaces: the Gaussian in the middle of an object may lie inside it, behind its surface."""
 
 
 def typical_points(means: np.ndarray, labels: np.ndarray) -> dict[int, np.ndarray]:

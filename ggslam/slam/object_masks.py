@@ -25,9 +25,16 @@ from ggslam.objects.table import Observation, Supervision
 from ggslam.scene.frame import Frame
 from ggslam.system.savable import savable
 from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
+from ggslam.system.tuning import Tuning
 
-_LARGE = 160
-"""Gaussians of an object that one look is enough for, if it had no chance of more."""
+
+class ObjectChanceTuning(Tuning):
+    """When an object is kept that was found once."""
+
+    min_gaussians = 160
+    """Gaussians from which an object needs only one observation if it had no chance of more."""
+
+
 Source = Literal["auto", "recording", "geometry", "model", "none"]
 
 
@@ -200,7 +207,11 @@ class ObjectMasks:
         views = {i: seen[i].views if i in seen else 0 for i in object_ids.tolist()}
         enough, share = min(self.settings.min_views, 1 + keyframes // 10), self.settings.min_repeat
         least = self.settings.min_gaussians
-        always = {i for i, count in views.items() if 1 <= chances.get(i, 0) <= count and sizes[i] >= _LARGE}
+        always = {
+            i
+            for i, count in views.items()
+            if 1 <= chances.get(i, 0) <= count and sizes[i] >= ObjectChanceTuning.min_gaussians
+        }
         seldom = {i for i, count in views.items() if count < max(enough, share * chances.get(i, 0))} - always
         seldom -= set(known)
         return [i for i in views if i in seldom or sizes[i] < least]

@@ -21,11 +21,16 @@ from ggslam.loops.uncertainty import information_in_frame
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.slam.place_comparison import PlaceComparison
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.points import disc_points
 from ggslam.tracking.surface import MeasuredSurface
 
-QUERIES = 200
-"""Keyframes that are looked up at most, spread evenly."""
+
+class JoinTuning(Tuning):
+    """Search for places that parts of a run have in common."""
+
+    max_queries = 200
+    """Most keyframes of a part that are looked up, spread evenly over it."""
 
 
 def find_links(
@@ -47,7 +52,9 @@ def find_links(
     largest = Counter(parts.of).most_common(1)[0][0]
     asked = [k for k, part in enumerate(parts.of) if part != largest]
     links = []
-    for k in np.unique(np.linspace(0, len(asked) - 1, min(len(asked), QUERIES)).round().astype(int)).tolist():
+    for k in np.unique(
+        np.linspace(0, len(asked) - 1, min(len(asked), JoinTuning.max_queries)).round().astype(int)
+    ).tolist():
         new, own = asked[k], parts.members(asked[k])
         place = places.with_words(places[new])
         points = disc_points(*surface.points_and_normals(new), comparison.noise)

@@ -16,17 +16,21 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import AlignmentStatus, GicpTarget, align
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult, TrackingStatus
 
-MOST_KEPT = 8
-"""Frames that are kept to become keyframes."""
-APART = 12.5
-"""How far apart parts are laid, in units of the farthest depth that is used: 100 m in a room, where float32 still tells
-hundredths of a millimetre."""
+
+class PartStartTuning(Tuning):
+    """How a new part of the map starts."""
+
+    max_frames = 8
+    """Most frames kept to become keyframes of the new part."""
+    distance_depths = 12.5
+    """Distance between parts, in units of the largest depth used: 100 m indoors, where float32 resolves 0.01 mm."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,11 @@ class PartStart:
         """The frame that was watched last may become a keyframe; it is kept unless one was so few frames ago, or enough
         are. Its mask is read now, for the recording may be read elsewhere by then."""
         number = len(self.poses) - 1
-        if self.before is None or len(self.kept) >= MOST_KEPT or (self.kept and number - self.kept[-1][0] < gap):
+        if (
+            self.before is None
+            or len(self.kept) >= PartStartTuning.max_frames
+            or (self.kept and number - self.kept[-1][0] < gap)
+        ):
             return
         mask = frame.load_mask() if with_mask else None
         self.kept.append((number, replace(frame, mask=mask, mask_loader=None, T_world_camera=None), self.before))
@@ -168,5 +176,5 @@ def pose_apart(T_world_camera: np.ndarray, keyframes: np.ndarray, farthest_m: fl
     """
     T = T_world_camera.copy()
     highest = min(float(T[1, 3]), float(keyframes[:, 1, 3].min(initial=np.inf)))  # the y axis points down
-    T[1, 3] = highest - APART * farthest_m
+    T[1, 3] = highest - PartStartTuning.distance_depths * farthest_m
     return T

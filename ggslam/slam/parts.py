@@ -28,14 +28,19 @@ from ggslam.slam.map_paging import MapPager
 from ggslam.slam.memory_budget import MB, MemoryBudget
 from ggslam.slam.modes import Mode, refuse
 from ggslam.slam.object_masks import ObjectMasks
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker
 
-SMALLEST_SIDE = 16
-"""Pixels; below it there are no windows to estimate normals in, nor tiles to draw."""
+
+class ImageLimits(Tuning):
+    """Images that a run refuses."""
+
+    min_side_pixels = 16
+    """Smallest width and height, in pixels. Below it, no window for normals and no tile fits."""
 
 
 @dataclass
@@ -70,9 +75,11 @@ def make_parts(
     compact: bool = True,
 ) -> RunParts:  # fmt: skip
     """The parts that the settings name; arguments and errors as of `Slam`, `compact` as of `make_mapper`."""
-    if min(camera.width, camera.height) < SMALLEST_SIDE:
+    if min(camera.width, camera.height) < ImageLimits.min_side_pixels:
         size = f"{camera.width}x{camera.height}"
-        raise ConfigError(f"images of {size} pixels are too small: at least {SMALLEST_SIDE} each way are needed")
+        raise ConfigError(
+            f"images of {size} pixels are too small: at least {ImageLimits.min_side_pixels} each way are needed"
+        )
     context, masks, notes = NativeContext(config.threads or None), ObjectMasks(config.masks, has_masks), []
     if library is None:
         library, reason = run_library(config)

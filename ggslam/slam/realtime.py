@@ -22,9 +22,14 @@ from ggslam.slam.result import StepReport
 from ggslam.slam.schedules import MapSteps, NewKeyframe, Schedule
 from ggslam.slam.slam import Slam
 from ggslam.system.opencv import opencv_errors
+from ggslam.system.tuning import Tuning
 
-MAX_WAITING = 8
-"""While so many keyframes wait for the mapper no more are made, so that memory stays bounded."""
+
+class RealtimeTuning(Tuning):
+    """How the tracker and the mapper share the work in real time."""
+
+    max_waiting = 8
+    """Keyframes waiting for the mapper from which no more are made, so that memory stays bounded."""
 
 
 class _InAnotherThread(Schedule):
@@ -39,7 +44,9 @@ class _InAnotherThread(Schedule):
         self._jobs, self._beside = jobs, beside
 
     def begin_step(self) -> None:
-        self.takes_keyframes = self._jobs.qsize() < MAX_WAITING  # and no fewer will wait until this one is put in
+        self.takes_keyframes = (
+            self._jobs.qsize() < RealtimeTuning.max_waiting
+        )  # and no fewer will wait until this one is put in
 
     def beside_mapping(self) -> AbstractContextManager[object]:
         return self._beside

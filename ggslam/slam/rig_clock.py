@@ -10,11 +10,16 @@ import numpy as np
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-LONGEST_S = 0.5
-"""Seconds between two instants beyond which the motion between them says nothing of that within one."""
-TOGETHER_S = 0.002
-"""Images so few seconds apart were taken together: nothing that is carried by hand moves by a millimetre meanwhile."""
+
+class RigClockTuning(Tuning):
+    """When images of a rig were taken together."""
+
+    max_interval_s = 0.5
+    """Longest time between two instants over which motion is interpolated, in seconds."""
+    together_s = 0.002
+    """Largest time between images that count as simultaneous, in seconds: a hand moves below 1 mm meanwhile."""
 
 
 @savable()
@@ -36,7 +41,7 @@ class RigClock:
 
     def knows(self, seconds: float) -> bool:
         """Whether `motion_in` can tell the motion in so short a time."""
-        return abs(seconds) <= TOGETHER_S or self.motion is not None
+        return abs(seconds) <= RigClockTuning.together_s or self.motion is not None
 
     def motion_in(self, seconds: float) -> np.ndarray:
         """T_now_then [4, 4], to the rig's pose now from that so many seconds later; the identity if it is not known."""
@@ -47,7 +52,11 @@ class RigClock:
     def follow(self, T_world_first: np.ndarray | None, time: float) -> None:
         """The rig was located at a pose [4, 4], or not (None), at the next instant."""
         interval, self.motion = time - self.time, None
-        if T_world_first is not None and self.T_world_first is not None and 0 < interval <= LONGEST_S:
+        if (
+            T_world_first is not None
+            and self.T_world_first is not None
+            and 0 < interval <= RigClockTuning.max_interval_s
+        ):
             self.motion, self.interval = inverse(self.T_world_first) @ T_world_first, interval
         self.T_world_first, self.time = T_world_first, time
 

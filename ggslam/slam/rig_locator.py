@@ -18,6 +18,7 @@ from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.parts import RunParts
 from ggslam.slam.rig_clock import RigClock
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.keyframes import KeyframePolicy
 from ggslam.tracking.noise import estimate_noise
@@ -25,10 +26,14 @@ from ggslam.tracking.rig_engine import RigTrackingEngine, RigView
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
-DARK = 12
-"""Grey levels of 255: an image that is nowhere brighter shows nothing."""
-DARK_LOOK = 8
-"""Every so many rows and columns are looked at."""
+
+class DarkImageTuning(Tuning):
+    """When an image of a rig counts as dark."""
+
+    max_grey = 12
+    """Brightest grey level, of 255, of an image that shows nothing."""
+    stride = 8
+    """Distance, in rows and columns, between the pixels that are looked at."""
 
 
 @savable(not_saved="_config _surface _masks _tracker _loops _pager _policy _poses _filters _rig _engine")
@@ -128,4 +133,4 @@ class RigLocator(FrameLocator):
 
 def _is_black(frame: Frame) -> bool:
     """Whether an image shows nothing."""
-    return int(frame.color[::DARK_LOOK, ::DARK_LOOK].max()) <= DARK
+    return int(frame.color[::DarkImageTuning.stride, ::DarkImageTuning.stride].max()) <= DarkImageTuning.max_grey

@@ -32,11 +32,16 @@ from ggslam.slam.schedules import NewKeyframe
 from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.tracker import TrackingStatus
 
-TRIM_EVERY = 8
-"""Keyframes after which the C library gives back the memory that it keeps, a fifth of a run's; takes milliseconds."""
+
+class TrimTuning(Tuning):
+    """How freed memory is returned to the system."""
+
+    keyframes = 8
+    """Keyframes between two calls that return freed memory. A call takes milliseconds."""
 
 
 @savable(not_saved="camera config context pager start_notes schedule", after="use_scale_again")
@@ -154,7 +159,7 @@ class Slam(RunState):
         """
         # 7. Train the map on keyframes drawn at random: longer on the very first ones.
         count, settings = len(self.mapper.keyframes), self.config.mapping
-        if count // TRIM_EVERY != keyframes_before // TRIM_EVERY:
+        if count // TrimTuning.keyframes != keyframes_before // TrimTuning.keyframes:
             trim()
         if count and self.growing:
             first = settings.first_frame_iterations * count

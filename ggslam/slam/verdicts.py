@@ -11,19 +11,34 @@ from ggslam.scene.poses import fit_similarity
 from ggslam.sequences.verdicts import Severity, Verdict, judge_scale_by
 from ggslam.slam.map_parts import NOT_JOINED
 from ggslam.slam.result import SlamResult
-from ggslam.tracking.gicp_tracker import MIN_TEXTURED
+from ggslam.system.tuning import Tuning
+from ggslam.tracking.gicp_tracker import GicpTrackerTuning
 from ggslam.tracking.photometric import GreyDepth, textured_points
 from ggslam.tracking.settings import PhotometricSettings
 from ggslam.tracking.tracker import TrackingStatus
 
-DEGENERATE_SHARE, BLIND_SHARE, LOST_SHARE, DROPPED_SHARE = 0.5, 0.1, 0.05, 0.02
-"""Shares of the frames from which it is told that they were of this kind."""
-FEWEST_FRAMES = 5
-"""And how many there have to be."""
-EXPOSURE_CHANGE = 0.1
-"""Natural logarithm of a keyframe's gain from which it is told."""
-LONGER, LONGEST_ERROR, FEWEST_POSES = 1.4, 0.35, 10
-"""The true path differs in length by this factor and fits but for this share of its size; so many poses are needed."""
+
+class VerdictTuning(Tuning):
+    """When a run gets a verdict."""
+
+    degenerate_share = 0.5
+    """Share of degenerate frames from which they are reported."""
+    blind_share = 0.1
+    """Share of frames that show one bare surface without texture from which they are reported."""
+    lost_share = 0.05
+    """Share of lost frames from which they are reported."""
+    dropped_share = 0.02
+    """Share of dropped frames from which they are reported."""
+    min_frames = 5
+    """Fewest frames of a kind that are reported."""
+    exposure_change = 0.1
+    """Change of a keyframe's exposure that is reported, as the natural logarithm of its gain."""
+    length_factor = 1.4
+    """Factor between the lengths of the estimated and the true path from which a wrong scale is reported..."""
+    max_error_share = 0.35
+    """...if the scaled path fits the true one with at most this error, as a share of its size."""
+    min_poses = 10
+    """Fewest poses from which a wrong scale is reported."""
 
 
 def judge_run(result: SlamResult) -> list[Verdict]:
@@ -35,19 +50,19 @@ def judge_run(result: SlamResult) -> list[Verdict]:
 def _judge_motion(result: SlamResult) -> list[Verdict]:
     """Whether geometry told where the camera went, and, where it did not, grey values."""
     open_ = [f for f in result.frames if f.status == TrackingStatus.DEGENERATE.value]
-    if len(open_) < FEWEST_FRAMES:
+    if len(open_) < VerdictTuning.min_frames:
         return []
     bare = {k: _is_bare(result.keyframes[k]) for k in {f.keyframe for f in open_ if f.keyframe < len(result.keyframes)}}
     blind = [f for f in open_ if bare.get(f.keyframe, False)]
     total = len(result.frames)
-    if len(blind) >= max(FEWEST_FRAMES, BLIND_SHARE * total):
+    if len(blind) >= max(VerdictTuning.min_frames, VerdictTuning.blind_share * total):
         text = (
             f"{len(blind)} of {total} frames (the first: {blind[0].frame_index}) show one bare surface and no "
             "texture: nothing tells how the camera moved along it, and it seems to stand still; keep edges or texture "
             "in view"
         )
         return [Verdict("textureless", "wrong", text)]
-    if len(open_) > DEGENERATE_SHARE * total:
+    if len(open_) > VerdictTuning.degenerate_share * total:
         text = (
             f"in {len(open_)} of {total} frames ({len(open_) / total:.0%}) the surfaces in view leave a direction of "
             "motion open, and grey values alone tell it; keep more than one wall or the floor in view"
@@ -62,14 +77,14 @@ def _is_bare(keyframe: Keyframe) -> bool:
         return False
     shrink = PhotometricSettings().shrink * max(1, round(keyframe.camera.width / 320))
     view = GreyDepth.from_images(keyframe.color, keyframe.depth_m(), keyframe.camera, shrink)
-    return len(textured_points(view, PhotometricSettings())) < MIN_TEXTURED
+    return len(textured_points(view, PhotometricSettings())) < GicpTrackerTuning.min_textured
 
 
 def _judge_exposure(result: SlamResult) -> list[Verdict]:
     """Whether the camera's exposure changed against that of the map, which is the first keyframe's."""
     ours = [k for k in result.keyframes if k.frame_index != ELSEWHERE]
     changes = {k.frame_index: change_of(k.exposure) for k in ours}
-    changed = {frame: gain for frame, gain in changes.items() if abs(np.log(gain)) > EXPOSURE_CHANGE}
+    changed = {frame: gain for frame, gain in changes.items() if abs(np.log(gain)) > VerdictTuning.exposure_change}
     if not changed:
         return []
     frame, gain = max(changed.items(), key=lambda item: abs(np.log(item[1])))
@@ -95,7 +110,7 @@ def _judge_doubted(result: SlamResult) -> list[Verdict]:
 
 def _judge_lost(result: SlamResult) -> list[Verdict]:
     lost = [f.frame_index for f in result.frames if f.status == TrackingStatus.LOST.value]
-    if len(lost) < max(FEWEST_FRAMES, LOST_SHARE * len(result.frames)):
+    if len(lost) < max(VerdictTuning.min_frames, VerdictTuning.lost_share * len(result.frames)):
         return []
     text = f"the camera was lost in {len(lost)} of {len(result.frames)} frames (the first: {lost[0]})"
     return [Verdict("lost", "wrong", f"{text}; move slower, and back to where it was found last")]
@@ -107,14 +122,16 @@ def _judge_parts(result: SlamResult) -> list[Verdict]:
     if not left:
         return []
     gone = sum(frame.reason == NOT_JOINED for frame in result.frames)
-    level: Severity = "wrong" if gone >= max(FEWEST_FRAMES, LOST_SHARE * len(result.frames)) else "doubtful"
+    level: Severity = (
+        "wrong" if gone >= max(VerdictTuning.min_frames, VerdictTuning.lost_share * len(result.frames)) else "doubtful"
+    )
     hint = "record once more so that the camera comes back to a place that it has seen, or run the pieces by themselves"
     return [Verdict("parts", level, f"{'; '.join(left)}; {hint}")]
 
 
 def _judge_dropped(result: SlamResult) -> list[Verdict]:
     dropped, total = result.dropped_frames, len(result.frames) + len(result.dropped_frames)
-    if len(dropped) < max(FEWEST_FRAMES, DROPPED_SHARE * total):
+    if len(dropped) < max(VerdictTuning.min_frames, VerdictTuning.dropped_share * total):
         return []
     text = f"{len(dropped)} of {total} frames were dropped (the first: {dropped[0]}): they came faster than tracked"
     return [Verdict("dropped", "doubtful", f"{text}; choose a lower rate, a smaller `scale` or a faster machine")]
@@ -134,15 +151,15 @@ def judge_path(result: SlamResult, truth: np.ndarray | None, depth_scale: float)
     ours = result.trajectory()[inside, :3, 3]
     true = truth[[f.frame_index for f in result.frames if f.frame_index < len(truth)], :3, 3]
     known = np.isfinite(ours).all(1) & np.isfinite(true).all(1)
-    if known.sum() < FEWEST_POSES:
+    if known.sum() < VerdictTuning.min_poses:
         return []
     ours, true = ours[known], true[known]
     size = np.sqrt(((true - true.mean(0)) ** 2).sum(1).mean())
     T, scale = fit_similarity(true, ours, with_scale=True)
     ratio = float(scale)
-    if not (size > 0.02 and ratio > 0 and abs(np.log(ratio)) > np.log(LONGER)):
+    if not (size > 0.02 and ratio > 0 and abs(np.log(ratio)) > np.log(VerdictTuning.length_factor)):
         return []
     error = np.sqrt(((ratio * true @ T[:3, :3].T + T[:3, 3] - ours) ** 2).sum(1).mean())
-    if error > LONGEST_ERROR * ratio * size:
+    if error > VerdictTuning.max_error_share * ratio * size:
         return []
     return judge_scale_by(depth_scale, ratio, f"the camera's path comes out {ratio:.3g} times as long as the true one")

@@ -24,9 +24,17 @@ from ggslam.errors import FormatError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.system.atomic import write_failure
 from ggslam.system.links import refuse_link, refuse_shared_file
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted
 
-_WAITING_THREADS = 8
+
+class CellFileTuning(Tuning):
+    """Reading and writing of cells."""
+
+    threads = 8
+    """Threads that wait for the disk."""
+
+
 _CELL = re.compile(r"(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})", re.ASCII)
 _PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
@@ -74,7 +82,7 @@ class CellFiles:
         except OSError as error:
             raise write_failure(path, error) from error
         # All are waited for at once: the file system commits its journal once for many instead of once for each.
-        with ThreadPoolExecutor(_WAITING_THREADS) as pool:
+        with ThreadPoolExecutor(CellFileTuning.threads) as pool:
             list(pool.map(wait_for_disk, [*written, *folders]))
 
     def sweep(self, key: CellKey, kept: Mapping[str, int]) -> None:

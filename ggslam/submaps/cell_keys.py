@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -15,8 +16,8 @@ from ggslam.submaps.settings import GridAxes
 CellKey = tuple[int, int, int]
 """Whole coordinates of a cell along x, y, z; 0 along an axis that the grid does not span."""
 
-LIMIT = 2**31
-"""Coordinates reach no farther: differences and sums of them stay exact."""
+LIMIT: Final = 2**31
+"""Largest coordinate of a cell: differences and sums stay exact in 64 bits."""
 
 
 def is_coordinate(value: object) -> bool:

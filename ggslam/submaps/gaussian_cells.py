@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -19,16 +20,26 @@ from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.gaussian_rows import Rows, decode_rows, encode_rows, join, map_like
 from ggslam.submaps.grid import GridStore
+from ggslam.system.tuning import Tuning
 
 PART, ARRIVALS = "gaussians.rows", "arrivals.rows"
 """Parts of a cell: its Gaussians, and while a correction is carried out those that come from other cells."""
-REACH_SIGMAS = 3.4
-"""Standard deviations to which a Gaussian reaches: beyond, its alpha is below 1/255 whatever its opacity."""
-_BATCH_BYTES = 1 << 22
-"""Encoded cells that are written together."""
-_BITS = 20
+REACH_SIGMAS: Final = 3.4
+"""Standard deviations to which a Gaussian reaches: beyond, its alpha is below 1/255 at any opacity."""
+
+
+class GaussianCellTuning(Tuning):
+    """Gaussians in cells."""
+
+    batch_bytes = 1 << 22
+    """Bytes of encoded cells that are written together."""
+    block = 1 << 16
+    """Gaussians that are sorted into cells in one batch."""
+
+
+_BITS: Final = 20
+"""Bits of a cell's coordinate in a key."""
 _HALF = 1 << (_BITS - 1)
-_BLOCK = 1 << 16
 _NOWHERE = (-_HALF, -_HALF, -_HALF)
 """Gaussians that are more than half a million cells from the origin, or at no place at all: they stay in memory until
 they are pruned."""
@@ -105,12 +116,12 @@ class GaussianCells:
         """The cell of each mean as one number, a block at a time: the map may take most of the memory there is."""
         out = np.empty(len(means), np.int64)
         reach = _HALF * self.store.grid.spacing * 0.99
-        for begin in range(0, len(means), _BLOCK):
-            block = means[begin : begin + _BLOCK]
+        for begin in range(0, len(means), GaussianCellTuning.block):
+            block = means[begin : begin + GaussianCellTuning.block]
             inside = (np.abs(block) < reach).all(1)
             keys = self.store.grid.keys_of(np.where(inside[:, None], block, 0)) + _HALF
             numbers = (keys[:, 0] << 2 * _BITS) | (keys[:, 1] << _BITS) | keys[:, 2]
-            out[begin : begin + _BLOCK] = np.where(inside, numbers, 0)
+            out[begin : begin + GaussianCellTuning.block] = np.where(inside, numbers, 0)
         return out
 
     def move_out(self, gaussians: GaussianMap, rows: Mapping[CellKey, np.ndarray]) -> int:
@@ -223,7 +234,7 @@ class GaussianCells:
             held = _summarise(rows)
             batch.append((CellWrite(key, {PART: data, **(others or {})}, counts={PART: held.count}), held))
             size += len(data)
-            if size > _BATCH_BYTES:
+            if size > GaussianCellTuning.batch_bytes:
                 self._put(batch, written)
                 batch, size = [], 0
         self._put(batch, written)

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
@@ -30,16 +30,30 @@ from ggslam.submaps.cell_records import CellChange, CellRecord, CellWrite, PartR
 from ggslam.submaps.index_schema import NEWEST, SCHEMAS, check_rows, check_schema
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.links import refuse_shared_file
+from ggslam.system.tuning import Tuning
 
-_APPLICATION = 0x67677367  # "ggsg": how SQLite files tell whose they are
-_BUSY_SECONDS = 10.0
-_LONGEST_VALUE = 1 << 20
-"""Bytes: the settings of a store are a page of text."""
-_LEAST_STEPS, _STEPS_A_BYTE, _STEPS_AT_ONCE = 20_000_000, 64, 100_000
-"""Steps of SQLite's machine that a call may take, a tenth of a second's for the range with most columns."""
+_APPLICATION: Final = 0x67677367  # "ggsg": how SQLite files tell whose they are
+"""Application id "ggsg" in the header of the SQLite file."""
+
+
+class IndexTuning(Tuning):
+    """Limits of a store's index."""
+
+    busy_s = 10.0
+    """Seconds to wait for another writer."""
+    max_value_bytes = 1 << 20
+    """Longest value in bytes. The settings of a store take a page of text."""
+    min_steps = 20_000_000
+    """Steps of SQLite's machine that a call may always take."""
+    steps_per_byte = 64
+    """Further steps that a call may take, for each byte of the file."""
+    steps_at_once = 100_000
+    """Steps between two checks of that limit."""
+    max_columns = 1 << 14
+    """Most (x, y) columns of a range that are looked up one by one. A larger range is looked up by x alone."""
+
+
 _PART = ("version", "count", "bytes", "crc")
-_MOST_COLUMNS = 1 << 14
-"""A range with more (x, y) columns than this is looked up by x alone."""
 
 
 class CellIndex:
@@ -137,7 +151,7 @@ class CellIndex:
         table, where, values = ("cells", "", ()) if part is None else ("parts", "AND c.name = ?", (part,))
         if any(first > last for first, last in zip(low, high, strict=True)):
             return {}
-        if (high[0] - low[0] + 1) * (high[1] - low[1] + 1) > _MOST_COLUMNS:
+        if (high[0] - low[0] + 1) * (high[1] - low[1] + 1) > IndexTuning.max_columns:
             query = f"SELECT c.x, c.y, c.z, c.version FROM {table} c WHERE c.x BETWEEN ? AND ? AND c.y BETWEEN ? AND ?"
         else:  # CROSS JOIN keeps the order of the loops: each (x, y) is one look-up in the primary key
             query = (
@@ -256,23 +270,25 @@ class _Steps:
 
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self._path, self._taken, self._most = path, 0, 0
-        connection.set_progress_handler(self._count, _STEPS_AT_ONCE)
+        connection.set_progress_handler(self._count, IndexTuning.steps_at_once)
 
     def begin(self) -> None:
         """The next statements begin."""
         self._taken = 0
 
     def _count(self) -> int:
-        self._taken += _STEPS_AT_ONCE
+        self._taken += IndexTuning.steps_at_once
         if self._taken > self._most:  # the file may have grown
             with suppress(OSError):
-                self._most = _LEAST_STEPS + _STEPS_A_BYTE * self._path.stat().st_size
+                self._most = IndexTuning.min_steps + IndexTuning.steps_per_byte * self._path.stat().st_size
         return int(self._taken > self._most)
 
 
 def _connect(path: Path, write: bool) -> sqlite3.Connection:
     uri = f"{path.resolve().as_uri()}?mode={'rw' if write else 'ro'}"
-    connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False, timeout=_BUSY_SECONDS)
+    connection = sqlite3.connect(
+        uri, uri=True, isolation_level=None, check_same_thread=False, timeout=IndexTuning.busy_s
+    )
     _limit(connection)
     if not write:
         try:
@@ -296,8 +312,8 @@ def _limit(connection: sqlite3.Connection) -> None:
     connection.execute("PRAGMA cell_size_check = ON")
     connection.execute("PRAGMA synchronous = FULL")
     if sys.version_info >= (3, 11):
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
-        connection.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, _LONGEST_VALUE)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, IndexTuning.max_value_bytes)
+        connection.setlimit(sqlite3.SQLITE_LIMIT_SQL_LENGTH, IndexTuning.max_value_bytes)
         connection.setlimit(sqlite3.SQLITE_LIMIT_COLUMN, 64)
         connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
 

@@ -14,10 +14,11 @@ import sqlite3
 from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ggslam.errors import FormatError
 from ggslam.submaps.cell_keys import is_coordinate
+from ggslam.system.tuning import Tuning
 
 _TABLES = """
 CREATE TABLE store (settings TEXT NOT NULL, last_version INTEGER NOT NULL){strict};
@@ -38,8 +39,15 @@ SCHEMAS = {
 NEWEST = 2 if sqlite3.sqlite_version_info >= (3, 37) else 1
 """Format version that is written."""
 
-_MOST = 2**53
-_LONGEST_NAME = 4096
+_MOST: Final = 2**53
+"""Whole numbers up to this one are exact in float64, too."""
+
+
+class IndexLimits(Tuning):
+    """Values that an index may hold."""
+
+    max_name = 4096
+    """Longest name in characters."""
 
 
 def check_schema(path: Path, connection: sqlite3.Connection, version: int) -> None:
@@ -87,7 +95,7 @@ def _number_or_none(low: float, high: float) -> Reader:
 
 
 def _is_name(value: Any) -> bool:
-    return type(value) is str and len(value) <= _LONGEST_NAME
+    return type(value) is str and len(value) <= IndexLimits.max_name
 
 
 COLUMNS: dict[str, Reader] = {

@@ -20,9 +20,14 @@ from ggslam.submaps.cell_points import (
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.grid import GridStore, check_same_grid
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.tuning import Tuning
 
-_CELLS_AT_ONCE = 64
-"""Cells of a whole cloud that are written together."""
+
+class RecorderTuning(Tuning):
+    """Writing of whole clouds."""
+
+    cells_at_once = 64
+    """Cells of a whole cloud that are written together."""
 
 
 class SubmapRecorder:
@@ -141,7 +146,7 @@ def store_cloud(
             CellWrite(key, {POINTS: encode_points(cell)}, recorded_at, {POINTS: len(cell["points"])}, changed)
         )
         keys.append(key)
-        if len(waiting) == _CELLS_AT_ONCE:
+        if len(waiting) == RecorderTuning.cells_at_once:
             store.put_cells(waiting)
             waiting = []
     store.put_cells(waiting)

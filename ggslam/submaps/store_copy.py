@@ -18,11 +18,17 @@ from ggslam.submaps.store_objects import OBJECTS_FILE
 from ggslam.submaps.visit_files import visit_file
 from ggslam.system.atomic import make_folder
 from ggslam.system.process_memory import most_memory_bytes
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, copy_untrusted
+from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import FileTuning, copy_untrusted
 
-_TRIES = 20
-"""Times that a writer may have replaced files between a look at the index and at them."""
-_WAITING_THREADS = 8
+
+class StoreCopyTuning(Tuning):
+    """Copying a store while it is written."""
+
+    max_tries = 20
+    """Most attempts, if a writer replaces files between reading the index and copying them."""
+    threads = 8
+    """Threads that wait for the disk."""
 
 
 def copy_store(source: Path, target: Path) -> None:
@@ -36,9 +42,9 @@ def copy_store(source: Path, target: Path) -> None:
     if target.exists() or target.is_symlink():
         raise RunFolderError(f"{target}: is there already; choose another folder with `out`")
     with coming_store(target) as beside, GridStore.open(source) as store:
-        for attempt in range(_TRIES):
+        for attempt in range(StoreCopyTuning.max_tries):
             make_folder(beside)
-            if _copy_to(store, beside, last=attempt == _TRIES - 1):
+            if _copy_to(store, beside, last=attempt == StoreCopyTuning.max_tries - 1):
                 break
             shutil.rmtree(beside)
 
@@ -67,7 +73,7 @@ def _copy_to(store: GridStore, folder: Path, last: bool) -> bool:
     finally:
         index.close()
     folders = {path.parent for path in written} | {path.parent.parent for path in written[1:]}
-    with ThreadPoolExecutor(_WAITING_THREADS) as pool:
+    with ThreadPoolExecutor(StoreCopyTuning.threads) as pool:
         list(pool.map(wait_for_disk, [*written, *folders]))
     return True
 
@@ -93,6 +99,6 @@ def _copy_beside(source: Path, target: Path, visits: Sequence[str]) -> list[Path
     for file, copy in known:
         if file.is_file():
             copy.parent.mkdir(exist_ok=True)
-            copy_untrusted(file, copy, MAX_TEXT_BYTES)
+            copy_untrusted(file, copy, FileTuning.max_text_bytes)
             written.append(copy)
     return written

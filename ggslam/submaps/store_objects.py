@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, field
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import pydantic
@@ -23,10 +23,11 @@ from ggslam.scene.poses import motion_of, to_matrix
 from ggslam.submaps.cell_keys import LIMIT
 from ggslam.submaps.grid import GridStore
 from ggslam.system.atomic import write_bytes
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, read_untrusted
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
 OBJECTS_FILE = "objects.json"
-VERSION = 1
+VERSION: Final = 1
+"""Version of the file's format."""
 Kind = Literal["added", "removed", "moved", "look", "unseen"]
 _Coordinate = Annotated[int, pydantic.Field(ge=-LIMIT, le=LIMIT)]
 _Cell = tuple[_Coordinate, _Coordinate, _Coordinate]
@@ -195,7 +196,7 @@ def read_objects(store: GridStore) -> StoreObjects | None:
         raise FormatError(f"{path}: is a link; a store holds none")
     if not path.exists():
         return None
-    return parse_objects(read_untrusted(path, MAX_TEXT_BYTES), str(path))
+    return parse_objects(read_untrusted(path, FileTuning.max_text_bytes), str(path))
 
 
 def parse_objects(content: bytes, path: str) -> StoreObjects:

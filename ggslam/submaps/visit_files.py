@@ -12,7 +12,7 @@ from pathlib import Path
 from ggslam.errors import FormatError
 from ggslam.submaps.grid import GridStore
 from ggslam.system.atomic import make_folder, write_bytes
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, read_untrusted
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
 VISITS = "visits"
 
@@ -52,4 +52,4 @@ def read_visit(store: GridStore, name: str) -> bytes | None:
     path = visit_file(store.path, name)
     if not path.is_file():
         return None
-    return read_untrusted(path, MAX_TEXT_BYTES)
+    return read_untrusted(path, FileTuning.max_text_bytes)

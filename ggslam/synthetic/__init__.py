@@ -10,10 +10,9 @@ from ggslam.synthetic.room import furnished_room
 from ggslam.synthetic.scene import Scene, SceneBuilder, Shape
 from ggslam.synthetic.scenes import SCENES
 from ggslam.synthetic.trajectory import TRAJECTORIES, camera_path
-from ggslam.synthetic.writer import FRAMES_WITH_MOVERS, write_synthetic_sequence
+from ggslam.synthetic.writer import SynthTuning, write_synthetic_sequence
 
 __all__ = [
-    "FRAMES_WITH_MOVERS",
     "MOVERS",
     "SCENES",
     "TRAJECTORIES",
@@ -23,6 +22,7 @@ __all__ = [
     "SceneBuilder",
     "Shape",
     "Shutter",
+    "SynthTuning",
     "camera_path",
     "furnished_room",
     "write_synthetic_rig",

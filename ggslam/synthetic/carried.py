@@ -10,10 +10,18 @@ from ggslam.scene.poses import translation
 from ggslam.synthetic.changes import fill, free_motion, outline
 from ggslam.synthetic.motion import Mover, Setting, sample_window, turn
 from ggslam.synthetic.scene import Shape
+from ggslam.system.tuning import Tuning
 
-LIFT = 0.22
-"""Metres that it is lifted."""
-_LEAST_WAY, _TRIES = 0.2, 25
+
+class CarriedTuning(Tuning):
+    """How an object is carried."""
+
+    lift_m = 0.22
+    """Height that it is lifted, in metres."""
+    min_way_m = 0.2
+    """Shortest way, in metres."""
+    tries = 25
+    """Places that are tried for each object."""
 
 
 def carried_mug(setting: Setting) -> Mover:
@@ -29,7 +37,7 @@ def carried_mug(setting: Setting) -> Mover:
     for number in mugs:
         if not (setting.views.masks == number).any():
             continue
-        for _ in range(_TRIES):
+        for _ in range(CarriedTuning.tries):
             found = _way(setting, number, rng)
             if found is not None and found[1] > most:
                 (best, most), chosen = found, number
@@ -52,7 +60,7 @@ def _way(setting: Setting, number: int, rng: np.random.Generator) -> tuple[np.nd
     if target is None:
         return None
     way = target[:3, :3] @ middle + target[:3, 3] - middle
-    if np.linalg.norm(way) < _LEAST_WAY:
+    if np.linalg.norm(way) < CarriedTuning.min_way_m:
         return None
     angle, progress = float(np.arctan2(target[1, 0], target[0, 0])), sample_window(rng, setting.frames)
     motion = _arc(progress, middle, way, angle)
@@ -63,7 +71,7 @@ def _way(setting: Setting, number: int, rng: np.random.Generator) -> tuple[np.nd
 
 def _arc(s: np.ndarray, middle: np.ndarray, way: np.ndarray, angle: float) -> np.ndarray:
     """Motions [n, 4, 4] at shares s [n] of the way: up fast, along, and down."""
-    height = LIFT * (1 - (2 * s - 1) ** 4)
+    height = CarriedTuning.lift_m * (1 - (2 * s - 1) ** 4)
     at = middle + s[:, None] * way + height[:, None] * np.array([0.0, 0.0, 1.0])
     return translation(at) @ turn(s * angle, 2) @ translation(-middle)
 

@@ -13,20 +13,32 @@ from ggslam.errors import SequenceError
 from ggslam.scene.poses import translation
 from ggslam.synthetic.room import furnished_room
 from ggslam.synthetic.scene import Kind, Scene, Shape
+from ggslam.system.tuning import Tuning
 
-MOST_CHANGES = 10
+
+class ChangeTuning(Tuning):
+    """How objects are moved between two visits."""
+
+    max_changes = 10
+    """Most changes of a scene."""
+    gap_m = 0.015
+    """Smallest distance of a moved object from all others, in metres."""
+    tries = 200
+    """Places that are tried for it."""
+    shifts_m = (0.08, 0.5)
+    """Shortest and longest way that it moves, in metres."""
+    turns_deg = (-90.0, 90.0)
+    """Rotations to the right and to the left, in degrees."""
+    touching_m = 0.02
+    """Largest distance between an object and what it stands on, in metres."""
+
+
 _MOVABLE = (
     "mug", "book pile", "ball", "beach ball", "pouf", "vase", "waste basket", "laptop", "chair", "desk chair",
     "keyboard", "desk lamp",
 )  # fmt: skip
-_GAP, _TRIES = 0.015, 200
-"""Metres that a moved thing stays away from all others; places that are tried for it."""
-_SHIFTS, _TURNS = (0.08, 0.5), (-90.0, 90.0)
-"""Metres and degrees by which things move."""
 _AWAY = np.array([0.0, 0.0, -60.0])
 """Where things are that are not there: textures are drawn shape by shape, so every shape stays in the scene."""
-_TOUCHING = 0.02
-"""Metres between a thing and what it stands on, at most."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +75,10 @@ def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeCh
             along what they stand on by 8 to 50 cm and turn them by up to 90 degrees.
 
     Raises:
-        SequenceError: fewer than 0 or more than `MOST_CHANGES`.
+        SequenceError: fewer than 0 or more than `ChangeTuning.max_changes`.
     """
-    if not 0 <= count <= MOST_CHANGES:
-        raise SequenceError(f"changes: expected 0 to {MOST_CHANGES}, found {count}")
+    if not 0 <= count <= ChangeTuning.max_changes:
+        raise SequenceError(f"changes: expected 0 to {ChangeTuning.max_changes}, found {count}")
     rng = np.random.default_rng([seed, 7])
     first, second = furnished_room(seed), furnished_room(seed)
     names = first.instance_names
@@ -96,17 +108,21 @@ def free_motion(scene: Scene, instance: int, rng: np.random.Generator) -> np.nda
     others = [shape for shape in scene.shapes if shape.instance != instance]
     points = np.concatenate([outline(shape) for shape in own])
     middle, bottom = points.mean(0), float(points[:, 2].min())
-    supports = [s for s in others if _is_flat(s) and abs(_top(s) - bottom) < _TOUCHING and _carries(s, points, bottom)]
-    for _ in range(_TRIES if supports else 0):
-        heading, turn = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*_TURNS))
+    supports = [
+        s
+        for s in others
+        if _is_flat(s) and abs(_top(s) - bottom) < ChangeTuning.touching_m and _carries(s, points, bottom)
+    ]
+    for _ in range(ChangeTuning.tries if supports else 0):
+        heading, turn = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*ChangeTuning.turns_deg))
         T = _turn_about(middle, turn)
-        T[:2, 3] += rng.uniform(*_SHIFTS) * np.array([np.cos(heading), np.sin(heading)])
+        T[:2, 3] += rng.uniform(*ChangeTuning.shifts_m) * np.array([np.cos(heading), np.sin(heading)])
         moved = points @ T[:3, :3].T + T[:3, 3]
         if not any(_carries(support, moved, bottom) for support in supports):
             continue
         raised = np.concatenate([moved, fill(moved)])
-        raised[:, 2] = np.maximum(raised[:, 2], bottom + _TOUCHING + _GAP)
-        if all((shape.distance(raised) > _GAP).all() for shape in others):
+        raised[:, 2] = np.maximum(raised[:, 2], bottom + ChangeTuning.touching_m + ChangeTuning.gap_m)
+        if all((shape.distance(raised) > ChangeTuning.gap_m).all() for shape in others):
             return T
     return None
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -12,17 +13,25 @@ from ggslam.scene.poses import translation
 from ggslam.synthetic.changes import fill, outline
 from ggslam.synthetic.motion import Mover, Setting, sample_window
 from ggslam.synthetic.scene import Kind, Shape
+from ggslam.system.tuning import Tuning
 
 _CHESTS = {"sideboard": (3, 2), "television stand": (3, 2), "desk": (1, 3)}
 """Columns and rows of the drawers on their fronts."""
-_FRONT = 2
-"""Face -y of a box."""
-_MARGIN = 0.01
-"""Metres between the outlines of a drawer and of its painted field."""
-_BOARD = 0.012
-"""Metres that its boards are thick."""
-_WINDOWS = 8
-"""Times of opening that are tried."""
+_FRONT: Final = 2
+"""Number of a box's face -y."""
+
+
+class DrawerTuning(Tuning):
+    """What a drawer looks like, and when it opens."""
+
+    margin_m = 0.01
+    """Distance between the outlines of a drawer and of its painted field, in metres."""
+    board_m = 0.012
+    """Thickness of its boards, in metres."""
+    windows = 8
+    """Times of opening that are tried."""
+
+
 _AWAY = np.array([0.0, 0.0, -60.0])
 
 
@@ -35,7 +44,7 @@ def opened_drawer(setting: Setting) -> Mover:
         SequenceError: the camera sees none that can open.
     """
     rng = np.random.default_rng([setting.seed, 11, 2])
-    windows = [sample_window(rng, setting.frames) for _ in range(_WINDOWS)]
+    windows = [sample_window(rng, setting.frames) for _ in range(DrawerTuning.windows)]
     opening = rng.uniform(0.22, 0.32)
     names = setting.scene.instance_names
     best, most, progress = None, 0.0, windows[0]
@@ -72,8 +81,8 @@ def _panel(chest: Shape, grid: tuple[int, int], cell: int) -> Shape:
     """Front board of one of the drawers, flush with the front of its chest, with its part of the picture."""
     (columns, rows), (x, y, z) = grid, chest.half
     column, row = cell % columns, cell // columns
-    half = (x / columns - _MARGIN, _BOARD, z / rows - _MARGIN)
-    middle = np.array([x * ((2 * column + 1) / columns - 1), -y + _BOARD, z * (1 - (2 * row + 1) / rows)])
+    half = (x / columns - DrawerTuning.margin_m, DrawerTuning.board_m, z / rows - DrawerTuning.margin_m)
+    middle = np.array([x * ((2 * column + 1) / columns - 1), -y + DrawerTuning.board_m, z * (1 - (2 * row + 1) / rows)])
     front = chest.faces[_FRONT]
     height, width = front.image.shape[:2]
     left, right = (round((s * h + middle[0] + x) / (2 * x) * width) for s, h in ((-1, half[0]), (1, half[0])))
@@ -86,10 +95,10 @@ def _panel(chest: Shape, grid: tuple[int, int], cell: int) -> Shape:
 def _boards(chest: Shape, panel: Shape) -> list[Shape]:
     """A drawer: its front, two sides, and what lies in it."""
     (x, _, z), depth, wood = panel.half, chest.half[1] * 0.9, chest.material
-    back = 2 * depth - _BOARD
-    boards = [((-x + 2 * _BOARD, depth, -0.1 * z), (_BOARD, depth, 0.9 * z)),
-              ((x - 2 * _BOARD, depth, -0.1 * z), (_BOARD, depth, 0.9 * z))]  # fmt: skip
-    inside = ((0.0, back / 2, -0.3 * z), (x - 3 * _BOARD, back / 2, 0.6 * z))
+    back = 2 * depth - DrawerTuning.board_m
+    boards = [((-x + 2 * DrawerTuning.board_m, depth, -0.1 * z), (DrawerTuning.board_m, depth, 0.9 * z)),
+              ((x - 2 * DrawerTuning.board_m, depth, -0.1 * z), (DrawerTuning.board_m, depth, 0.9 * z))]  # fmt: skip
+    inside = ((0.0, back / 2, -0.3 * z), (x - 3 * DrawerTuning.board_m, back / 2, 0.6 * z))
     made = [panel]
     for middle, half in (*boards, inside):
         pose = panel.T_world_shape @ translation(np.array(middle))

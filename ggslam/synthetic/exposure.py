@@ -10,11 +10,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-MOMENTS = 5
-"""Views that one exposure is the mean of."""
-BANDS = 12
-"""Bands of rows that a rolling shutter reads one after the other."""
+
+class ExposureTuning(Tuning):
+    """How finely time is sampled."""
+
+    moments = 5
+    """Views that an exposure is the mean of."""
+    bands = 12
+    """Bands of rows that a rolling shutter reads one after the other."""
+
 
 View = Callable[[Camera, np.ndarray], np.ndarray]
 """An image of a camera at T_world_camera [4, 4]."""
@@ -49,7 +55,7 @@ class Shutter:
 
     def color(self, view: View, camera: Camera, poses: np.ndarray, frame: int) -> np.ndarray:
         """Colour uint8 [H, W, 3] of a frame; `poses` T_world_camera [n, 4, 4] of all frames."""
-        moments = self.blur * np.linspace(-0.5, 0.5, MOMENTS if self.blur else 1)
+        moments = self.blur * np.linspace(-0.5, 0.5, ExposureTuning.moments if self.blur else 1)
 
         def expose(part: Camera, offset: float) -> np.ndarray:
             views = [view(part, pose) for pose in poses_at(poses, frame, offset + moments)]
@@ -73,7 +79,7 @@ class Shutter:
 
     def _roll(self, image: Callable[[Camera, float], np.ndarray], camera: Camera, offset: float) -> np.ndarray:
         """Bands of rows one below the other, each of its own moment about `offset`."""
-        edges = np.linspace(0, camera.height, BANDS + 1 if self.rolling else 2).astype(int)
+        edges = np.linspace(0, camera.height, ExposureTuning.bands + 1 if self.rolling else 2).astype(int)
         times = offset + self.rolling * ((edges[:-1] + edges[1:]) / 2 / camera.height - 0.5)
         parts = [
             Camera(camera.width, bottom - top, camera.fx, camera.fy, camera.cx, camera.cy - top)

@@ -16,19 +16,26 @@ import numpy as np
 
 from ggslam.synthetic.scene import Light, Scene, Shape
 from ggslam.synthetic.surfaces import face_sizes, intersect, surface_points
+from ggslam.system.tuning import Tuning
 
-PATCH = 0.07
-"""Metres between patches of large faces; small faces have finer ones, down to half of it."""
-LARGEST_MAP = 112
-"""Patches along a face at most."""
-REACH = 0.9
-"""Metres within which things darken the ambient light."""
-AMBIENT_RAYS = 16
-_STRIP = 16
-OFFSET = 2e-3
-"""Metres by which rays start above the surface."""
-_MARGIN = 0.01
-"""Metres by which a shape has to be out of the way for its rays not to be looked at: far more than rounding."""
+
+class LightingTuning(Tuning):
+    """How finely light is computed."""
+
+    patch_m = 0.07
+    """Side of the patches of large faces, in metres; small faces have finer ones, down to half of it."""
+    max_patches = 112
+    """Most patches along a face."""
+    reach_m = 0.9
+    """Distance within which shapes darken the ambient light, in metres."""
+    ambient_rays = 16
+    """Rays for the ambient light of a patch."""
+    strip = 16
+    """Patches that are looked at together."""
+    offset_m = 2e-3
+    """Height above the surface at which rays start, in metres."""
+    margin_m = 0.01
+    """Distance from which a shape is out of a ray's way, in metres: far more than rounding."""
 
 
 @dataclass
@@ -70,7 +77,7 @@ def _bake(scene: Scene, first: int) -> LightMaps:
             normals.append(normal @ R.T)
             owners.append(np.full(len(own), index))
     position, normal = np.concatenate(points), np.concatenate(normals)
-    position += OFFSET * normal
+    position += LightingTuning.offset_m * normal
     seen = np.nonzero(((position > scene.bounds[0]) & (position < scene.bounds[1])).all(1))[0]
     patches = _Patches(position[seen], normal[seen], np.concatenate(owners)[seen])
     light = np.zeros((len(position), 3), np.float32)
@@ -103,7 +110,7 @@ class _Patches:
     def __init__(self, position: np.ndarray, normal: np.ndarray, owner: np.ndarray) -> None:
         self.position, self.normal, self.owner = position, normal, owner
         self._height = _dot(position, normal)
-        strip = np.arange(len(position)) // _STRIP
+        strip = np.arange(len(position)) // LightingTuning.strip
         count = np.bincount(strip)
         self._centre, self._normal = (
             np.stack([np.bincount(strip, of[:, k]) / count for k in range(3)], 1) for of in (position, normal)
@@ -144,16 +151,18 @@ class _Patches:
         middle, normal = self._centre[strips], self._normal[strips]
         slack = self._radius[strips] + self._bend[strips] * (_length(centre - middle) + shape.radius())
         above = normal @ centre - _dot(middle, normal) + np.abs(normal @ R) @ bounds + slack
-        chosen = (strips[above > -_MARGIN, None] * _STRIP + np.arange(_STRIP)).ravel()
+        chosen = (
+            strips[above > -LightingTuning.margin_m, None] * LightingTuning.strip + np.arange(LightingTuning.strip)
+        ).ravel()
         chosen = chosen[: np.searchsorted(chosen, len(self.position))]
         chosen = chosen[self.owner[chosen] != number]
         normal = self.normal[chosen]
-        return chosen[normal @ centre - self._height[chosen] + np.abs(normal @ R) @ bounds > -_MARGIN]
+        return chosen[normal @ centre - self._height[chosen] + np.abs(normal @ R) @ bounds > -LightingTuning.margin_m]
 
 
 def _beside(shape: Shape, light: np.ndarray, points: np.ndarray, radius: np.ndarray | float = 0.0) -> np.ndarray:
     """Whether points [n, 3], or balls there, and a light are on one side of a shape, as of a wall: it hides nothing."""
-    R, centre, reach = shape.T_world_shape[:3, :3], shape.T_world_shape[:3, 3], shape.bounds() + _MARGIN
+    R, centre, reach = shape.T_world_shape[:3, :3], shape.T_world_shape[:3, 3], shape.bounds() + LightingTuning.margin_m
     own, lamp = (points - centre) @ R, (light - centre) @ R
     apart = (np.minimum(own - radius, lamp.min(0)) > reach) | (np.maximum(own + radius, lamp.max(0)) < -reach)
     return apart[:, 0] | apart[:, 1] | apart[:, 2]
@@ -169,7 +178,13 @@ def _length(a: np.ndarray) -> np.ndarray:
 
 def _patches(side: float) -> int:
     """Patches along a side of `side` metres."""
-    return int(np.clip(np.ceil(side / np.clip(side / 8, PATCH / 2, PATCH)), 2, LARGEST_MAP))
+    return int(
+        np.clip(
+            np.ceil(side / np.clip(side / 8, LightingTuning.patch_m / 2, LightingTuning.patch_m)),
+            2,
+            LightingTuning.max_patches,
+        )
+    )
 
 
 def _pack(light: np.ndarray, sizes: list[tuple[int, int]]) -> LightMaps:
@@ -196,8 +211,8 @@ def _pack(light: np.ndarray, sizes: list[tuple[int, int]]) -> LightMaps:
 def _ambient(scene: Scene, patches: _Patches) -> np.ndarray:
     """Ambient light [n, 3] on patches."""
     # Directions spread evenly over the hemisphere with density proportional to the cosine (golden-angle spiral).
-    i = np.arange(AMBIENT_RAYS)
-    radius, angle = np.sqrt((i + 0.5) / AMBIENT_RAYS), i * np.pi * (3 - np.sqrt(5))
+    i = np.arange(LightingTuning.ambient_rays)
+    radius, angle = np.sqrt((i + 0.5) / LightingTuning.ambient_rays), i * np.pi * (3 - np.sqrt(5))
     normal = patches.normal
     tangent = np.cross(normal, np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]]))
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -205,13 +220,13 @@ def _ambient(scene: Scene, patches: _Patches) -> np.ndarray:
     spokes = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)])  # [3, rays]
     frames = np.stack([tangent, other, normal], 2)  # [n, 3, 3]
     directions = np.ascontiguousarray((frames @ spokes).transpose(1, 0, 2), np.float32)  # [3, n, rays]
-    free = np.full(directions.shape[1:], REACH, np.float32)
+    free = np.full(directions.shape[1:], LightingTuning.reach_m, np.float32)
     for number, shape in enumerate(scene.shapes):
         if shape.casts_shadow:
-            near = patches.near(number, shape, REACH)
+            near = patches.near(number, shape, LightingTuning.reach_m)
             hit = _first_hits(shape, patches.position[near], directions[:, near])
             free[near] = np.minimum(free[near], hit)
-    openness = np.clip(free / REACH, 0, 1) ** 0.7
+    openness = np.clip(free / LightingTuning.reach_m, 0, 1) ** 0.7
     up = (directions[2] + 1) / 2
     below, above = (openness * (1 - up)).mean(1), (openness * up).mean(1)
     return below[:, None] * np.array(scene.ambient_down) + above[:, None] * np.array(scene.ambient_up)

@@ -8,11 +8,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ggslam.system.tuning import Tuning
+
 Color = tuple[float, float, float]
 """Red, green, blue in [0, 1] as shown on a screen (gamma 2.2)."""
 
-SIZE = 512
-"""Pixels along each side of a tiled texture."""
+
+class TextureTuning(Tuning):
+    """How fine textures are."""
+
+    size = 512
+    """Pixels along each side of a tiled texture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +54,13 @@ class MaterialMaker:
 
     # --- building blocks ---------------------------------------------------------------------------------------------
 
-    def noise(self, height: int = SIZE, width: int = SIZE, slope: float = 1.0, stretch: float = 1.0) -> np.ndarray:
+    def noise(
+        self,
+        height: int = TextureTuning.size,
+        width: int = TextureTuning.size,
+        slope: float = 1.0,
+        stretch: float = 1.0,
+    ) -> np.ndarray:
         """Cloudy noise [height, width] that tiles, mean 0, deviation 1; power falls with frequency^-2 slope.
 
         `stretch` above 1 draws it out along the width (wood grain).
@@ -74,7 +86,7 @@ class MaterialMaker:
 
     def wood(self, dark: Color, light: Color, tile: float = 0.9) -> Material:
         """Straight grain along the width."""
-        return self.finish(_mix(dark, light, self._grain(SIZE, SIZE)), tile, grain=True)
+        return self.finish(_mix(dark, light, self._grain(TextureTuning.size, TextureTuning.size)), tile, grain=True)
 
     def _grain(self, height: int, width: int) -> np.ndarray:
         rings = np.sin(3.0 * self.noise(height, width, 1.5, 10.0) + 1.2 * self.noise(height, width, 1.2, 4.0))
@@ -84,12 +96,12 @@ class MaterialMaker:
 
     def planks(self, dark: Color, light: Color, rows: int = 8, tile: float = 1.6) -> Material:
         """Floor boards along the width, each with its own tone and grain."""
-        image = np.empty((SIZE, SIZE, 3))
-        height = SIZE // rows
+        image = np.empty((TextureTuning.size, TextureTuning.size, 3))
+        height = TextureTuning.size // rows
         for row in range(rows):
-            band = _mix(dark, light, self._grain(height, SIZE))
-            cut = int(self.rng.integers(SIZE // 8, 7 * SIZE // 8))
-            for part in (slice(0, cut), slice(cut, SIZE)):
+            band = _mix(dark, light, self._grain(height, TextureTuning.size))
+            cut = int(self.rng.integers(TextureTuning.size // 8, 7 * TextureTuning.size // 8))
+            for part in (slice(0, cut), slice(cut, TextureTuning.size)):
                 band[:, part] *= 1 + 0.14 * self.rng.standard_normal()
             band[:, [cut, cut - 1]] *= 0.45
             band[[0, -1]] *= 0.5
@@ -99,10 +111,10 @@ class MaterialMaker:
     def bricks(self, color: Color, mortar: Color, tile: float = 1.28) -> Material:
         """Running bond, 16 rows a tile."""
         rows, columns, joint = 16, 5, 4
-        height, width = SIZE // rows, SIZE / columns
-        y, x = np.mgrid[:SIZE, :SIZE]
+        height, width = TextureTuning.size // rows, TextureTuning.size / columns
+        y, x = np.mgrid[: TextureTuning.size, : TextureTuning.size]
         row = y // height
-        shifted = (x + (row % 2) * width / 2) % SIZE
+        shifted = (x + (row % 2) * width / 2) % TextureTuning.size
         column = (shifted // width).astype(int)
         wobble = 1.2 * self.noise(slope=1.0)
         inside = (y % height + wobble > joint) & (shifted % width + wobble > joint)
@@ -145,7 +157,7 @@ class MaterialMaker:
 
     def tiles(self, first: Color, second: Color, joint: Color, across: int, tile: float) -> Material:
         """Square tiles of two colours by turns, each with its own tone; `across` (even) of them a copy."""
-        y, x = np.mgrid[:SIZE, :SIZE] * across / SIZE
+        y, x = np.mgrid[: TextureTuning.size, : TextureTuning.size] * across / TextureTuning.size
         row, column = y.astype(int), x.astype(int)
         tone = 1 + 0.10 * self.rng.standard_normal((across, across))[row, column] + 0.05 * self.noise(slope=0.7)
         image = _mix(first, second, ((row + column) % 2).astype(float)) * tone[..., None]

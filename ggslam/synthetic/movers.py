@@ -18,15 +18,24 @@ from ggslam.synthetic.motion import Mover, Setting, Views
 from ggslam.synthetic.raycast import RayCaster, RayImages
 from ggslam.synthetic.scene import Scene, Shape
 from ggslam.synthetic.walker import walker
+from ggslam.system.tuning import Tuning
 
 _MAKERS = {"mug": carried_mug, "door": opened_drawer, "walker": walker}
 """In the order in which they are fitted in: who walks goes around the others."""
 MOVERS = ("walker", "mug", "door")
-LEAST_FRAMES = 10
-_VIEWS, _VIEW_WIDTH = 24, 96
-"""Frames that are looked at for what the camera sees, and pixels along their width."""
-_FLUSH = 0.002
-"""Metres between what is painted on a thing and the thing, at most."""
+
+
+class MoverTuning(Tuning):
+    """How movers are placed."""
+
+    min_frames = 10
+    """Fewest frames of a recording with movers."""
+    views = 24
+    """Frames that tell what the camera sees."""
+    view_width = 96
+    """Pixels along their width."""
+    flush_m = 0.002
+    """Largest distance between an object and what is painted on it, in metres."""
 
 
 class MovingScene:
@@ -49,7 +58,7 @@ class MovingScene:
             if mover.painted is not None and mover.is_painted is not None and mover.is_painted[frame]:
                 assert self._painted is not None
                 depth, _ = self._painted.measure(camera, T_world_camera)
-                own = (mask == mover.painted.instance) & (np.abs(depth - images.depth) < _FLUSH)
+                own = (mask == mover.painted.instance) & (np.abs(depth - images.depth) < MoverTuning.flush_m)
                 mask = np.where(own, np.uint16(mover.instance), mask)
         self._told.append([mover.describe_frame(frame, mask) for mover in self.movers])
         return replace(images, mask=mask)
@@ -102,8 +111,8 @@ def find_movers(scene: Scene, camera: Camera, poses: np.ndarray, seed: int, want
     wanted = list(wanted)
     if not wanted:
         return MovingScene(scene, seed)
-    if len(poses) < LEAST_FRAMES:
-        raise SequenceError(f"movers: expected at least {LEAST_FRAMES} frames, found {len(poses)}")
+    if len(poses) < MoverTuning.min_frames:
+        raise SequenceError(f"movers: expected at least {MoverTuning.min_frames} frames, found {len(poses)}")
     scene = replace(scene, instance_names=dict(scene.instance_names))
     setting = Setting(scene, _look(scene, camera, poses, seed), seed)
     for name, make in _MAKERS.items():
@@ -114,8 +123,8 @@ def find_movers(scene: Scene, camera: Camera, poses: np.ndarray, seed: int, want
 
 def _look(scene: Scene, camera: Camera, poses: np.ndarray, seed: int) -> Views:
     """What the camera sees of the scene at rest; the last frame is among it."""
-    small = camera.resize(_VIEW_WIDTH, round(_VIEW_WIDTH * camera.height / camera.width))
-    frames = np.unique(np.linspace(0, len(poses) - 1, _VIEWS).round().astype(int))
+    small = camera.resize(MoverTuning.view_width, round(MoverTuning.view_width * camera.height / camera.width))
+    frames = np.unique(np.linspace(0, len(poses) - 1, MoverTuning.views).round().astype(int))
     caster = RayCaster(scene, seed)
     depths, masks = zip(*(caster.measure(small, poses[i]) for i in frames), strict=True)
     return Views(small, poses, frames, np.array(depths), np.array(masks))

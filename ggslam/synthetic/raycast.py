@@ -16,10 +16,18 @@ from ggslam.synthetic.lighting import LightMaps, bake, bake_further
 from ggslam.synthetic.materials import Material
 from ggslam.synthetic.scene import FACES, Kind, Scene, Shape
 from ggslam.synthetic.surfaces import face_sizes, intersect, locate
+from ggslam.system.tuning import Tuning
 
-_NEAR = 0.02
-"""Metres before which shapes are cut off when their outline in the image is computed."""
-_EXPOSURE = 1.25
+
+class RaycastTuning(Tuning):
+    """How shapes are drawn."""
+
+    near_m = 0.02
+    """Depth before which shapes are cut off when their outline is computed, in metres."""
+    exposure = 1.25
+    """Exposure of the camera: how fast light saturates."""
+
+
 _BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 _BOX_EDGES = np.array([(i, j) for i in range(8) for j in range(i + 1, 8) if bin(i ^ j).count("1") == 1])
 
@@ -101,7 +109,7 @@ class RayCaster:
         v = ((np.arange(fine.height) - fine.cy) / fine.fy).astype(np.float32)
         light = self._shade(u, v, *self._trace(u, v, T_shape_camera), T_shape_camera, 1 / fine.fx)
         light = cv2.resize(light, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        color = (1 - np.exp(-_EXPOSURE * light)) ** (1 / 2.2)
+        color = (1 - np.exp(-RaycastTuning.exposure * light)) ** (1 / 2.2)
         return RayImages(np.rint(255 * color).astype(np.uint8), depth, mask)
 
     def measure(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -214,11 +222,11 @@ def _outlines(bounds: np.ndarray, T_shape_camera: np.ndarray) -> np.ndarray:
     first, second = corners[:, _BOX_EDGES[:, 0]], corners[:, _BOX_EDGES[:, 1]]
     with np.errstate(divide="ignore", invalid="ignore"):
         # Where edges cross the near plane, the points on it bound the image.
-        share = (_NEAR - first[..., 2:]) / (second[..., 2:] - first[..., 2:])
+        share = (RaycastTuning.near_m - first[..., 2:]) / (second[..., 2:] - first[..., 2:])
         cuts = first + share * (second - first)
         points = np.concatenate([corners, cuts], 1)
         projected = points[..., :2] / points[..., 2:]
-    front = corners[..., 2] > _NEAR
+    front = corners[..., 2] > RaycastTuning.near_m
     crossing = front[:, _BOX_EDGES[:, 0]] != front[:, _BOX_EDGES[:, 1]]
     used = np.concatenate([front, crossing], 1)[..., None]
     low = np.where(used, projected, np.inf).min(1) - 1e-4

@@ -14,11 +14,17 @@ from ggslam.errors import SequenceError
 from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.synthetic.scene import Scene
 from ggslam.synthetic.writer import check_target, new_folder, plan_recording, write_recording
+from ggslam.system.tuning import Tuning
 
 YAWS = {"front": 0.0, "left": -90.0, "back": 180.0, "right": 90.0}
 """Degrees by which a camera of this name is turned to the right."""
-RADIUS = 0.06
-"""Metres from the middle of the rig to each camera."""
+
+
+class SyntheticRigTuning(Tuning):
+    """How cameras are mounted."""
+
+    radius_m = 0.06
+    """Distance from the middle of the rig to each camera, in metres."""
 
 
 def camera_yaw(text: str) -> tuple[str, float]:
@@ -44,7 +50,7 @@ def camera_on_rig(yaw: float) -> np.ndarray:
     angle = np.radians(yaw)
     T = np.eye(4)
     T[:3, 0], T[:3, 2] = (np.cos(angle), 0.0, -np.sin(angle)), (np.sin(angle), 0.0, np.cos(angle))
-    T[:3, 3] = RADIUS * T[:3, 2]
+    T[:3, 3] = SyntheticRigTuning.radius_m * T[:3, 2]
     return np.where(np.abs(T) < 1e-12, 0.0, T)
 
 

@@ -9,10 +9,20 @@ from ggslam.synthetic import furniture
 from ggslam.synthetic.materials import Material
 from ggslam.synthetic.palette import Palette
 from ggslam.synthetic.scene import Scene, SceneBuilder
+from ggslam.system.tuning import Tuning
 
-WIDTH, DEPTH, HEIGHT = 5.2, 4.4, 2.6
-"""Size of the room in metres: x from west to east, y from south to north, z up."""
-_WALL = 0.1
+
+class RoomSize(Tuning):
+    """Size of the room."""
+
+    width_m = 5.2
+    """From west to east, x, in metres."""
+    depth_m = 4.4
+    """From south to north, y, in metres."""
+    height_m = 2.6
+    """From floor to ceiling, z, in metres."""
+    wall_m = 0.1
+    """Thickness of walls, floor and ceiling, in metres."""
 
 
 def furnished_room(seed: int = 0) -> Scene:
@@ -26,7 +36,7 @@ def furnished_room(seed: int = 0) -> Scene:
     _desk_corner(b, m, rng)
     _south_side(b, m, rng)
     scene = b.scene
-    scene.bounds = ((0.0, 0.0, 0.0), (WIDTH, DEPTH, HEIGHT))
+    scene.bounds = ((0.0, 0.0, 0.0), (RoomSize.width_m, RoomSize.depth_m, RoomSize.height_m))
     scene.walk = ((3.15, 1.75, 1.45), (0.75, 0.55))
     scene.interest = np.array(
         [(1.9, 3.3, 0.75), (0.4, 2.4, 0.85), (0.9, 0.8, 0.7), (2.4, 0.2, 0.8), (4.9, 1.6, 0.85), (4.2, 4.0, 0.95)]
@@ -35,18 +45,18 @@ def furnished_room(seed: int = 0) -> Scene:
 
 
 def _shell(b: SceneBuilder, m: Palette) -> None:
-    x, y, z, t = WIDTH / 2, DEPTH / 2, HEIGHT / 2, _WALL
-    b.instance("floor").box((x, y, -t / 2), (WIDTH, DEPTH, t), m.floor)
-    b.instance("ceiling").box((x, y, HEIGHT + t / 2), (WIDTH, DEPTH, t), m.ceiling)
+    x, y, z, t = RoomSize.width_m / 2, RoomSize.depth_m / 2, RoomSize.height_m / 2, RoomSize.wall_m
+    b.instance("floor").box((x, y, -t / 2), (RoomSize.width_m, RoomSize.depth_m, t), m.floor)
+    b.instance("ceiling").box((x, y, RoomSize.height_m + t / 2), (RoomSize.width_m, RoomSize.depth_m, t), m.ceiling)
     walls: tuple[tuple[str, tuple[float, float], tuple[float, float], Material], ...] = (
-        ("north wall", (x, DEPTH + t / 2), (WIDTH, t), m.wallpaper),
-        ("south wall", (x, -t / 2), (WIDTH, t), m.stripes),
-        ("west wall", (-t / 2, y), (t, DEPTH), m.plaster),
-        ("east wall", (WIDTH + t / 2, y), (t, DEPTH), m.brick),
+        ("north wall", (x, RoomSize.depth_m + t / 2), (RoomSize.width_m, t), m.wallpaper),
+        ("south wall", (x, -t / 2), (RoomSize.width_m, t), m.stripes),
+        ("west wall", (-t / 2, y), (t, RoomSize.depth_m), m.plaster),
+        ("east wall", (RoomSize.width_m + t / 2, y), (t, RoomSize.depth_m), m.brick),
     )
     for name, (cx, cy), (sx, sy), material in walls:
         wall = b.instance(name)
-        wall.box((cx, cy, z), (sx, sy, HEIGHT), material)
+        wall.box((cx, cy, z), (sx, sy, RoomSize.height_m), material)
         inward = (np.sign(x - cx) if sx == t else 0.0, np.sign(y - cy) if sy == t else 0.0)
         skirting = (cx + inward[0] * (t / 2 + 0.008), cy + inward[1] * (t / 2 + 0.008), 0.05)
         wall.box(skirting, (0.016 if sx == t else sx, 0.016 if sy == t else sy, 0.10), m.white)
@@ -65,7 +75,7 @@ def _lounge(b: SceneBuilder, m: Palette, rng: np.random.Generator) -> None:
     furniture.bookshelf(b, m, rng, (3.75, 4.23, 0), 0)
     furniture.plant(b, m, rng, (4.80, 3.95, 0))
     for painting, x, width, height in ((1, 1.25, 0.52, 0.52), (0, 2.0, 0.70, 0.52), (2, 2.72, 0.42, 0.58)):
-        furniture.picture(b, m, m.paintings[painting], (x, DEPTH, 1.62), 0, width, height)
+        furniture.picture(b, m, m.paintings[painting], (x, RoomSize.depth_m, 1.62), 0, width, height)
     furniture.table(b, "coffee table", (1.95, 2.62, 0), 3, (1.15, 0.62, 0.42), m.walnut, m.walnut).box(
         (0, 0, 0.14), (0.98, 0.46, 0.025), m.walnut
     )
@@ -115,9 +125,9 @@ def _desk_corner(b: SceneBuilder, m: Palette, rng: np.random.Generator) -> None:
     lamp.cylinder((-0.09, -0.05, 0.38), 0.085, 0.12, m.rose, (0, 25, 0), top=0.5)
     furniture.book_pile(b, m, rng, (4.98, 1.22, 0.74), 3)
     furniture.chair(b, "desk chair", (4.28, 1.72, 0), 82, m.walnut, m.rose)
-    furniture.picture(b, m, m.paintings[3], (WIDTH, 1.3, 1.68), -90, 0.56, 0.56)
-    furniture.picture(b, m, m.paintings[4], (WIDTH, 2.15, 1.68), -90, 0.72, 0.50)
-    clock = b.instance("clock", (WIDTH, 3.05, 1.80))
+    furniture.picture(b, m, m.paintings[3], (RoomSize.width_m, 1.3, 1.68), -90, 0.56, 0.56)
+    furniture.picture(b, m, m.paintings[4], (RoomSize.width_m, 2.15, 1.68), -90, 0.72, 0.50)
+    clock = b.instance("clock", (RoomSize.width_m, 3.05, 1.80))
     clock.cylinder((-0.02, 0, 0), 0.16, 0.04, m.black, (0, -90, 0), cap=m.clock)
     basket = b.instance("waste basket", (4.92, 2.75, 0))
     basket.cylinder((0, 0, 0.16), 0.12, 0.32, m.wicker, top=1.2, cap=m.black)

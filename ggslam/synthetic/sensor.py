@@ -6,13 +6,19 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-LARGEST_DEPTH = 8.0
-"""Metres up to which the sensor measures."""
-DISPARITY_STEP = 0.00287
-"""Depth step per squared metre of depth: disparity in eighths of a pixel, focal length 580 px, baseline 7.5 cm."""
-_WAVES = 3
-"""Half waves of the distortion across the image, less one."""
+
+class SensorTuning(Tuning):
+    """What the depth sensor measures."""
+
+    max_depth_m = 8.0
+    """Largest depth, in metres."""
+    disparity_step = 0.00287
+    """Step of depth per squared metre of depth: disparity in eighths of a pixel, focal length 580 px, baseline 7.5
+    cm."""
+    waves = 3
+    """Half waves of the distortion across the image, plus one."""
 
 
 def disparity_distortion(camera: Camera, rms: float, seed: int) -> np.ndarray:
@@ -33,8 +39,8 @@ def disparity_distortion(camera: Camera, rms: float, seed: int) -> np.ndarray:
     v, u = np.mgrid[: camera.height, : camera.width] + 0.5
     v, u = v / camera.height, u / camera.width
     pattern = np.zeros(v.shape)
-    for i in range(_WAVES):
-        for j in range(_WAVES):
+    for i in range(SensorTuning.waves):
+        for j in range(SensorTuning.waves):
             strength, shift, other = rng.standard_normal(), rng.uniform(0, 2), rng.uniform(0, 2)
             if i + j:
                 pattern += strength / np.hypot(i, j) * np.cos(np.pi * (i * v + shift)) * np.cos(np.pi * (j * u + other))
@@ -53,12 +59,12 @@ def noisy_depth(
     z = depth.astype(np.float64)
     noisy = z + rng.standard_normal(z.shape) * (0.0012 + 0.0019 * (z - 0.4) ** 2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        disparity = np.rint(1 / (noisy * DISPARITY_STEP) + distortion)
-        noisy = np.where(disparity > 0, 1 / (disparity * DISPARITY_STEP), 0)
+        disparity = np.rint(1 / (noisy * SensorTuning.disparity_step) + distortion)
+        noisy = np.where(disparity > 0, 1 / (disparity * SensorTuning.disparity_step), 0)
     chance = rng.random(z.shape)
     edge, cosine = _edges(z), _cosine(z, camera)
     lost = (edge & (chance < 0.75)) | (chance < np.clip((0.22 - cosine) / 0.15, 0, 1)) | (chance < 0.001)
-    noisy[lost | (z <= 0.3) | (z > LARGEST_DEPTH)] = 0
+    noisy[lost | (z <= 0.3) | (z > SensorTuning.max_depth_m)] = 0
     return noisy.astype(np.float32)
 
 

@@ -6,9 +6,14 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.synthetic.scene import Kind, Shape
+from ggslam.system.tuning import Tuning
 
-NEAREST = np.float32(1e-3)
-"""Hits nearer along a ray than this are ignored."""
+
+class SurfaceTuning(Tuning):
+    """Where rays begin."""
+
+    near = np.float32(1e-3)
+    """Distance along a ray up to which hits are ignored."""
 
 
 def intersect(shape: Shape, origin: tuple[np.ndarray, ...], direction: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -38,7 +43,7 @@ def _intersect_box(half: np.ndarray, origin: tuple[np.ndarray, ...], direction: 
         enter = low if enter is None else np.maximum(enter, low)
         leave = high if leave is None else np.minimum(leave, high)
     assert enter is not None and leave is not None
-    return np.where((enter < leave) & (enter > NEAREST), enter, np.float32(np.inf))
+    return np.where((enter < leave) & (enter > SurfaceTuning.near), enter, np.float32(np.inf))
 
 
 def _intersect_ellipsoid(
@@ -50,7 +55,7 @@ def _intersect_ellipsoid(
     b = o[0] * d[0] + o[1] * d[1] + o[2] * d[2]
     c = o[0] * o[0] + o[1] * o[1] + o[2] * o[2] - np.float32(1)
     t = (-b - np.sqrt(b * b - a * c)) / a
-    return np.where(t > NEAREST, t, np.float32(np.inf))  # NaN where the ray misses compares false
+    return np.where(t > SurfaceTuning.near, t, np.float32(np.inf))  # NaN where the ray misses compares false
 
 
 def _intersect_frustum(shape: Shape, origin: tuple[np.ndarray, ...], direction: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -63,11 +68,11 @@ def _intersect_frustum(shape: Shape, origin: tuple[np.ndarray, ...], direction: 
     b = ox * dx + oy * dy - radius * change
     c = ox * ox + oy * oy - radius * radius
     t = (-b - np.sqrt(b * b - a * c)) / a
-    best = np.where((t > NEAREST) & (np.abs(oz + t * dz) <= half), t, np.float32(np.inf))
+    best = np.where((t > SurfaceTuning.near) & (np.abs(oz + t * dz) <= half), t, np.float32(np.inf))
     for z, r in ((-half, bottom), (half, upper)):
         t = (z - oz) / dz
         x, y = ox + t * dx, oy + t * dy
-        best = np.where((t > NEAREST) & (t < best) & (x * x + y * y <= r * r), t, best)
+        best = np.where((t > SurfaceTuning.near) & (t < best) & (x * x + y * y <= r * r), t, best)
     return best
 
 

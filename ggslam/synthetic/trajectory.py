@@ -11,20 +11,32 @@ from scipy.ndimage import gaussian_filter1d
 
 from ggslam.errors import SequenceError
 from ggslam.synthetic.scene import Scene
+from ggslam.system.tuning import Tuning
 
 TRAJECTORIES = ("loop", "round", "pan", "route", "walk", "turns", "still")
-LARGEST_STEP, LARGEST_TURN = 0.045, 1.9
-"""Metres and degrees between frames that a path keeps to (short recordings see less of the scene)."""
-TURN_PEAK, TURN_FRAMES = 4.7, 88
-"""Of "turns": degrees between frames at the fastest, and frames from one side to the other and back."""
-CLEARANCE = 0.18
-"""Metres that the camera stays away from every shape."""
-ROUTE_CLEARANCE = 0.3
-"""The same on a route through several rooms."""
-ROUTE_STEP, ROUTE_TURN = 0.075, 2.5
-"""Metres and degrees between frames that the pace along a route weighs alike: where it turns, the camera is slower."""
-SEEN_AGAIN = 0.14
-"""Share of a route's circuit that is gone a second time: its beginning."""
+
+
+class PathTuning(Tuning):
+    """How fast and how near the camera moves."""
+
+    max_step_m = 0.045
+    """Longest way between frames, in metres; short recordings see less of the scene."""
+    max_turn_deg = 1.9
+    """Largest rotation between frames, in degrees."""
+    peak_turn_deg = 4.7
+    """Largest rotation between frames of "turns", in degrees."""
+    turn_frames = 88
+    """Frames of "turns" from one side to the other and back."""
+    clearance_m = 0.18
+    """Smallest distance from every shape, in metres."""
+    route_clearance_m = 0.3
+    """The same on a route through several rooms."""
+    route_step_m = 0.075
+    """Way between frames of a route that weighs as much as `route_turn_deg`, in metres."""
+    route_turn_deg = 2.5
+    """Rotation between frames of a route that weighs as much as `route_step_m`, in degrees."""
+    seen_again = 0.14
+    """Share of a route's circuit, from its start, that is gone a second time."""
 
 
 def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int = 0) -> np.ndarray:
@@ -36,7 +48,7 @@ def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int =
         trajectory: "loop": once around the ellipse, the view swinging over the points nearest to the first and back, so
             that the end meets the beginning; "round": around the ellipse while the view passes over all the points;
             "pan": turning on the spot; "turns": from side to side, slow at either end and fast between, while walking;
-            "still": as a camera on a tripod; "route": along the scene's route, past its beginning for `SEEN_AGAIN` of
+            "still": as a camera on a tripod; "route": along the scene's route, past its beginning for `seen_again` of
             it; "walk": along the scene's route from its beginning, as far as one gets at the usual pace.
         seed: of the unrest.
 
@@ -53,7 +65,7 @@ def camera_path(scene: Scene, frames: int, trajectory: str = "loop", seed: int =
         return _route(scene, frames, seed, closed=trajectory == "route")
     for size in (1.0, 0.7, 0.45, 0.25, 0.1):
         poses = _path(scene, frames, trajectory, seed, size)
-        if _is_clear(scene, poses[:, :3, 3], CLEARANCE):
+        if _is_clear(scene, poses[:, :3, 3], PathTuning.clearance_m):
             return poses
     raise SequenceError("the scene leaves the camera no free way: every path comes too near to something")
 
@@ -62,7 +74,7 @@ def _path(scene: Scene, frames: int, trajectory: str, seed: int, size: float) ->
     (cx, cy, cz), radii = scene.walk
     phase = np.arange(frames) / frames  # 0 to nearly 1: the frame after the last would be the first again
     length = 2 * np.pi * size * max(radii)
-    shrink = 0.0 if trajectory == "pan" else size * min(1.0, LARGEST_STEP * frames / max(length, 1e-9))
+    shrink = 0.0 if trajectory == "pan" else size * min(1.0, PathTuning.max_step_m * frames / max(length, 1e-9))
     around = 2 * np.pi * phase + 0.75 * np.pi
     unrest = _unrest(frames, seed)
     position = np.stack(
@@ -75,7 +87,7 @@ def _path(scene: Scene, frames: int, trajectory: str, seed: int, size: float) ->
     )
     position += 0.012 * unrest[:, :3]
     first = np.arctan2(*(scene.interest[0] - (cx, cy, cz))[1::-1])
-    turn_limit = np.radians(LARGEST_TURN) * frames
+    turn_limit = np.radians(PathTuning.max_turn_deg) * frames
     if trajectory == "turns":
         heading = first + _swings(frames)
     elif trajectory == "loop":
@@ -94,8 +106,8 @@ def _path(scene: Scene, frames: int, trajectory: str, seed: int, size: float) ->
 
 def _swings(frames: int) -> np.ndarray:
     """Headings of "turns" against the first, radians [frames]: the pace goes with the fourth power of a sine."""
-    sine = np.sin(2 * np.pi * (np.arange(frames) - 0.5) / TURN_FRAMES)
-    turned = np.cumsum(np.radians(TURN_PEAK) * np.sign(sine) * sine**4)
+    sine = np.sin(2 * np.pi * (np.arange(frames) - 0.5) / PathTuning.turn_frames)
+    turned = np.cumsum(np.radians(PathTuning.peak_turn_deg) * np.sign(sine) * sine**4)
     return turned - turned.max() / 2
 
 
@@ -137,17 +149,17 @@ def _route(scene: Scene, frames: int, seed: int, closed: bool) -> np.ndarray:
     heading = np.radians(values[:, 3]) + 0.014 * unrest[:, 3]
     tilt = np.radians(values[:, 4]) + 0.012 * unrest[:, 4]
     forward = np.stack([np.cos(heading) * np.cos(tilt), np.sin(heading) * np.cos(tilt), np.sin(tilt)], 1)
-    if not _is_clear(scene, position, ROUTE_CLEARANCE):
-        raise SequenceError(f"the route leads nearer than {ROUTE_CLEARANCE} m to something")
+    if not _is_clear(scene, position, PathTuning.route_clearance_m):
+        raise SequenceError(f"the route leads nearer than {PathTuning.route_clearance_m} m to something")
     return np.stack([_look_along(p, f, 0.012 * u) for p, f, u in zip(position, forward, unrest[:, 5], strict=True)])
 
 
 def _circuit(route: np.ndarray, frames: int) -> np.ndarray:
-    """Rows [frames, 5] of a closed route: all of it and `SEEN_AGAIN` of it again, in so many frames."""
+    """Rows [frames, 5] of a closed route: all of it and `PathTuning.seen_again` of it again, in so many frames."""
     where, period = _closed_spline(route)
     fine = np.linspace(0, period, 4096)
     spent = _spent(where(fine), 40, "wrap")
-    wanted = spent[-1] * (1 + SEEN_AGAIN) * np.arange(frames) / frames
+    wanted = spent[-1] * (1 + PathTuning.seen_again) * np.arange(frames) / frames
     laps, rest = np.divmod(wanted, spent[-1])
     values = where(np.asarray(np.interp(rest, spent, fine)))
     values[:, 3] += 360 * laps
@@ -155,7 +167,7 @@ def _circuit(route: np.ndarray, frames: int) -> np.ndarray:
 
 
 def _one_way(route: np.ndarray, frames: int) -> np.ndarray:
-    """Rows [frames, 5] from the beginning of an open route, a frame for each `ROUTE_STEP` or `ROUTE_TURN`."""
+    """Rows [frames, 5] from the beginning of an open route, a frame for each `route_step_m` or `route_turn_deg`."""
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route[:, :3], axis=0), axis=1))])
     spline = CubicSpline(at, route)
     fine = np.arange(0, at[-1], 0.01)
@@ -169,7 +181,9 @@ def _spent(rows: np.ndarray, smoothing: float, mode: str) -> np.ndarray:
     """Frames spent up to each of the rows [n, 5] at the usual pace, which changes gently: [n]."""
     step = np.diff(rows, axis=0)
     metres, degrees = np.linalg.norm(step[:, :3], axis=1), np.linalg.norm(step[:, 3:], axis=1)
-    effort = gaussian_filter1d(np.hypot(metres / ROUTE_STEP, degrees / ROUTE_TURN), smoothing, mode=mode)
+    effort = gaussian_filter1d(
+        np.hypot(metres / PathTuning.route_step_m, degrees / PathTuning.route_turn_deg), smoothing, mode=mode
+    )
     return np.concatenate([[0.0], np.cumsum(effort)])
 
 

@@ -12,19 +12,36 @@ from ggslam.scene.poses import translation
 from ggslam.synthetic.materials import MaterialMaker
 from ggslam.synthetic.motion import Mover, Setting, progress_between, turn
 from ggslam.synthetic.scene import Scene, SceneBuilder, Shape
+from ggslam.system.tuning import Tuning
 
-RADIUS, HEIGHT = 0.26, 1.78
-"""Metres of free floor around the middle of a person, and how tall they are."""
-FROM_CAMERA = 0.6
-"""Metres between the person's middle and the camera, at least."""
-_STEP = 0.05
-"""Metres between frames, at most on the average."""
-_LEAST_WAY, _MOST_WAY = 1.3, 3.6
-_STRIDE, _SWING = 1.4, np.radians(27)
-"""Metres of two steps; how far legs swing."""
-_CELL, _TRIES = 0.08, 4000
-_ENOUGH = 0.6
-"""Of the time walked in view: a way with it is taken."""
+
+class WalkerTuning(Tuning):
+    """How a person walks."""
+
+    radius_m = 0.26
+    """Radius of free floor around a person's middle, in metres."""
+    height_m = 1.78
+    """Height of a person, in metres."""
+    from_camera_m = 0.6
+    """Smallest distance from the camera, in metres."""
+    max_step_m = 0.05
+    """Longest mean way between frames, in metres."""
+    min_way_m = 1.3
+    """Shortest limit of the way, in metres."""
+    max_way_m = 3.6
+    """Longest limit of the way, in metres."""
+    stride_m = 1.4
+    """Length of two steps, in metres."""
+    swing = np.radians(27)
+    """How far legs swing, in radians."""
+    cell_m = 0.08
+    """Side of the cells of the floor, in metres."""
+    tries = 4000
+    """Ways that are tried."""
+    enough = 0.6
+    """Share of a way in view with which it is taken at once."""
+
+
 _JOINTS = {"torso": (0.0, 0.0, 0.88), "left leg": (0.0, 0.1, 0.88), "right leg": (0.0, -0.1, 0.88),
            "left arm": (0.0, 0.26, 1.4), "right arm": (0.0, -0.26, 1.4)}  # fmt: skip
 _SWINGS = {"torso": 0.0, "left leg": 1.0, "right leg": -1.0, "left arm": -0.8, "right arm": 0.8}
@@ -49,8 +66,8 @@ def walker(setting: Setting) -> Mover:
     way = _find_way(setting, rng)
     number = setting.new_instance("person")
     root = translation(np.column_stack([way.at, np.zeros(setting.frames)])) @ turn(way.heading, 2)
-    gentle = np.clip(np.minimum(way.walked, way.walked[-1] - way.walked) / (_STRIDE / 4), 0, 1)
-    swing = _SWING * gentle * np.sin(2 * np.pi * way.walked / _STRIDE)
+    gentle = np.clip(np.minimum(way.walked, way.walked[-1] - way.walked) / (WalkerTuning.stride_m / 4), 0, 1)
+    swing = WalkerTuning.swing * gentle * np.sin(2 * np.pi * way.walked / WalkerTuning.stride_m)
     figure = _figure(number, rng)
     parts, shapes, tracks = {}, [], []
     for name, joint in _JOINTS.items():
@@ -60,7 +77,7 @@ def walker(setting: Setting) -> Mover:
             tracks.append(parts[name] @ local)
             shapes.append(replace(shape, T_world_shape=tracks[-1][setting.frames // 2]))
     numbers = setting.add_shapes(shapes)
-    what = f"a walking person of boxes and cylinders, {HEIGHT:g} m"
+    what = f"a walking person of boxes and cylinders, {WalkerTuning.height_m:g} m"
     return Mover("person", what, number, False, root, numbers, np.stack(tracks, 1), {"root": root, **parts})
 
 
@@ -94,29 +111,31 @@ def _figure(number: int, rng: np.random.Generator) -> dict[str, list[Shape]]:
 
 def _find_way(setting: Setting, rng: np.random.Generator) -> _Way:
     free, corner = _free_floor(setting)
-    places = np.argwhere(free) * _CELL + corner
+    places = np.argwhere(free) * WalkerTuning.cell_m + corner
     if not len(places):
         raise SequenceError("movers: nowhere is there room for a person")
     times, best, most = setting.views.frames, None, 0.0
-    for _ in range(_TRIES):
+    for _ in range(WalkerTuning.tries):
         first = rng.uniform(0.12, 0.45)
         last = min(0.9, first + rng.uniform(0.4, 0.65))
-        longest = np.clip(_STEP * (last - first) * setting.frames, _LEAST_WAY, _MOST_WAY)
+        longest = np.clip(
+            WalkerTuning.max_step_m * (last - first) * setting.frames, WalkerTuning.min_way_m, WalkerTuning.max_way_m
+        )
         a, b, c = places[rng.integers(len(places), size=3)]
         if not 0.7 * longest < np.linalg.norm(c - a) < longest:
             continue
         progress = progress_between(setting.frames, first, last)
         way = _bend(a, (a + b + c) / 3, c, progress)
-        cells = np.rint((way.at - corner) / _CELL).astype(int)
+        cells = np.rint((way.at - corner) / WalkerTuning.cell_m).astype(int)
         if not free[cells[:, 0], cells[:, 1]].all():
             continue
-        if np.linalg.norm(way.at - setting.views.poses[:, :2, 3], axis=1).min() < FROM_CAMERA:
+        if np.linalg.norm(way.at - setting.views.poses[:, :2, 3], axis=1).min() < WalkerTuning.from_camera_m:
             continue
         seen, under_way = _shares_seen(setting, way), (progress[times] > 0) & (progress[times] < 1)
         score = float(seen[under_way].mean()) - 0.15 * float(seen[0] + seen[-1])
         if score > most:
             best, most = way, score
-        if most >= _ENOUGH:
+        if most >= WalkerTuning.enough:
             break
     if best is None:
         raise SequenceError("movers: nobody can walk through what the camera sees")
@@ -149,8 +168,11 @@ def _free_floor(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
     """Where a person can stand, bool [x, y], and the middle of its first cell."""
     scene: Scene = setting.scene
     low, high = np.array(scene.bounds)
-    x, y = (np.arange(low[k] + RADIUS + 0.05, high[k] - RADIUS - 0.05, _CELL) for k in (0, 1))
-    grid = np.stack(np.meshgrid(x, y, np.arange(0.1, HEIGHT, 0.2), indexing="ij"), -1).reshape(-1, 3)
+    x, y = (
+        np.arange(low[k] + WalkerTuning.radius_m + 0.05, high[k] - WalkerTuning.radius_m - 0.05, WalkerTuning.cell_m)
+        for k in (0, 1)
+    )
+    grid = np.stack(np.meshgrid(x, y, np.arange(0.1, WalkerTuning.height_m, 0.2), indexing="ij"), -1).reshape(-1, 3)
     obstacles = [shape for shape in scene.shapes if _is_in_the_way(shape)]
     for mover in setting.movers:
         known = [*scene.shapes, *setting.shapes]
@@ -160,7 +182,7 @@ def _free_floor(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
     nearest = np.full(len(grid), np.inf)
     for shape in obstacles:
         np.minimum(nearest, shape.distance(grid), out=nearest)
-    free = nearest.reshape(len(x), len(y), -1).min(2) > RADIUS
+    free = nearest.reshape(len(x), len(y), -1).min(2) > WalkerTuning.radius_m
     return free, np.array([x[0], y[0]])
 
 
@@ -168,4 +190,4 @@ def _is_in_the_way(shape: Shape) -> bool:
     """Whether anybody runs into it: rugs and lamps at the ceiling they do not."""
     reach = np.abs(shape.T_world_shape[2, :3]) @ shape.bounds()
     middle = shape.T_world_shape[2, 3]
-    return bool(middle + reach > 0.05 and middle - reach < HEIGHT)
+    return bool(middle + reach > 0.05 and middle - reach < WalkerTuning.height_m)

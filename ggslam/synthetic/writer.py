@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
@@ -27,16 +28,27 @@ from ggslam.synthetic.scenes import SCENES, SceneKind
 from ggslam.synthetic.sensor import disparity_distortion, noisy_color, noisy_depth
 from ggslam.synthetic.trajectory import camera_path
 from ggslam.system.atomic import write_failure
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, read_untrusted
+from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
-DEPTH_SCALE = 5000.0
-LARGEST_DISTORTION = 10.0
+DEPTH_SCALE: Final = 5000.0
+"""Units per metre of depth images, as in TUM recordings."""
+
+
+class SynthTuning(Tuning):
+    """What generated recordings are like."""
+
+    max_distortion = 10.0
+    """Largest distortion of depth, in steps of disparity."""
+    frames_with_movers = 120
+    """Frames of a recording with movers."""
+    focal = 0.75
+    """Focal length as a share of the image's width: 67 degrees of view."""
+
+
 CHANGES_FILE = "changes.json"
 MOVERS_FILE = "movers.json"
-FRAMES_WITH_MOVERS = 120
 PLAIN_SHUTTER = Shutter()
-FOCAL_LENGTH = 0.75
-"""As a share of the image width: 67 degrees of view."""
 
 
 def write_synthetic_sequence(
@@ -97,7 +109,7 @@ def write_synthetic_sequence(
     if wanted := movers_of(movers):
         if scene != "room" or changes is not None:
             raise SequenceError("movers: only the room has things that move, and not at two visits")
-        frames = FRAMES_WITH_MOVERS if frames is None else frames
+        frames = SynthTuning.frames_with_movers if frames is None else frames
     if changes is not None:
         scene, made = _scene_of_visit(scene, seed, changes, visit)
         trajectory = trajectory or "round"
@@ -176,7 +188,7 @@ def plan_recording(
     if speed < 1:
         raise SequenceError(f"speed: expected 1 or more, found {speed}")
     scene = scene if isinstance(scene, Scene) else kind.build(seed, frames * speed)
-    focal = FOCAL_LENGTH * width
+    focal = SynthTuning.focal * width
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     poses = _poses(scene, frames, trajectory, seed, speed)
     return RecordingPlan(scene, camera, seed, noise, trajectory, frame_rate, distortion, poses, shutter)
@@ -226,8 +238,8 @@ def new_folder(target: Path) -> Iterator[Path]:
 
 
 def _check_numbers(width: int, height: int, frame_rate: float, distortion: float) -> None:
-    if not 0 <= distortion <= LARGEST_DISTORTION:
-        raise SequenceError(f"depth_distortion: expected 0 to {LARGEST_DISTORTION:g} steps, found {distortion}")
+    if not 0 <= distortion <= SynthTuning.max_distortion:
+        raise SequenceError(f"depth_distortion: expected 0 to {SynthTuning.max_distortion:g} steps, found {distortion}")
     if width < 16 or height < 16 or not frame_rate > 0:
         raise SequenceError(
             f"expected at least 16x16 pixels and a positive frame rate, found {width}x{height} and {frame_rate}"
@@ -282,7 +294,9 @@ def check_target(target: Path, file: str, overwrite: bool) -> None:
     if not any(target.iterdir()):
         return
     description = target / file
-    generated = description.is_file() and b"generator:" in read_untrusted(description, MAX_TEXT_BYTES, SequenceError)
+    generated = description.is_file() and b"generator:" in read_untrusted(
+        description, FileTuning.max_text_bytes, SequenceError
+    )
     if not (overwrite and generated):
         what = "holds a generated recording already" if generated else "is not empty"
         raise SequenceError(f"{target}: {what}; choose another folder")

@@ -16,20 +16,21 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Final
 
 import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.system.atomic import write_failure
 from ggslam.system.links import new_file
-from ggslam.system.untrusted_files import open_untrusted
+from ggslam.system.untrusted_files import FileTuning, open_untrusted
 
 _MAGIC = b"ggstate1"
-_ALIGNMENT = 64
-_BLOCK = 1 << 20
+_ALIGNMENT: Final = 64
+"""Bytes that arrays are aligned to in the file."""
 _KINDS = "biufc"
-_WIDEST = 32
+_WIDEST: Final = 32
+"""Bytes of numpy's widest number."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class _Summed:
     def write(self, data: bytes | memoryview) -> None:
         view = memoryview(data)
         while len(view):
-            done = self._file.write(view[:_BLOCK])
+            done = self._file.write(view[: FileTuning.bytes_at_once])
             self.crc = zlib.crc32(view[:done], self.crc)
             self.size += done
             view = view[done:]
@@ -187,7 +188,7 @@ def _fill(file: IO[bytes], array: np.ndarray, crc: int) -> int:
     view = memoryview(array.view(np.uint8).data) if array.size else memoryview(b"")
     done = 0
     while done < len(view):
-        read = file.readinto(view[done : done + _BLOCK])  # type: ignore[attr-defined]
+        read = file.readinto(view[done : done + FileTuning.bytes_at_once])  # type: ignore[attr-defined]
         if not read:
             raise ValueError("it ends too early")
         crc = zlib.crc32(view[done : done + read], crc)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ggslam.errors import RunFolderError
 from ggslam.system.links import refuse_shared_file
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import printable
 
 try:
@@ -28,12 +29,18 @@ LOCK_FILE = ".lock"
 _UNABLE = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL)
 """File systems that have no locks."""
 
-_QUIET_S = 2.0
-"""Seconds to wait without a word."""
+
+class LockTuning(Tuning):
+    """How long a process waits for a folder that another one writes."""
+
+    quiet_s = 2.0
+    """Seconds before it says that it waits."""
+    wait_s = 600.0
+    """Seconds that a command waits which writes beside others."""
+
+
 _log = logging.getLogger(__name__)
 
-WAIT_S = 600.0
-"""Seconds that a command which writes beside others waits for one that is at it."""
 
 _Key = tuple[int, int, str]
 _held: dict[_Key, list[int]] = {}
@@ -65,7 +72,7 @@ def folder_lock(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
 
 
 @contextmanager
-def output_lock(path: Path, wait_s: float = WAIT_S) -> Iterator[None]:
+def output_lock(path: Path, wait_s: float = LockTuning.wait_s) -> Iterator[None]:
     """This process alone writes a file, or the files of a folder, within the block; others of the same name wait.
 
     Args:
@@ -97,7 +104,7 @@ def _enter_within(folder: Path, name: str, wait_s: float) -> _Key:
             waited = time.monotonic() - start
             if waited >= wait_s:
                 raise
-            if waited > _QUIET_S and not told:
+            if waited > LockTuning.quiet_s and not told:
                 told = True
                 _log.warning("note: %s; waiting for it", printable(str(refusal).partition(";")[0]))
             time.sleep(0.02)

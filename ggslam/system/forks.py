@@ -15,15 +15,25 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from ggslam.errors import NativeCoreError
+from ggslam.system.tuning import Tuning
 
-_PAUSE_HARD = 2
+_PAUSE_HARD: Final = 2
 """`omp_pause_hard` of OpenMP 5."""
-_FORKED_WITHOUT_EXEC = 0x40
+_FORKED_WITHOUT_EXEC: Final = 0x40
 """PF_FORKNOEXEC of the flags in /proc/self/stat."""
-_PROBE_S = 2.0
-_good_process = 0
+
+
+class ForkTuning(Tuning):
+    """How a fork is tried."""
+
+    probe_s = 2.0
+    """Seconds after which letting the threads go counts as hanging."""
+
+
+_good_process: int = 0
 """The process of which is known that no thread was lost to it by a fork."""
 _rested = False
 
@@ -95,7 +105,7 @@ def _would_hang() -> bool:
         for pause in pauses:
             pause()
         os._exit(0)
-    end = time.monotonic() + _PROBE_S
+    end = time.monotonic() + ForkTuning.probe_s
     while time.monotonic() < end:
         if os.waitpid(probe, os.WNOHANG)[0]:
             return False

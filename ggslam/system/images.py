@@ -16,10 +16,17 @@ import numpy as np
 
 from ggslam.errors import FormatError, GgslamError
 from ggslam.system.opencv import opencv_errors
-from ggslam.system.untrusted_files import MAX_IMAGE_BYTES, read_untrusted
+from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
-MAX_PIXELS = 100_000_000
-"""Of one image: more than any camera of a recording has, and 300 MB in memory."""
+
+class PictureLimits(Tuning):
+    """A limit on hostile pictures."""
+
+    max_pixels = 100_000_000
+    """Largest picture in pixels: more than any camera of a recording has, and 300 MB in memory."""
+
+
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_START = b"\xff\xd8"
 _FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -28,7 +35,9 @@ _BARE_MARKERS = {0x01, *range(0xD0, 0xD8)}
 """JPEG markers without a length."""
 
 
-def read_picture(path: Path, most_pixels: int = MAX_PIXELS, error: type[GgslamError] = FormatError) -> np.ndarray:
+def read_picture(
+    path: Path, most_pixels: int = PictureLimits.max_pixels, error: type[GgslamError] = FormatError
+) -> np.ndarray:
     """A picture in a file of a run, uint8 [H, W, 3] RGB.
 
     Args:
@@ -49,7 +58,7 @@ def read_image_bytes(path: Path, error: type[GgslamError] = FormatError) -> byte
     Raises:
         error: missing, truncated, damaged, or not an image.
     """
-    content = read_untrusted(path, MAX_IMAGE_BYTES, error)
+    content = read_untrusted(path, FileTuning.max_image_bytes, error)
     damage = find_damage(content)
     if damage:
         raise error(f"{path}: {damage}")
@@ -57,7 +66,11 @@ def read_image_bytes(path: Path, error: type[GgslamError] = FormatError) -> byte
 
 
 def decode_image(
-    place: object, content: bytes, flags: int, most_pixels: int = MAX_PIXELS, error: type[GgslamError] = FormatError
+    place: object,
+    content: bytes,
+    flags: int,
+    most_pixels: int = PictureLimits.max_pixels,
+    error: type[GgslamError] = FormatError,
 ) -> np.ndarray:
     """Image of the bytes of a PNG, JPEG or WebP file, as OpenCV decodes it.
 
@@ -76,7 +89,7 @@ def decode_image(
     if size is None:
         raise error(f"{place}: cannot be decoded as an image: its header tells no size ({len(content)} bytes)")
     width, height = size
-    most = min(most_pixels, MAX_PIXELS)
+    most = min(most_pixels, PictureLimits.max_pixels)
     if width * height > most:
         raise error(f"{place}: claims {width}x{height} pixels; at most {most:,} are read")
     with opencv_errors(place, error):

@@ -14,11 +14,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from ggslam.system.tuning import Tuning
+
 STOPPING = tuple(
     found for name in ("SIGINT", "SIGTERM", "SIGHUP") if (found := getattr(signal, name, None)) is not None
 )
-AGAIN_S = 1.0
-"""Signals that come sooner after the first are the same request: who hangs up sends more than one."""
+
+
+class InterruptTuning(Tuning):
+    """When two signals are one request."""
+
+    again_s = 1.0
+    """Seconds after a signal in which others belong to it: whoever hangs up sends more than one."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -68,7 +75,7 @@ class StopRequest:
             self.number, self._since = number, time.monotonic()
             if self._announce is not None:
                 self._announce("stopping: what there is is saved (once more ends at once)")
-        elif time.monotonic() - self._since > AGAIN_S:
+        elif time.monotonic() - self._since > InterruptTuning.again_s:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
 

@@ -15,9 +15,18 @@ from typing import Any
 
 import yaml
 
-MAX_DEPTH = 32
-MAX_CHARACTERS = 1 << 20
-_KEPT_CHARACTERS = 1 << 16
+from ggslam.system.tuning import Tuning
+
+
+class YamlTuning(Tuning):
+    """Limits on hostile files."""
+
+    max_depth = 32
+    """Deepest nesting."""
+    max_characters = 1 << 20
+    """Longest text, in characters."""
+    kept_characters = 1 << 16
+    """Longest text, in characters, whose content is kept in memory for the next time."""
 
 
 class PlainYamlError(ValueError):
@@ -36,9 +45,9 @@ class _Loader(yaml.SafeLoader):
             event = self.peek_event()
             raise PlainYamlError(f"line {event.start_mark.line + 1}: aliases (*{event.anchor}) are not read")
         self.depth += 1
-        if self.depth > MAX_DEPTH:
+        if self.depth > YamlTuning.max_depth:
             line = self.peek_event().start_mark.line + 1
-            raise PlainYamlError(f"line {line}: nested deeper than {MAX_DEPTH} levels")
+            raise PlainYamlError(f"line {line}: nested deeper than {YamlTuning.max_depth} levels")
         try:
             return super().compose_node(parent, index)
         finally:
@@ -69,10 +78,10 @@ def parse_yaml(text: str) -> Any:
     Raises:
         PlainYamlError: it is none, or not plain; one line.
     """
-    if len(text) > MAX_CHARACTERS:
-        raise PlainYamlError(f"{len(text):,} characters; at most {MAX_CHARACTERS:,} are read")
+    if len(text) > YamlTuning.max_characters:
+        raise PlainYamlError(f"{len(text):,} characters; at most {YamlTuning.max_characters:,} are read")
     # One command asks for a run's settings several times, and reading them takes 20 ms.
-    return copy.deepcopy(_parse_again(text)) if len(text) < _KEPT_CHARACTERS else _parse(text)
+    return copy.deepcopy(_parse_again(text)) if len(text) < YamlTuning.kept_characters else _parse(text)
 
 
 def _parse(text: str) -> Any:

@@ -9,10 +9,23 @@ import resource
 import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-"""Numbers of glibc's `mallopt`."""
-_LARGE = 1 << 18
+from ggslam.system.tuning import Tuning
+
+_TRIM_THRESHOLD: Final = -1
+"""M_TRIM_THRESHOLD of glibc's `mallopt`."""
+_MMAP_THRESHOLD: Final = -3
+"""M_MMAP_THRESHOLD of glibc's `mallopt`."""
+
+
+class MemoryTuning(Tuning):
+    """Which memory is given back early."""
+
+    large_bytes = 1 << 18
+    """Bytes from which an array's memory goes back to the system at once."""
+
+
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
@@ -60,8 +73,8 @@ def release_early() -> None:
     told so (glibc otherwise keeps more and more of them for itself). Costs some time, but not what is computed."""
     adjust = getattr(_c_library(), "mallopt", None)
     if adjust is not None:
-        adjust(_MMAP_THRESHOLD, _LARGE)
-        adjust(_TRIM_THRESHOLD, _LARGE)
+        adjust(_MMAP_THRESHOLD, MemoryTuning.large_bytes)
+        adjust(_TRIM_THRESHOLD, MemoryTuning.large_bytes)
 
 
 def _c_library() -> ctypes.CDLL | None:

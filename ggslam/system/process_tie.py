@@ -7,8 +7,9 @@ import ctypes
 import os
 import signal
 import sys
+from typing import Final
 
-_DIE_WITH_PARENT = 1
+_DIE_WITH_PARENT: Final = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
 
 

@@ -21,15 +21,21 @@ from typing import Any
 
 from ggslam.errors import GgslamError, RunFolderError
 from ggslam.system.atomic import is_machine_error, reason_of, write_text
-from ggslam.system.folder_lock import WAIT_S, folder_lock
+from ggslam.system.folder_lock import LockTuning, folder_lock
 from ggslam.system.links import first_link_in, refuse_link
 from ggslam.system.process_tie import is_running
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted_text
 
 _SAVING = "saving"
 _NAME = re.compile(r"\.staged-(\d+)-[0-9a-f]{8}")
-_WAIT_S = 5.0
-"""For another process that finishes the same saving."""
+
+
+class StagingTuning(Tuning):
+    """How a save waits for another one."""
+
+    wait_s = 5.0
+    """Seconds to wait for another process that finishes the same save."""
 
 
 def new_staging(target: Path) -> Path:
@@ -90,7 +96,7 @@ def publish(staged: Path, target: Path, marker: str, old: Sequence[str], before:
     record = {**before, _SAVING: {"from": staged.name, "stale": stale}}
     with ExitStack() as undone:
         undone.callback(shutil.rmtree, staged, ignore_errors=True)  # a link is not followed
-        with folder_lock(target, wait_s=WAIT_S):
+        with folder_lock(target, wait_s=LockTuning.wait_s):
             _refuse_links(staged, target, marker, stale)
             write_text(target / marker, json.dumps(record, indent=1) + "\n", follow=False)
             undone.pop_all()
@@ -134,7 +140,7 @@ def finish_saving(target: Path, marker: str) -> None:
     if _read_saving(target / marker) is None:
         return
     refuse_link(target / marker)
-    with folder_lock(target, wait_s=_WAIT_S):
+    with folder_lock(target, wait_s=StagingTuning.wait_s):
         record = _read_saving(target / marker)
         if record is None:  # another process was at it
             return

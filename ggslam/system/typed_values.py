@@ -9,17 +9,25 @@ import typing
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
 
 from ggslam.system.array_forms import Between, Form, NotFinite
+from ggslam.system.tuning import Tuning
 
-_LARGEST = 2**53
-"""Of whole numbers: all counters, frames and versions are below, and floats hold them exactly."""
-_FARTHEST = 1e30
-"""Of other numbers: those that float32 holds, with room for sums."""
+_LARGEST: Final = 2**53
+"""Largest whole number that floats hold exactly; all counters, frames and versions are below."""
+
+
+class NumberLimits(Tuning):
+    """A limit on numbers in files."""
+
+    max_number = 1e30
+    """Largest other number: float32 holds it, with room for sums."""
+
+
 Lengths = dict[str, int]
 
 
@@ -123,7 +131,8 @@ def _whole(value: Any) -> str | None:
 
 def _number(value: Any) -> str | None:
     if isinstance(value, float | np.floating):
-        return None if abs(value) <= _FARTHEST else f"expected a number within +-{_FARTHEST:g}, found {value}"
+        most = NumberLimits.max_number
+        return None if abs(value) <= most else f"expected a number within +-{most:g}, found {value}"
     return _whole(value)
 
 

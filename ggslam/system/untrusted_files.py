@@ -11,22 +11,30 @@ import os
 import stat
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 from ggslam.errors import FormatError, GgslamError, MemoryFullError, SequenceError
 from ggslam.system.process_memory import most_memory_bytes
+from ggslam.system.tuning import Tuning
 
-MAX_TEXT_BYTES = 256 << 20
-"""Descriptions, tables and trajectories in text: a trajectory of a day at 30 frames/s has 200 MB."""
-MAX_IMAGE_BYTES = 256 << 20
-"""One image file."""
-_BLOCK = 1 << 20
-_LONGEST_NAME = 255
+
+class FileTuning(Tuning):
+    """Limits on hostile files, and how they are read."""
+
+    max_text_bytes = 256 << 20
+    """Largest text file: a trajectory of a day at 30 frames/s has 200 MB."""
+    max_image_bytes = 256 << 20
+    """Largest image file."""
+    bytes_at_once = 1 << 20
+    """Bytes that are read or written at a time."""
+    shown_characters = 60
+    """Characters of a far too long path that are shown."""
+
+
+_LONGEST_NAME: Final = 255
 """Bytes of a file's name, on all usual file systems."""
-_LONGEST_PATH = 4096
+_LONGEST_PATH: Final = 4096
 """Bytes of a path in Linux, with a zero byte behind it."""
-_SHOWN = 60
-"""Characters of a path that is far too long."""
 
 
 def given_path(path: str | Path, error: type[GgslamError] = SequenceError, where: str = "") -> Path:
@@ -42,7 +50,7 @@ def given_path(path: str | Path, error: type[GgslamError] = SequenceError, where
     """
     text = os.fspath(path)
     shown = f"{where}: " if where else ""
-    shown += repr(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")
+    shown += repr(text if len(text) <= FileTuning.shown_characters else text[: FileTuning.shown_characters] + "...")
     if "\0" in text:
         raise error(f"{shown}: a path cannot have a zero byte")
     try:
@@ -135,7 +143,7 @@ def copy_untrusted(
         with target.open("wb") as copy:
             while left > 0:
                 try:
-                    block = file.read(min(left, _BLOCK))
+                    block = file.read(min(left, FileTuning.bytes_at_once))
                 except OSError as reason:
                     raise error(f"{source}: cannot be read: {reason.strerror or reason}") from None
                 if not block:
@@ -169,7 +177,9 @@ def copy_untrusted_folder(
             copy_untrusted(path, target / path.name, limit, error)
 
 
-def read_untrusted_text(path: str | Path, error: type[GgslamError] = FormatError, limit: int = MAX_TEXT_BYTES) -> str:
+def read_untrusted_text(
+    path: str | Path, error: type[GgslamError] = FormatError, limit: int = FileTuning.max_text_bytes
+) -> str:
     """Text of a file in UTF-8, with or without a byte order mark; line ends become `\\n`.
 
     Raises:

@@ -11,12 +11,12 @@ import sys
 import threading
 from collections.abc import Callable
 from types import FrameType
-from typing import NoReturn
+from typing import Final, NoReturn
 
 from ggslam.system.interrupts import STOPPING
 
-_UNFLUSHED = 120
-"""What Python itself exits with if the last of the output could not be written."""
+_UNFLUSHED: Final = 120
+"""Python's own exit status if the last of the output could not be written."""
 
 
 def run_program(main: Callable[[], object]) -> NoReturn:

@@ -8,14 +8,19 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import AlignmentResult
 from ggslam.tracking.observability import PointSpread
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.shared_features import SharedFeatures
 
-KEPT = 0.8
-"""An alignment has to explain this share of the features that its start does."""
+
+class FeatureHoldTuning(Tuning):
+    """When matched features overrule an alignment."""
+
+    min_kept = 0.8
+    """Smallest share of the features explained by the start that an alignment must explain, too."""
 
 
 def hold_to_features(
@@ -35,11 +40,11 @@ def hold_to_features(
     """
     if found.overlap >= enough_overlap and not found.degenerate:
         return found  # geometry is finer than features, which blur and a late shutter shift
-    if shared.keeps(found.T_world_camera, T_start, KEPT):
+    if shared.keeps(found.T_world_camera, T_start, FeatureHoldTuning.min_kept):
         return found
     if found.degenerate:
         T = follow_weakly(found, T_start, PointSpread.of(points.read(), noise))
-        if shared.keeps(T, T_start, KEPT):
+        if shared.keeps(T, T_start, FeatureHoldTuning.min_kept):
             return replace(found, T_world_camera=T)
     return found if found.overlap >= enough_overlap else replace(found, T_world_camera=T_start.copy())
 

@@ -17,6 +17,7 @@ from ggslam.abi.arrays import address
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.origin import moved_pose
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.observability import PointSpread, about_point, observability
 from ggslam.tracking.photometric import PhotometricPoints, PhotometricReference
 from ggslam.tracking.points import FramePoints
@@ -251,8 +252,11 @@ class AlignmentResult:
         return len(self.weak_directions) > 0
 
 
-PLANE_VARIANCE = 0.02
-"""Variance along the normal of a match of two planes: twice the default thickness. Scales the cost to metres."""
+class GicpTuning(Tuning):
+    """Cost of G-ICP."""
+
+    plane_variance = 0.02
+    """Variance along the normal of a match of two planes: twice the default thickness. It scales the cost to metres."""
 
 
 @dataclass(frozen=True)
@@ -275,7 +279,7 @@ def native_align_settings(
     return structures.AlignSettings(
         settings.translation_tolerance, settings.rotation_tolerance, settings.coarse_kernel_factor,
         noise.constant, noise.square, settings.kernel_constant, settings.kernel_sigmas, settings.overlap_constant,
-        settings.overlap_sigmas, settings.min_normal_dot, PLANE_VARIANCE, settings.coarse_iterations,
+        settings.overlap_sigmas, settings.min_normal_dot, GicpTuning.plane_variance, settings.coarse_iterations,
         settings.fine_iterations, settings.coarse_points, settings.min_matches, photometric_weight, p.huber,
         p.depth_tolerance,
     )  # fmt: skip

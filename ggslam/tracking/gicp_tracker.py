@@ -14,6 +14,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import orthonormalize
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
 from ggslam.tracking.noise import estimate_noise
@@ -24,8 +25,12 @@ from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSetting
 from ggslam.tracking.still_camera import SmallFrame
 from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
 
-MIN_TEXTURED = 200
-"""Textured points from which grey values are trusted."""
+
+class GicpTrackerTuning(Tuning):
+    """When photometric alignment is used."""
+
+    min_textured = 200
+    """Fewest textured points for photometric alignment."""
 
 
 @savable(not_saved="_given_engine")
@@ -215,7 +220,7 @@ class GicpTracker(Tracker):
         if reference is None:
             return None
         points = textured_points(self._shrink(view), settings)
-        return PhotometricPart(points, reference, settings) if len(points) >= MIN_TEXTURED else None
+        return PhotometricPart(points, reference, settings) if len(points) >= GicpTrackerTuning.min_textured else None
 
     def _current_reference(self) -> PhotometricReference | None:
         motion = self.state.motion

@@ -13,19 +13,24 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-WIDTH = 80
-"""Pixels of the small images."""
-LEAST_RESPONSE = 0.3
-"""Of the correlation's peak, in [0, 1]; below it images have too little in common."""
+
+class ImageTurnTuning(Tuning):
+    """Estimate of the camera's rotation from the shift of the image."""
+
+    width = 80
+    """Width, in pixels, of the reduced images."""
+    min_response = 0.3
+    """Smallest peak of the correlation, in [0, 1]. Below it, images have too little in common."""
 
 
 def small_image(color: np.ndarray) -> np.ndarray:
-    """Grey values float32 [h, `WIDTH`] of colour uint8 [H, W, 3]."""
-    height = max(2, round(color.shape[0] * WIDTH / color.shape[1]))
-    return cv2.cvtColor(cv2.resize(color, (WIDTH, height), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY).astype(
-        np.float32
-    )
+    """Grey values float32 [h, `ImageTurnTuning.width`] of colour uint8 [H, W, 3]."""
+    height = max(2, round(color.shape[0] * ImageTurnTuning.width / color.shape[1]))
+    return cv2.cvtColor(
+        cv2.resize(color, (ImageTurnTuning.width, height), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY
+    ).astype(np.float32)
 
 
 def image_turn(before: np.ndarray, now: np.ndarray, camera: Camera) -> np.ndarray:
@@ -38,7 +43,7 @@ def image_turn(before: np.ndarray, now: np.ndarray, camera: Camera) -> np.ndarra
     window = cv2.createHanningWindow((now.shape[1], now.shape[0]), cv2.CV_32F)
     (columns, rows), response = cv2.phaseCorrelate(before, now, window)
     T = np.eye(4)
-    if response >= LEAST_RESPONSE:
+    if response >= ImageTurnTuning.min_response:
         larger = camera.width / now.shape[1]
         yaw, pitch = np.arctan(columns * larger / camera.fx), np.arctan(rows * larger / camera.fy)
         T[:3, :3] = Rotation.from_euler("yx", [yaw, -pitch]).as_matrix().T

@@ -13,17 +13,22 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.system.array_forms import Form, Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.image_turn import image_turn, small_image
 from ggslam.tracking.photometric import PhotometricReference
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import PhotometricSettings, TrackerSettings
 
-GREYS = 6
-"""Frames whose grey values tell what is usual."""
-SUDDEN = 2.0
-"""Images that agree so many times less than usual make a pose doubtful..."""
-SUDDEN_FLOOR = 0.015
-"""...if they differ by this much, in [0, 1]."""
+
+class MotionTuning(Tuning):
+    """When grey values make a pose doubtful."""
+
+    frames = 6
+    """Frames whose grey residuals define the usual one."""
+    sudden_factor = 2.0
+    """Grey residual that makes a pose doubtful, in multiples of the usual one..."""
+    min_sudden = 0.015
+    """...if it is above this value, in [0, 1]."""
 
 
 @savable(not_saved="reference")
@@ -70,13 +75,13 @@ class CameraMotion:
     def is_sudden(self, residual: float) -> bool:
         """Whether images that differ by `residual` agree far less than those of the frames before did: something near
         that moves may have taken the pose along."""
-        if len(self.greys) < GREYS:
+        if len(self.greys) < MotionTuning.frames:
             return False
-        return residual > max(SUDDEN * float(np.median(self.greys)), SUDDEN_FLOOR)
+        return residual > max(MotionTuning.sudden_factor * float(np.median(self.greys)), MotionTuning.min_sudden)
 
     def note_greys(self, residual: float) -> None:
         """The grey values of a located frame differ by so much from the reference."""
-        self.greys = [residual, *self.greys[: GREYS - 1]]
+        self.greys = [residual, *self.greys[: MotionTuning.frames - 1]]
 
     def follow(self, view: FeatureView, T_world_camera: np.ndarray) -> None:
         """A frame was located at `T_world_camera` [4, 4], which becomes its view's pose."""

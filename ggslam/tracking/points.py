@@ -16,10 +16,15 @@ from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, Points32
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import UNBOUNDED, DepthNoise, PointSettings
 
-THICKNESS = 0.01
-"""Of a point's disc along its normal against along the surface: the tracker's planes."""
+
+class PointTuning(Tuning):
+    """Shape of a frame's points."""
+
+    thickness = 0.01
+    """Thickness of a point's disc along its normal, relative to its width."""
 
 
 class PointSource(Protocol):
@@ -190,7 +195,9 @@ def disc_points(points: np.ndarray, normals: np.ndarray, noise: DepthNoise) -> F
     """Points of a frame of which only float32 points and normals [n, 3] were kept; their shapes are discs."""
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
     pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    covariances = np.stack([(i == j) - (1 - THICKNESS) * normals[:, i] * normals[:, j] for i, j in pairs], 1)
+    covariances = np.stack(
+        [(i == j) - (1 - PointTuning.thickness) * normals[:, i] * normals[:, j] for i, j in pairs], 1
+    )
     sigma = noise.constant + noise.square * points[:, 2].astype(float) ** 2
     weights = (noise.sigma(1.0) / sigma) ** 2
     pixels = np.zeros((len(points), 2), np.int32)

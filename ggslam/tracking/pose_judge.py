@@ -13,20 +13,25 @@ from ggslam.features.orb import FeatureView
 from ggslam.geometry.moved_depth import largest_shift
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.feature_hold import hold_to_features
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.seen_before import share_seen_before
 from ggslam.tracking.settings import DepthNoise, RecoverySettings
-from ggslam.tracking.shared_features import JUMP_SLACK, SharedFeatures
+from ggslam.tracking.shared_features import SharedFeatures, SharedFeatureTuning
 
-ALIKE_SHARE = 0.01
-"""Of the image width, by which the image shifts between two starts of which one is enough."""
-LEAST_SEEN = 0.5
-"""Share of a frame that the last views have to show where its overlap is held to that."""
-NEAR_DEPTH = 2.0
-"""Metres at which shifts of the image are judged in deeper scenes: their nearer parts shift most."""
+
+class JudgeTuning(Tuning):
+    """When an alignment is believed."""
+
+    alike_share = 0.01
+    """Starts that shift the image by less than this share of its width are the same."""
+    min_seen = 0.5
+    """Smallest share of a frame that earlier views must show before its overlap is judged against that share."""
+    near_m = 2.0
+    """Depth, in metres, at which image shifts are judged in deeper scenes: their nearer parts shift most."""
 
 
 @dataclass
@@ -78,7 +83,7 @@ class PoseJudge:
         if self.is_wide(turned):
             starts.append(("shift of the image", turned, True))
         for name, pose, coarse in starts:
-            if not any(self._shift(pose, other) < ALIKE_SHARE for other in tried):
+            if not any(self._shift(pose, other) < JudgeTuning.alike_share for other in tried):
                 tried.append(pose)
                 yield name, pose, coarse
 
@@ -88,7 +93,7 @@ class PoseJudge:
 
     def _shift(self, T_one: np.ndarray, T_other: np.ndarray) -> float:
         """By what share of its width the image shifts between two poses [4, 4]."""
-        depth_m = min(self.depth_m or NEAR_DEPTH, NEAR_DEPTH)
+        depth_m = min(self.depth_m or JudgeTuning.near_m, JudgeTuning.near_m)
         return largest_shift(inverse(T_one) @ T_other, self.camera, depth_m) / self.camera.width
 
     # --- witnesses ---------------------------------------------------------------------------------------------------
@@ -132,13 +137,13 @@ class PoseJudge:
 
     def jump(self, T_world_camera: np.ndarray) -> str:
         """Why the path jumps at a pose [4, 4], as far as features were asked; empty if it does not."""
-        return self.features.contradict(T_world_camera, JUMP_SLACK) if self.has_matched else ""
+        return self.features.contradict(T_world_camera, SharedFeatureTuning.jump_slack) if self.has_matched else ""
 
     def _matches_what_was_seen(self, found: AlignmentResult, points: PointSource) -> bool:
         """Whether the overlap is convincing for so much as the last views show of the frame: a fast turn leaves
         little, and its blurred image bears no witness."""
         seen = share_seen_before(points.read(), found.T_world_camera, self.motion.views, self.camera)
-        if seen < LEAST_SEEN or found.overlap < self.settings.convincing_overlap * seen:
+        if seen < JudgeTuning.min_seen or found.overlap < self.settings.convincing_overlap * seen:
             return False
         return not self.jump(found.T_world_camera)
 

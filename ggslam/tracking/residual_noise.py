@@ -8,24 +8,39 @@ They show where a frame is laid onto the surface that frames before have measure
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
 
-EVERY, BEGINNING, LATER = 2, 24, 16
-"""Every so many frames are looked at, up to a frame, and every so many later: on a GPU a look waits for the device."""
-LATEST, FEWEST = 12, 4
-"""So many looks count, the latest ones, and so many there have to be."""
-DISHONEST = 2.5
-"""The noise is taken to be larger when residuals are this many times as large as it, and as the surface's own."""
-SURFACE_SIGMA = 1e-3
-"""Metres by which points of an exact camera miss a surface gathered in voxels."""
-ROOM_DEPTH = 1.25
-"""Metres; voxels of nearer scenes are smaller, and so is what they cost."""
-_MEDIAN_OF_NORMAL = 0.6745
+
+class ResidualNoiseTuning(Tuning):
+    """Measurement of depth noise on tracking residuals."""
+
+    early_stride = 2
+    """One frame in this many is measured at the start of a run."""
+    early_frames = 24
+    """Frames of that start."""
+    late_stride = 16
+    """One frame in this many is measured later: on a GPU, each measurement waits for the device."""
+    latest = 12
+    """Latest measurements that count."""
+    min_measurements = 4
+    """Fewest measurements that noise is estimated from."""
+    max_factor = 2.5
+    """Ratio of residuals to the expected noise from which the expected noise is raised."""
+    surface_sigma_m = 1e-3
+    """Standard deviation, in metres, of exact points from a surface gathered in voxels."""
+    room_depth_m = 1.25
+    """Depth, in metres, below which that deviation shrinks: closer scenes have smaller voxels."""
+
+
+_MEDIAN_OF_NORMAL: Final = 0.6745
+"""Median of the absolute value of a standard normal variable."""
 
 
 @savable()
@@ -47,12 +62,24 @@ class ResidualNoise:
     @property
     def sigma(self) -> float | None:
         """Robust standard deviation in metres of the distances in the latest looks; None: too few so far."""
-        return float(np.median([sigma for _, sigma in self.residuals])) if len(self.residuals) >= FEWEST else None
+        return (
+            float(np.median([sigma for _, sigma in self.residuals]))
+            if len(self.residuals) >= ResidualNoiseTuning.min_measurements
+            else None
+        )
 
     def due(self) -> bool:
         """Whether the next frame is looked at; counts it."""
         self.frames += 1
-        return self.frames % (EVERY if self.frames <= BEGINNING else LATER) == 0
+        return (
+            self.frames
+            % (
+                ResidualNoiseTuning.early_stride
+                if self.frames <= ResidualNoiseTuning.early_frames
+                else ResidualNoiseTuning.late_stride
+            )
+            == 0
+        )
 
     def observe(self, points: FramePoints, squared_distances: np.ndarray, noise: DepthNoise) -> DepthNoise:
         """The noise that agrees with the residuals so far: the one given, or a larger one of the same shape.
@@ -66,12 +93,19 @@ class ResidualNoise:
         if matched.sum() < 100:
             return noise
         sigma = float(np.sqrt(np.median(squared_distances[matched]))) / _MEDIAN_OF_NORMAL
-        self.residuals = [*self.residuals[1 - LATEST :], (float(np.median(points.z[matched])), sigma)]
-        if len(self.residuals) < FEWEST:
+        self.residuals = [
+            *self.residuals[1 - ResidualNoiseTuning.latest :],
+            (float(np.median(points.z[matched])), sigma),
+        ]
+        if len(self.residuals) < ResidualNoiseTuning.min_measurements:
             return noise
-        ratios = [sigma / max(noise.sigma(z), SURFACE_SIGMA * min(1, z / ROOM_DEPTH)) for z, sigma in self.residuals]
+        ratios = [
+            sigma
+            / max(noise.sigma(z), ResidualNoiseTuning.surface_sigma_m * min(1, z / ResidualNoiseTuning.room_depth_m))
+            for z, sigma in self.residuals
+        ]
         factor = float(np.median(ratios))
-        if factor < DISHONEST:
+        if factor < ResidualNoiseTuning.max_factor:
             return noise
         depth, found = (float(np.median(values)) for values in zip(*self.residuals, strict=True))
         self.residuals = []

@@ -12,12 +12,17 @@ import numpy as np
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget, PhotometricPart, align
 from ggslam.tracking.points import FramePoints, PointSource, check_depth, extract_points
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings
 
-FEWEST_SHARE = 0.1
-"""Of the points of the camera that has most: one with fewer does not tell how well the rig was located."""
+
+class RigEngineTuning(Tuning):
+    """How a rig is located."""
+
+    min_share = 0.1
+    """Fewest points of a camera that is judged, as a share of the points of the camera that has most."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class RigTrackingEngine:
             settings, noise: it was made with.
         """
         most = max(map(len, self.parts), default=0)
-        needed = max(settings.min_matches, FEWEST_SHARE * most)
+        needed = max(settings.min_matches, RigEngineTuning.min_share * most)
         squared, shares, begin = found.matches.read().squared_distances, list[float | None](), 0
         for part in self.parts:
             limit = settings.overlap_constant + settings.overlap_sigmas * (noise.constant + noise.square * part.z**2)

@@ -6,11 +6,16 @@ from __future__ import annotations
 import numpy as np
 
 from ggslam.system.settings import Conflict, setting, settings_class
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.points import FramePoints
 
-_THICKNESS = 0.01
-"""Variance of a point in every direction, in the unit of `TargetSettings.min_thickness`: a match with a plane then
-counts the distance to the plane."""
+
+class ScanPointTuning(Tuning):
+    """Shape of a scan's points."""
+
+    thickness = 0.01
+    """Variance of a point in every direction, in the unit of `TargetSettings.min_thickness`. A match with a plane then
+    measures the distance to the plane."""
 
 
 @settings_class(frozen=True)
@@ -47,7 +52,7 @@ def scan_points(points: np.ndarray, settings: ScanSettings) -> FramePoints:
     _, first = np.unique((cells[:, 0] * span + cells[:, 1]) * span + cells[:, 2], return_index=True)
     chosen = within[np.sort(first)]
     count = len(chosen)
-    shape = np.tile(np.array([1, 0, 0, 1, 0, 1], np.float32) * np.float32(_THICKNESS), (count, 1))
+    shape = np.tile(np.array([1, 0, 0, 1, 0, 1], np.float32) * np.float32(ScanPointTuning.thickness), (count, 1))
     return FramePoints(
         points[chosen], -points[chosen] / distance[chosen, None], shape, np.zeros((count, 2), np.int32),
         np.ones(count, np.float32),

@@ -5,15 +5,15 @@ resolution and the distance of the scene."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 from ggslam.features.orb import FeatureSettings
 from ggslam.system.savable import savable
 from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
 
 PhotometricMode = Literal["never", "degenerate", "auto", "always"]
-UNBOUNDED = 1e9
-"""A weight that no point has: the nearest, at 0.1 m, is 10^4 times that at 1 m at most."""
+UNBOUNDED: Final = 1e9
+"""A weight that no point has: the closest, at 0.1 m, has at most 10^4 times the weight of one at 1 m."""
 
 
 @savable()

@@ -13,20 +13,28 @@ import numpy as np
 
 from ggslam.features.orb import FeaturePose, FeatureSettings, FeatureView, ViewMatches, match_views
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 
-CONTRADICTED_BELOW = 0.4
-"""A pose is contradicted if it explains less than this share of the features shared with the last located frame, and
-less than this share of what another pose explains."""
-JUMP_SLACK = 3.0
-"""Features this many limits off contradict a pose for good: in fast turns colour and depth that are out of step differ
-by less."""
-VOUCHED_SHARE, VOUCHED_TIMES = 0.5, 3
-"""Features vouch for a pose that explains this share of those shared with a view, and so many times the number that
-makes a pose..."""
-VOUCHED_CELLS, CELLS = 4, 4
-"""...in so many parts of the image, which has `CELLS` x `CELLS`: those on one thing that moves vouch for nothing."""
-CLEARLY_FEWER = 0.7
-"""Of two poses one is preferred if the other explains less than this share of what it does."""
+
+class SharedFeatureTuning(Tuning):
+    """When features confirm or contradict a pose."""
+
+    contradicted_below = 0.4
+    """Share of the features shared with the last located frame, and of those explained by another pose, below which a
+    pose is contradicted."""
+    jump_slack = 3.0
+    """Distance of a feature, in limits, that contradicts a pose also in a fast turn, when colour and depth are out of
+    step."""
+    confirmed_share = 0.5
+    """Smallest share of the features shared with a view that a confirmed pose explains."""
+    confirmed_factor = 3
+    """Fewest features that a confirmed pose explains, in multiples of those that make a pose..."""
+    confirmed_cells = 4
+    """...in at least this many parts of the image, so that one moving thing confirms nothing."""
+    cells = 4
+    """Parts of the image along each axis."""
+    clearly_fewer = 0.7
+    """A pose is clearly worse if it explains less than this share of the features that another explains."""
 
 
 class SharedFeatures:
@@ -75,10 +83,10 @@ class SharedFeatures:
             return ""
         shared, needed = self._match(0), 2 * self._settings.min_inliers
         found = shared.count_explained(T_world_camera, self._camera, self._settings, slack)
-        if len(shared) < needed or found >= CONTRADICTED_BELOW * len(shared):
+        if len(shared) < needed or found >= SharedFeatureTuning.contradicted_below * len(shared):
             return ""
         best = self._pose(0)
-        if best is None or best.inliers < needed or found >= CONTRADICTED_BELOW * best.inliers:
+        if best is None or best.inliers < needed or found >= SharedFeatureTuning.contradicted_below * best.inliers:
             return ""
         return (
             f"{found} of {len(shared)} features shared with the last frame lie where this pose has them, "
@@ -93,16 +101,24 @@ class SharedFeatures:
     @property
     def could_vouch(self) -> bool:
         """Whether enough is shared with the last view to vouch for a pose."""
-        return bool(self._earlier) and len(self._match(0)) >= VOUCHED_TIMES * self._settings.min_inliers
+        return (
+            bool(self._earlier)
+            and len(self._match(0)) >= SharedFeatureTuning.confirmed_factor * self._settings.min_inliers
+        )
 
     def _vouches(self, shared: ViewMatches, T_world_camera: np.ndarray) -> bool:
         explained = shared.which_agree(T_world_camera, self._camera, self._settings)
-        needed = max(VOUCHED_TIMES * self._settings.min_inliers, VOUCHED_SHARE * len(shared))
+        needed = max(
+            SharedFeatureTuning.confirmed_factor * self._settings.min_inliers,
+            SharedFeatureTuning.confirmed_share * len(shared),
+        )
         if explained.sum() < needed:
             return False
         size = (self._camera.width, self._camera.height)
-        cells = np.floor(shared.pixels[explained] / size * CELLS).clip(0, CELLS - 1) @ (CELLS, 1)
-        return len(np.unique(cells)) >= VOUCHED_CELLS
+        cells = np.floor(shared.pixels[explained] / size * SharedFeatureTuning.cells).clip(
+            0, SharedFeatureTuning.cells - 1
+        ) @ (SharedFeatureTuning.cells, 1)
+        return len(np.unique(cells)) >= SharedFeatureTuning.confirmed_cells
 
     def keeps(self, T_world_camera: np.ndarray, T_start: np.ndarray, share: float) -> bool:
         """Whether a pose [4, 4] explains a share of what its start does, of what was matched so far."""
@@ -116,6 +132,8 @@ class SharedFeatures:
         """Whether one pose [4, 4] explains clearly more of the features than another; None: there is no clear
         difference."""
         one, other = self._count(self._all(), T_one), self._count(self._all(), T_other)
-        if max(one, other) < self._settings.min_inliers or min(one, other) >= CLEARLY_FEWER * max(one, other):
+        if max(one, other) < self._settings.min_inliers or min(one, other) >= SharedFeatureTuning.clearly_fewer * max(
+            one, other
+        ):
             return None
         return one > other

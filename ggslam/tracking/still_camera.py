@@ -9,37 +9,54 @@ their number all over the image, and their depth.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
 
 from ggslam.system.array_forms import DepthImage, Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import DepthNoise
 
-WIDTH = 160
-"""Pixels of the images that are compared."""
-LEAST_GRADIENT = 6.0
-"""Grey levels per pixel from which a pixel is textured."""
-FEWEST, MOST = 150, 2500
-"""Textured pixels that tell anything, and of more so many are looked at."""
-LARGEST_FLOW = 0.5
-"""Pixels by which a textured pixel moves, across its edge, that may not have moved at all."""
-LARGEST_SHIFT = 0.03
-"""Pixels by which all of them may have shifted on the average, turned (at the image's corner) or come closer."""
-CELLS, CELL_PIXELS = 4, 8
-"""The image has `CELLS` x `CELLS` parts, of which those count that have so many textured pixels..."""
-STILL_CELLS, STILL_SHARE = 0.5, 0.5
-"""...and such a share of them has to stand still: such a share of its pixels."""
-WAYS = ((1.0, 0.0), (0.7071, 0.7071), (0.0, 1.0), (-0.7071, 0.7071))
-"""Directions in the image; along each..."""
-ACROSS, FEWEST_ACROSS = 0.7, 50
-"""...motion is told by pixels whose gradient lies along it to this share; there must be so many, and `STILL_SHARE` of
-them has to stay: edges along a motion stay, however far it goes."""
-STILL_DEPTH, DEPTH_SIGMAS = 0.6, 4.0
-"""Share of the pixels that stand still whose depth stays, within so many standard deviations."""
-MOSTLY = 0.5
-"""Share of a run's frames from which it is said that the camera stands still."""
+
+class StillTuning(Tuning):
+    """When the camera stands still."""
+
+    width = 160
+    """Width, in pixels, of the compared images."""
+    min_gradient = 6.0
+    """Smallest gradient of a textured pixel, in grey levels per pixel."""
+    min_pixels = 150
+    """Fewest textured pixels of a decision."""
+    max_pixels = 2500
+    """Most textured pixels that are compared."""
+    max_flow_pixels = 0.5
+    """Largest flow, in pixels across its edge, of a textured pixel that may be still."""
+    max_shift_pixels = 0.03
+    """Largest mean shift of all pixels, in pixels: sideways, by rotation at the image corner, or by approach."""
+    cells = 4
+    """Parts of the image along each axis."""
+    min_cell_pixels = 8
+    """Fewest textured pixels of a part that counts."""
+    min_still_cells = 0.5
+    """Smallest share of these parts that must be still."""
+    min_still_share = 0.5
+    """Smallest share of still pixels in a still part, and along each direction."""
+    across = 0.7
+    """Smallest component along a direction of the unit gradient of a pixel that tells about motion along it."""
+    min_across = 50
+    """Fewest such pixels for each direction. Edges along a motion look still however fast it is."""
+    min_still_depth = 0.6
+    """Smallest share of the still pixels whose depth is unchanged."""
+    depth_sigmas = 4.0
+    """Largest change of unchanged depth, in standard deviations."""
+    mostly = 0.5
+    """Share of a run's frames from which the camera is reported as still."""
+
+
+WAYS: Final = ((1.0, 0.0), (0.7071, 0.7071), (0.0, 1.0), (-0.7071, 0.7071))
+"""Unit vectors of the four directions in the image along which motion is tested."""
 
 
 @savable()
@@ -53,7 +70,7 @@ class SmallFrame:
     @staticmethod
     def of(color: np.ndarray, depth: np.ndarray) -> SmallFrame:
         """Of colour uint8 [H, W, 3] and depth float32 [H, W]."""
-        size = (WIDTH, max(2, round(color.shape[0] * WIDTH / color.shape[1])))
+        size = (StillTuning.width, max(2, round(color.shape[0] * StillTuning.width / color.shape[1])))
         grey = cv2.cvtColor(cv2.resize(color, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
         return SmallFrame(grey.astype(np.float32), cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST))
 
@@ -97,39 +114,44 @@ def is_still(anchor: SmallFrame, now: SmallFrame, noise: DepthNoise) -> bool:
         return False
     smooth = cv2.GaussianBlur(anchor.grey, (3, 3), 0.7)
     gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
-    rows, columns = np.nonzero((gx * gx + gy * gy > LEAST_GRADIENT**2) & (anchor.depth > 0) & (now.depth > 0))
-    if len(rows) < FEWEST:
+    rows, columns = np.nonzero((gx * gx + gy * gy > StillTuning.min_gradient**2) & (anchor.depth > 0) & (now.depth > 0))
+    if len(rows) < StillTuning.min_pixels:
         return False
-    step = max(1, len(rows) // MOST)
+    step = max(1, len(rows) // StillTuning.max_pixels)
     rows, columns = rows[::step], columns[::step]
     gx, gy = gx[rows, columns], gy[rows, columns]
     difference = cv2.GaussianBlur(now.grey, (3, 3), 0.7)[rows, columns] - smooth[rows, columns]
     slope = np.hypot(gx, gy)
-    stays = np.abs(difference - np.median(difference)) < LARGEST_FLOW * slope
+    stays = np.abs(difference - np.median(difference)) < StillTuning.max_flow_pixels * slope
     if not (_is_all_over(rows, columns, stays, anchor.grey.shape) and _stays_each_way(gx / slope, gy / slope, stays)):
         return False
     shifts = _shifts(rows, columns, gx, gy, smooth[rows, columns], difference, stays, anchor.grey.shape)
-    if shifts is None or np.abs(shifts).max() > LARGEST_SHIFT:
+    if shifts is None or np.abs(shifts).max() > StillTuning.max_shift_pixels:
         return False
     before, after = anchor.depth[rows, columns][stays], now.depth[rows, columns][stays]
-    same = np.abs(after - before) < DEPTH_SIGMAS * (noise.constant + noise.square * before * before) + 1e-3
-    return bool(same.mean() >= STILL_DEPTH)
+    same = np.abs(after - before) < StillTuning.depth_sigmas * (noise.constant + noise.square * before * before) + 1e-3
+    return bool(same.mean() >= StillTuning.min_still_depth)
 
 
 def _is_all_over(rows: np.ndarray, columns: np.ndarray, stays: np.ndarray, shape: tuple[int, ...]) -> bool:
     """Whether pixels that stay are most of the textured ones in most parts of the image."""
-    cells = rows * CELLS // shape[0] * CELLS + columns * CELLS // shape[1]
-    textured = np.bincount(cells, minlength=CELLS**2)
-    still = np.bincount(cells[stays], minlength=CELLS**2)
-    counted = textured >= CELL_PIXELS
-    return bool(counted.sum() >= CELLS and (still[counted] >= STILL_SHARE * textured[counted]).mean() >= STILL_CELLS)
+    cells = rows * StillTuning.cells // shape[0] * StillTuning.cells + columns * StillTuning.cells // shape[1]
+    textured = np.bincount(cells, minlength=StillTuning.cells**2)
+    still = np.bincount(cells[stays], minlength=StillTuning.cells**2)
+    counted = textured >= StillTuning.min_cell_pixels
+    return bool(
+        counted.sum() >= StillTuning.cells
+        and (still[counted] >= StillTuning.min_still_share * textured[counted]).mean() >= StillTuning.min_still_cells
+    )
 
 
 def _stays_each_way(x: np.ndarray, y: np.ndarray, stays: np.ndarray) -> bool:
     """Whether, for each direction in the image, most of the pixels stay that would show a motion along it; `x`, `y`:
     unit gradients."""
-    telling = [np.abs(x * way[0] + y * way[1]) >= ACROSS for way in WAYS]
-    return all(one.sum() >= FEWEST_ACROSS and stays[one].mean() >= STILL_SHARE for one in telling)
+    telling = [np.abs(x * way[0] + y * way[1]) >= StillTuning.across for way in WAYS]
+    return all(
+        one.sum() >= StillTuning.min_across and stays[one].mean() >= StillTuning.min_still_share for one in telling
+    )
 
 
 def _shifts(
@@ -150,15 +172,15 @@ def _shifts(
     slope = np.maximum(np.hypot(gx, gy), 1e-3)
     agree = stays
     for _ in range(3):
-        if agree.sum() < FEWEST:
+        if agree.sum() < StillTuning.min_pixels:
             return None
         found = np.linalg.lstsq(A[agree].T @ A[agree], A[agree].T @ difference[agree], rcond=None)[0]
-        agree = stays & (np.abs(difference - A @ found) < LARGEST_FLOW / 2 * slope)
+        agree = stays & (np.abs(difference - A @ found) < StillTuning.max_flow_pixels / 2 * slope)
     return found[:4]
 
 
 def still_notes(still: int, frames: int) -> list[str]:
     """What the user should know of a run of so many frames, in so many of which the camera stood still."""
-    if still < MOSTLY * frames:
+    if still < StillTuning.mostly * frames:
         return []
     return [f"the camera stands still in {still} of {frames} frames: its pose is held in them"]

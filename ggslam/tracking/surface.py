@@ -25,14 +25,22 @@ from ggslam.scene.keyframe_poses import KeyframePoses
 from ggslam.scene.poses import transform_points
 from ggslam.system.array_forms import Form, PoseForm, check_arrays, check_indices
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import TargetSettings
 
-SPACING = 3.0 / 200.0
-"""Standard deviation of a point's disc along the surface at 1 m depth; weights go with its inverse square."""
-FLATNESS = 0.1
-_OPACITY_LOGIT = 3.0
+
+class SurfaceTuning(Tuning):
+    """Shape of the points of the tracked surface."""
+
+    spacing = 3.0 / 200.0
+    """Standard deviation of a point's disc along the surface, as a share of its depth. Weights go with its inverse
+    square."""
+    flatness = 0.1
+    """Thickness of the disc relative to its width."""
+    opacity_logit = 3.0
+    """Opacity of the points, as a logit."""
 
 
 _SAVED = {
@@ -294,10 +302,12 @@ class MeasuredSurface:
             rows, own = slice(begin, begin + part.count), part.points
             points[rows] = transform_points(own, T)
             quaternions[rows] = quaternions_from_normals(part.normals @ T[:3, :3].T)
-            log_scales[rows] = np.log(SPACING * own[:, 2])[:, None] + np.log([1.0, 1.0, FLATNESS])
+            shape = np.log([1.0, 1.0, SurfaceTuning.flatness])
+            log_scales[rows] = np.log(SurfaceTuning.spacing * own[:, 2])[:, None] + shape
             begin += part.count
+        opacity_logits = np.full(count, SurfaceTuning.opacity_logit, np.float32)
         return GicpTarget.from_arrays(
-            points, quaternions, log_scales, np.full(count, _OPACITY_LOGIT, np.float32), self.settings, self._context,
+            points, quaternions, log_scales, opacity_logits, self.settings, self._context,
             base=base, finish=self.finish, like=like,
         )  # fmt: skip
 

@@ -32,7 +32,7 @@ from timing import seconds
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_levels import coarser, merge
-from ggslam.formats.streamed_sog import LEVEL_RATIO
+from ggslam.formats.streamed_sog import StreamedSogTuning
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.camera import Camera
@@ -152,7 +152,8 @@ def main() -> None:
     print("| level | distance m | method | Gaussians | PSNR dB | against all Gaussians dB | seconds |")
     print("|" + " --- |" * 7)
     for level in MODEL_LEVELS:
-        distance, count = FIRST_DISTANCE * STEP ** (level - 0.5), -(-len(columns) // LEVEL_RATIO**level)
+        distance = FIRST_DISTANCE * STEP ** (level - 0.5)
+        count = -(-len(columns) // StreamedSogTuning.level_ratio**level)
         images = [wanted(whole, camera, view, distance) for view in views]
         for name, method in methods.items():
             few = method(count)

@@ -37,7 +37,7 @@ from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.config import load_config
 from ggslam.slam.result import SlamResult
 from ggslam.slam.slam import Slam
-from ggslam.synthetic import FRAMES_WITH_MOVERS, MOVERS, write_synthetic_sequence
+from ggslam.synthetic import MOVERS, SynthTuning, write_synthetic_sequence
 
 FEWEST_PIXELS = 30
 """Of a mover at half size: fewer are not asked for."""
@@ -254,7 +254,7 @@ def bench_generated(count: int, more: list[str], stop: int | None) -> None:
         with tempfile.TemporaryDirectory() as folder:
             path, twin = Path(folder) / "busy", Path(folder) / "still"
             write_synthetic_sequence(path, seed=seed, movers=MOVERS)
-            write_synthetic_sequence(twin, seed=seed, frames=FRAMES_WITH_MOVERS)
+            write_synthetic_sequence(twin, seed=seed, frames=SynthTuning.frames_with_movers)
             print(f"\nroom {seed}")
             bench_movers(path, twin, more, stop)
 

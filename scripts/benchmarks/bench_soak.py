@@ -36,8 +36,8 @@ from ggslam.slam.slam import Slam
 from ggslam.slam.step_log import COLUMNS
 from ggslam.synthetic import SCENES, RayCaster, camera_path
 from ggslam.synthetic.sensor import noisy_color, noisy_depth
-from ggslam.synthetic.trajectory import SEEN_AGAIN
-from ggslam.synthetic.writer import FOCAL_LENGTH
+from ggslam.synthetic.trajectory import PathTuning
+from ggslam.synthetic.writer import SynthTuning
 from ggslam.system.process_memory import resident_bytes, trim
 
 TRAINING_PARTS = ("forward_ms", "loss_ms", "backward_ms", "identity_ms")
@@ -58,11 +58,12 @@ class Rounds:
         self, scene: str, frames: int, width: int, height: int, seed: int = 0, keep: Path | None = None
     ) -> None:
         kind = SCENES[scene]
-        focal = FOCAL_LENGTH * width
+        focal = SynthTuning.focal * width
         self.camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         self.rate, self._seed = kind.frame_rate, seed
         built = kind.build(seed, frames)
-        again = SEEN_AGAIN if kind.trajectory == "route" else 0.0  # a route walks part of itself twice: not here
+        # A route walks part of itself twice: not here.
+        again = PathTuning.seen_again if kind.trajectory == "route" else 0.0
         poses = camera_path(built, round(frames * (1 + again)), kind.trajectory, seed)[:frames]
         self.poses = poses
         if keep is not None and keep.exists():

@@ -86,7 +86,7 @@ FAULTS = (
           "if values is None or _kind(values) != count:", "if values is None:", ("sequences/test_pose_files.py",)),
     Fault("scores", "ggslam/evaluation/trajectory.py", "rpe_rot_deg=float(np.rad2deg(_rms(rotation))),",
           "rpe_rot_deg=float(_rms(rotation)),", ("evaluation/test_trajectory_scores.py",)),
-    Fault("records", "ggslam/runs/records/mark.py", '"complete": self.stopped_by is None and not missing',
+    Fault("records", "ggslam/runs/records/run_json.py", '"complete": self.stopped_by is None and not missing',
           '"complete": True', ("cli/test_run.py::test_truncated_png_stops_the_run_but_keeps_what_was_done",)),
     Fault("settings", "ggslam/slam/config.py", "sh_degree: int = setting(0, 0, 3,",
           "sh_degree: int = setting(0, 0, 5,", ("slam/test_config.py",)),

@@ -16,6 +16,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ggslam.scene.frame import Frame
+    from ggslam.slam.result import StepReport
 
 MEMORY_BYTES = 4 << 30
 """Of address space that a command may take beyond what this process has."""
@@ -226,11 +233,11 @@ def _in_child(words: list[str], said: Path, after: Hook | None, memory: int) -> 
 def _watch_frames(after: Hook) -> None:
     from ggslam.slam.slam import Slam
 
-    real = Slam.step
+    real = Slam.step_together
 
-    def step(slam: Slam, frame: object) -> object:
-        report = real(slam, frame)  # type: ignore[arg-type]
-        after(report.frame.frame_index)
-        return report
+    def step_together(slam: Slam, frames: Sequence[Frame]) -> list[StepReport]:
+        reports = real(slam, frames)
+        after(reports[-1].frame.frame_index)
+        return reports
 
-    Slam.step = step  # type: ignore[method-assign,assignment]
+    Slam.step_together = step_together  # type: ignore[method-assign]

@@ -37,16 +37,17 @@ import ggslam.jobs.run.pipeline  # noqa: E402, F401
 FRAMES = 14
 HEAD = """# Faults
 
-What goes wrong, the line of ggslam's answer that matters (shortened), the exit code, and what of the work in progress
-is kept. Existing files stay as they are wherever the last column does not say otherwise. Every row happened, in its own
-folder (here `.`): the page is written by `python scripts/tools/fault_table.py --markdown docs/faults.md`.
+What goes wrong, the line of ggslam's answer that matters (shortened), the exit code, and what is kept of the work.
+Existing files are untouched wherever nothing else is said. Every fault happened, in a folder of its own (here `.`):
+`python scripts/tools/fault_table.py --markdown docs/faults.md` writes this page.
 
-Exit codes: 0 done (3 with `--strict` where something seems wrong), 1 this machine's fault or ours, or most frames were
-lost, 2 the input's fault, 128 + n after signal n, -9 after a kill. After a kill the line is that of the command that
-goes on.
+Exit codes: 0 done (3 with `--strict` where something seems wrong), 1 the machine's fault or ours, or most frames were
+lost, 2 the input's fault, 128 + n after signal n, -9 after a kill, where the line is that of the command that goes on.
 """
-MOST = 84
+MOST = 52
 """Characters of a message on the page."""
+FEWEST = 3
+"""Faults that a section of the page is made for."""
 
 
 def make_inputs(folder: Path) -> tuple[Path, Path]:
@@ -77,8 +78,10 @@ def happen(name: str, folder: Path, recording: Path, run: Path) -> Row | None:
 
 
 def brief(said: str) -> str:
-    """What a message says, without its kind, the folder of the fault and remarks in brackets; cut off between words."""
-    words = re.sub(r" \([^()]*\)", "", said.removeprefix("error: ")).replace("./recording/", "").split()
+    """What a message says, without its kind, the file that the fault names, and remarks; cut off between words."""
+    text = re.sub(r"^(\./\S+|[\w/]+\.\w+):? ", "", said.removeprefix("error: "))
+    text = re.sub(r"cannot write \S+:", "cannot write:", re.sub(r" \([^()]*\)", "", text)).replace("./recording/", "")
+    words = text.split()
     short = words[:1]
     for word in words[1:]:
         if len(" ".join([*short, word])) > MOST:
@@ -87,26 +90,36 @@ def brief(said: str) -> str:
     return " ".join(short)
 
 
-def cell(text: str) -> str:
-    """Text for a Markdown table."""
-    return text.replace("|", "\\|").replace("<", "&lt;")
+def kept(row: Row) -> str:
+    """What was kept besides existing files, and what was bad."""
+    parts = row.kept.split("; ")
+    words = "; ".join(re.sub(r"^an? (\w+ )run of", r"\1run,", part) for part in parts if part != UNTOUCHED)
+    if UNTOUCHED not in parts:
+        words += ", but an existing file has changed"
+    return words + (f" **{', '.join(row.problems)}**" if row.problems else "")
 
 
 def table(rows: list[Row]) -> str:
+    """A row of a Markdown table for each fault."""
     lines = ["| fault | message | exit | kept |", "|---|---|---|---|"]
-    for row in rows:
-        parts = row.kept.split("; ")
-        kept = "; ".join(part for part in parts if part != UNTOUCHED)
-        if UNTOUCHED not in parts:
-            kept += " (an existing file has changed)"
-        bad = f" **{', '.join(row.problems)}**" if row.problems else ""
-        lines.append(f"| {row.fault} | {cell(brief(row.said))} | {row.code} | {cell(kept + bad)} |")
+    lines += [f"| {row.fault} | {row.said} | {row.code} | {kept(row)} |" for row in rows]
     return "\n".join(lines)
 
 
 def page(rows: list[Row]) -> str:
-    """The table as a page of docs."""
-    return f"{HEAD}\n{table(rows)}\n"
+    """A page of docs: a section for every outcome that several faults have, and one for the others."""
+    outcomes: dict[tuple[int, str], dict[str, list[str]]] = {}
+    for row in rows:
+        outcomes.setdefault((row.code, kept(row)), {}).setdefault(brief(row.said), []).append(row.fault)
+    sections, others = [HEAD], []
+    for (code, what), said in outcomes.items():
+        lines = [f"- {'; '.join(faults)}: *{text.replace('<', '&lt;')}*" for text, faults in said.items()]
+        if sum(len(faults) for faults in said.values()) >= FEWEST:
+            sections += [f"## Exit code {code}, {'kept: ' if what else 'nothing new is written'}{what}\n", *lines, ""]
+        else:
+            others += [f"{line} (exit {code}{'; kept: ' if what else ''}{what})" for line in lines]
+    sections += ["## Other outcomes\n", *others] if others else []
+    return "\n".join(sections).rstrip() + "\n"
 
 
 def write(rows: list[Row], markdown: Path | None, records: Path | None) -> None:

@@ -13,7 +13,7 @@ from command_line import ggslam
 
 from ggslam.cli.console import PlainConsole
 from ggslam.errors import CoreMemoryError, FormatError, GgslamError, InputError, plain
-from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.system.staging import new_staging, publish
 
 ERROR = OSError(errno.ENOSPC, "No space left on device", "runs/a/.staged-12-0123abcd/map.ply")

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ggslam.coding import AttributeSettings, CodecSettings, block_encoder, decode_cloud, encode_cloud
-from ggslam.coding.block_encoder import Block, encode_blocks
+from ggslam.coding import AttributeSettings, CodecSettings, decode_cloud, encode_cloud
+from ggslam.coding.block_encoder import Block, BlockTuning, encode_blocks
 from ggslam.coding.decoder import decode_in_parts
 from ggslam.errors import ConfigError, FormatError
+from ggslam.system.tuning import overridden
 
 IDS = {"id": AttributeSettings(lossless=True)}
 
@@ -37,8 +38,9 @@ def blocks(points: np.ndarray, attributes: dict[str, np.ndarray], size: int) -> 
 
 
 @pytest.fixture(autouse=True)
-def _small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(block_encoder, "_ROWS", 700)
+def _small_blocks() -> Iterator[None]:
+    with overridden(BlockTuning, rows_at_once=700):
+        yield
 
 
 @pytest.mark.parametrize(

@@ -6,14 +6,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ggslam.coding.quantization import ROUNDING, Quantization
+from ggslam.coding.quantization import Quantization, QuantizationTuning
 
 ORIGIN, SIZE = (-5, 0, 2), (40, 100, 70)
 
 
 def expected(points: np.ndarray, scale: float) -> np.ndarray:
     exact = scale == 1 and np.issubdtype(points.dtype, np.integer)
-    whole = points.astype(np.int64) if exact else np.floor(points.astype(np.float64) * scale + 0.5 + ROUNDING)
+    whole = (
+        points.astype(np.int64)
+        if exact
+        else np.floor(points.astype(np.float64) * scale + 0.5 + QuantizationTuning.rounding)
+    )
     return np.clip(whole - ORIGIN, 0, np.array(SIZE) - 1).astype(np.int32)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from ggslam.coding import CodecSettings, decode_cloud, encode_cloud
 from ggslam.coding.container import UnitType, unit_bytes
-from ggslam.coding.quantization import ROUNDING, Quantization, choose_quantization
+from ggslam.coding.quantization import Quantization, QuantizationTuning, choose_quantization
 from ggslam.coding.stream import read_stream
 from ggslam.coding.user_data import write_user_data
 from ggslam.errors import ConfigError, FormatError
@@ -42,7 +42,7 @@ def test_error_is_half_a_voxel_at_most(metres: np.ndarray, bits: int) -> None:
     assert np.ptp(metres, 0).max() / edge == pytest.approx(2**bits - 1)
     for axis in range(3):
         error = np.abs(np.sort(cloud.points[:, axis]) - np.sort(metres[:, axis]))
-        assert error.max() <= edge * (0.5 + ROUNDING + 1e-6)
+        assert error.max() <= edge * (0.5 + QuantizationTuning.rounding + 1e-6)
     assert cloud.quantization.metres
 
 

@@ -13,10 +13,9 @@ from ggslam.coding import AttributeSettings, CodecSettings, PointCloud, decode_c
 from ggslam.coding.container import UnitType, read_units
 from ggslam.coding.least_rotations import least_rotations
 from ggslam.coding.splats import (
-    POSITION_BITS,
     RANGES,
     RATES,
-    VALUE_BITS,
+    SplatCodingTuning,
     gaussians_of,
     is_splat_cloud,
     means_of,
@@ -141,7 +140,8 @@ def test_the_finest_quantiser_keeps_parameters_within_steps(degree: int) -> None
     decoded, rows = gaussians_of(cloud), rows_in_order_of_decoding(gaussians, cloud)
     assert decoded.sh_degree == degree
     extent = float((gaussians.means.amax(0) - gaussians.means.amin(0)).max())
-    assert (decoded.means - gaussians.means[rows]).abs().max() < 0.51 * extent / ((1 << POSITION_BITS) - 1) + 1e-6
+    step = extent / ((1 << SplatCodingTuning.position_bits) - 1)
+    assert (decoded.means - gaussians.means[rows]).abs().max() < 0.51 * step + 1e-6
     rest = rest_range([gaussians])
     pairs = {"sh": (decoded.sh[:, :1], gaussians.sh[rows, :1]), "rest": (decoded.sh[:, 1:], gaussians.sh[rows, 1:]),
              "opacity": (decoded.opacity_logits, gaussians.opacity_logits[rows]),
@@ -150,7 +150,7 @@ def test_the_finest_quantiser_keeps_parameters_within_steps(degree: int) -> None
         low, high = RANGES.get(kind, (-rest, rest))
         if not found.numel():
             continue
-        error = (found - true).abs() / ((high - low) / ((1 << VALUE_BITS) - 1))
+        error = (found - true).abs() / ((high - low) / ((1 << SplatCodingTuning.value_bits) - 1))
         # The transform's 15-bit factors let values shrink by up to a thousandth: four steps of the largest.
         assert error.mean() < 1.5 and error.max() < 5
     found, true = (shapes(m) for m in (decoded, gaussians))

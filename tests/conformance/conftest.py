@@ -19,7 +19,7 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
-from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.writing import OBJECT_FILES, write_objects
 from ggslam.scene.identity import IdentityClassifier
 

@@ -16,18 +16,18 @@ from sog_reader import from_sog
 from splat_maps import Splats, convert, from_ply, small_map
 
 from ggslam.errors import FormatError
-from ggslam.formats import streamed_sog
 from ggslam.formats.point_sampling import MapPart
-from ggslam.formats.streamed_sog import write_streamed_sog
+from ggslam.formats.streamed_sog import StreamedSogTuning, write_streamed_sog
+from ggslam.system.tuning import overridden
 
 COUNT = 3000
 
 
 @pytest.fixture(autouse=True)
-def small_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_leaves() -> Iterator[None]:
     """A small map with a tree, several files of a level, and three levels."""
-    for name, value in {"LEAF": 500, "LEAF_LEAST": 100, "CHUNK": 900, "COARSEST": 200}.items():
-        monkeypatch.setattr(streamed_sog, name, value)
+    with overridden(StreamedSogTuning, leaf=500, leaf_min=100, chunk=900, coarsest=200):
+        yield
 
 
 def parts_of(degree: int) -> list[MapPart]:

@@ -21,7 +21,7 @@ from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.jobs.export.export_run import export_run
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
-from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.writing import OBJECT_FILES
 from ggslam.scene.gaussian_map import GaussianMap
 

@@ -8,10 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from ggslam.evaluation import gaussian_labels
-from ggslam.evaluation.gaussian_labels import GaussianTruth
+from ggslam.evaluation.gaussian_labels import GaussianTruth, LabelTuning
 from ggslam.evaluation.segmentation import Matching
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import overridden
 
 CAMERA = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
 IDENTITY = np.eye(4)
@@ -52,15 +52,15 @@ def test_the_nearer_tolerance_is_two_centimetres() -> None:
     assert truth_of([at(1, 2, 0.518), at(1, 2, 0.522)], depth=0.5).tolist() == [1, 0]
 
 
-def test_the_majority_of_views_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gaussian_labels, "_KEYS_AT_ONCE", 3)  # votes are gathered on the way, too
-    truth, points = GaussianTruth(2), numbered([at(1, 2, 2), at(6, 2, 2)])
-    depth, one, other = np.full((6, 8), 2, np.float32), halves(), np.full((6, 8), 7, np.uint16)
-    for mask in (one, other, other, one, other):
-        truth.add(CAMERA, IDENTITY, depth, mask, *points)
-    assert truth.labels().tolist() == [7, 7]
-    truth.add(CAMERA, IDENTITY, depth, one, *points)
-    assert truth.labels().tolist() == [1, 2]  # three each: the lower id
+def test_the_majority_of_views_counts() -> None:
+    with overridden(LabelTuning, keys_at_once=3):
+        truth, points = GaussianTruth(2), numbered([at(1, 2, 2), at(6, 2, 2)])
+        depth, one, other = np.full((6, 8), 2, np.float32), halves(), np.full((6, 8), 7, np.uint16)
+        for mask in (one, other, other, one, other):
+            truth.add(CAMERA, IDENTITY, depth, mask, *points)
+        assert truth.labels().tolist() == [7, 7]
+        truth.add(CAMERA, IDENTITY, depth, one, *points)
+        assert truth.labels().tolist() == [1, 2]  # three each: the lower id
 
 
 def test_the_pose_is_from_world_to_camera() -> None:

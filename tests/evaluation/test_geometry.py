@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from ggslam.evaluation.geometry import score_cloud
-from ggslam.geometry import clouds
-from ggslam.geometry.clouds import overlap
+from ggslam.geometry.clouds import CloudTuning, overlap
 from ggslam.geometry.icp import register
 from ggslam.geometry.normals import estimate_normals
 from ggslam.scene.poses import inverse, se3_exp
+from ggslam.system.tuning import overridden
 
 
 def corner(count: int = 4000, seed: int = 0) -> np.ndarray:
@@ -107,10 +107,10 @@ def test_scores_of_a_map_that_is_half_there() -> None:
     assert elsewhere.completeness_m == pytest.approx(s.completeness_m)
 
 
-def test_large_clouds_are_sampled(monkeypatch: pytest.MonkeyPatch) -> None:
+@overridden(CloudTuning, max_queries=900)
+def test_large_clouds_are_sampled() -> None:
     reference, estimate = grid(0.1, 0.0), grid(0.1, 0.0)
     estimate[::4, 2] = 0.03
-    monkeypatch.setattr(clouds, "MOST_QUERIES", 900)
     found = score_cloud(estimate, reference, (0.01,), seed=1)
     assert found.thresholds[0].precision == pytest.approx(0.75, abs=0.04)
     assert found.thresholds[0].precision != 0.75  # which all of them would give

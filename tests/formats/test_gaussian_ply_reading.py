@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from ggslam.errors import FormatError
-from ggslam.formats import gaussian_rows
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.gaussian_ply_reading import PlyGaussianRows, apply_filter
+from ggslam.formats.gaussian_rows import GaussianRowsTuning
 from ggslam.formats.ply import write_ply
 from ggslam.formats.splat_formats import open_splats, read_splats
 from ggslam.scene.gaussian_map import SH_C0
+from ggslam.system.tuning import overridden
 
 NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3)),
          *(f"rot_{i}" for i in range(4))]  # fmt: skip
@@ -122,19 +123,18 @@ def test_harmonics_of_degree_4_become_3_and_bytes_are_colours(tmp_path: Path) ->
     assert float(0.5 + SH_C0 * found.sh[0, 0, 0]) == pytest.approx(0, abs=1e-6)
 
 
-def test_blocks_are_the_whole_without_the_bad_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gaussian_rows, "BLOCK", 64)
-    monkeypatch.setattr("ggslam.formats.gaussian_ply_reading.BLOCK", 64)
-    vertex = rows(1000)
-    gone = np.random.default_rng(5).random(1000) < 0.3
-    gone[[0, 63, 64, 999]] = True
-    vertex["opacity"][gone] = np.nan
-    found = PlyGaussianRows(stored(tmp_path / "map.ply", vertex))
-    expected = vertex["x"][~gone]
-    assert len(found) == len(expected)
-    np.testing.assert_array_equal(np.concatenate([b.means.numpy()[:, 0] for b in found.blocks()]), expected)
-    for start, count in ((0, 1), (17, 100), (len(expected) - 1, 1), (5, 0)):
-        np.testing.assert_array_equal(found.read(start, count).means.numpy()[:, 0], expected[start : start + count])
+def test_blocks_are_the_whole_without_the_bad_ones(tmp_path: Path) -> None:
+    with overridden(GaussianRowsTuning, rows_at_once=64):
+        vertex = rows(1000)
+        gone = np.random.default_rng(5).random(1000) < 0.3
+        gone[[0, 63, 64, 999]] = True
+        vertex["opacity"][gone] = np.nan
+        found = PlyGaussianRows(stored(tmp_path / "map.ply", vertex))
+        expected = vertex["x"][~gone]
+        assert len(found) == len(expected)
+        np.testing.assert_array_equal(np.concatenate([b.means.numpy()[:, 0] for b in found.blocks()]), expected)
+        for start, count in ((0, 1), (17, 100), (len(expected) - 1, 1), (5, 0)):
+            np.testing.assert_array_equal(found.read(start, count).means.numpy()[:, 0], expected[start : start + count])
 
 
 def test_files_without_a_good_gaussian_are_refused(tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ import torch
 from ggslam.errors import FormatError
 from ggslam.formats.ply import read_ply, write_ply
 from ggslam.formats.point_ply import read_points, sample_points, write_points
-from ggslam.formats.point_sampling import MapPart, sample_parts
+from ggslam.formats.point_sampling import MapPart, PointSamplingTuning, sample_parts
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import overridden
 
 
 def one(mean: list[float], scales: list[float], opacity: float, rgb: list[float], label: int = 0) -> GaussianMap:
@@ -122,13 +123,13 @@ def test_parts_with_a_gaussian_of_a_kilometre_are_those_of_the_whole_map() -> No
     assert {tuple(p) for p in np.rint(found / 20).tolist()} == {tuple(p) for p in np.rint(expected / 20).tolist()}
 
 
-def test_the_size_of_the_chunks_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_size_of_the_chunks_does_not_matter() -> None:
     whole = sample_points(random_map(), 0.02, with_object_id=True)
-    monkeypatch.setattr("ggslam.formats.point_sampling._CHUNK", 500)
-    parts = sample_points(random_map(), 0.02, with_object_id=True)
-    np.testing.assert_array_equal(parts.grid, whole.grid)
-    np.testing.assert_array_equal(parts.object_id, whole.object_id)
-    assert np.abs(parts.colors.astype(int) - whole.colors).max() <= 1
+    with overridden(PointSamplingTuning, samples_at_once=500):
+        parts = sample_points(random_map(), 0.02, with_object_id=True)
+        np.testing.assert_array_equal(parts.grid, whole.grid)
+        np.testing.assert_array_equal(parts.object_id, whole.object_id)
+        assert np.abs(parts.colors.astype(int) - whole.colors).max() <= 1
 
 
 def test_impossible_requests_and_foreign_files_are_refused(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.splat_formats import open_splats, read_splats, write_splats
 from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.map_file import VIEWS, MapFile, open_map
+from ggslam.runs.map_file import MapFile, MapViewTuning, open_map
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.harmonics import spherical_harmonics
 
@@ -76,7 +76,7 @@ def test_the_folder_of_a_meta_json_is_a_file_too(tmp_path: Path) -> None:
 def test_cameras_stand_around_the_map_and_see_it_whole(tmp_path: Path) -> None:
     folder = open_map(written(tmp_path / "map.ply"))
     poses, camera = folder.keyframes().poses(), folder.sequence().camera
-    assert len(poses) == VIEWS and not folder.has_poses
+    assert len(poses) == MapViewTuning.views and not folder.has_poses
     points = folder.gaussians().means.numpy()
     for T in poses.values():
         own = (points - T[:3, 3]) @ T[:3, :3]

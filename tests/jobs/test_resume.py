@@ -137,7 +137,7 @@ def test_killed_again_and_again(room: Path, whole: Path, tmp_path: Path, monkeyp
     for frame in (5, 6, 12):
         with pytest.raises(Killed):
             resume(out, KillAt(frame=frame), checkpoint_every=2 if frame == 6 else 1)
-    assert len(states(out)) == checkpoints.STATES
+    assert len(states(out)) == checkpoints.CheckpointTuning.states
     resume(out, checkpoint_every=0)
     assert_same(out, whole)
 

@@ -14,8 +14,8 @@ from ggslam.jobs.report.comparison_page import by_recording, comparison_page
 from ggslam.jobs.report.run_data import FrameView, LevelAxes, Path3D, RunData, stage_seconds
 from ggslam.jobs.report.run_page import run_page
 from ggslam.jobs.report.run_plots import all_plots, trajectory_plots
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.scene.camera import Camera

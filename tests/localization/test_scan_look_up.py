@@ -24,7 +24,7 @@ from ggslam.localization.near import Near, parse_near
 from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.scan_maps import scan_places
 from ggslam.localization.scan_places import SCAN_PLACES, place_of, recorded_places
-from ggslam.localization.scan_tracker import MOST_PASSED, ScanTracker, ScanTrackerSettings
+from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings, ScanTrackerTuning
 from ggslam.localization.scan_views import SECTORS, ViewIndex, view_of
 from ggslam.localization.scans import LaserScan
 from ggslam.localization.surface import NORMAL, SCAN_TARGET, PartialSurface, packed_normals
@@ -216,7 +216,7 @@ def test_ever_more_scans_are_passed_over_while_nothing_is_found(made: Made, reco
         results: list[Localization] = []
         for _ in range(24):
             results.append(localizer.locate(made.scans[0]))
-    assert asked == [0, 1, 3, 7, 15, 23] and MOST_PASSED == 7
+    assert asked == [0, 1, 3, 7, 15, 23] and ScanTrackerTuning.max_skipped == 7
 
 
 def test_only_places_near_a_position_are_looked_at(made: Made, recorded: Path, cloud: Path) -> None:

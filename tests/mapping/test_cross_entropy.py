@@ -10,7 +10,7 @@ import torch
 from ggslam.errors import CoreInputError, RenderError
 from ggslam.mapping.cpu.cross_entropy import cross_entropy
 from ggslam.native.loader import NativeContext, available_instruction_sets
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IdentityClassifier, IdentityVectorTuning
 
 
 def make_classifier(classes: int, channels: int = 16, size: float = 1.0) -> IdentityClassifier:
@@ -28,7 +28,7 @@ def by_torch(
     parts = (features, classifier.weight[chosen], classifier.bias[chosen])
     f, w, b = (torch.tensor(part, dtype=torch.float64, requires_grad=True) for part in parts)
     logits = f @ w.T + b
-    logits = torch.cat([logits, torch.full((len(f), 1), NOTHING_LOGIT, dtype=torch.float64)], 1)
+    logits = torch.cat([logits, torch.full((len(f), 1), IdentityVectorTuning.nothing_logit, dtype=torch.float64)], 1)
     true = torch.from_numpy(np.where(classes >= 0, np.searchsorted(chosen, classes), -100))
     loss = torch.nn.functional.cross_entropy(logits, true)
     loss.backward()

@@ -13,17 +13,19 @@ import torch
 from identity_picture import COUNT, HEIGHT, WIDTH, MaskedKeyframe, make_map, picture
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.mapping.cpu.class_table import FIRST_CLASSES
+from ggslam.mapping.class_numbers import ClassTuning
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.pixel_pool import draw_pool
-from ggslam.mapping.cuda.identity import CudaIdentityLearner
-from ggslam.mapping.identity import POOL_STEPS
+from ggslam.mapping.cuda.class_table import CudaClassTuning
+from ggslam.mapping.cuda.identity import CudaIdentityLearner, CudaIdentityTuning
+from ggslam.mapping.identity import IdentityTuning
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.pixel_terms import CpuPixelTerms
 from ggslam.rendering.types import RenderBuffers
+from ggslam.system.tuning import overridden
 
 ALONE = NeighbourSettings(weight=0)
 
@@ -133,7 +135,7 @@ def test_many_classes_compete_all_at_once(cuda_library: CudaLibrary) -> None:
     both.cpu._choose_competitors = lambda classes: np.arange(200)  # type: ignore[method-assign]
     both.step(3)
     both.check()
-    assert both.cuda.table.count == 200 > FIRST_CLASSES
+    assert both.cuda.table.count == 200 > ClassTuning.initial_rows
 
 
 def test_votes_alone_are_those_of_the_cpu(cuda_library: CudaLibrary) -> None:
@@ -145,22 +147,20 @@ def test_votes_alone_are_those_of_the_cpu(cuda_library: CudaLibrary) -> None:
 
 
 @pytest.mark.parametrize("part", [2**24, 700])
-def test_the_dense_schedule_gives_the_gradient_image(
-    cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch, part: int
-) -> None:
-    monkeypatch.setattr("ggslam.mapping.cuda.identity.LOGITS_AT_ONCE", part)
-    both = Both(cuda_library, schedule="dense", weight=1.0)
-    both.begin()
-    features = torch.from_numpy(np.random.default_rng(2).normal(size=(16, HEIGHT, WIDTH)).astype(np.float32))
-    empty = torch.zeros(0)
-    for _ in range(3):
-        both.give_pool(1)
-        expected = both.cpu.step(both.map, both.view, both.keyframe, RenderBuffers(empty, empty, empty, features))
-        on_device = RenderBuffers(empty, empty, empty, features.to(both.device))
-        found = both.cuda.step(both.device_map, both.view, both.keyframe, on_device)
-        assert found is not None and expected is not None and expected.abs().max() > 1e-5
-        assert torch.allclose(found.cpu(), expected, atol=1e-7)
-    both.check()
+def test_the_dense_schedule_gives_the_gradient_image(cuda_library: CudaLibrary, part: int) -> None:
+    with overridden(CudaIdentityTuning, logits_at_once=part):
+        both = Both(cuda_library, schedule="dense", weight=1.0)
+        both.begin()
+        features = torch.from_numpy(np.random.default_rng(2).normal(size=(16, HEIGHT, WIDTH)).astype(np.float32))
+        empty = torch.zeros(0)
+        for _ in range(3):
+            both.give_pool(1)
+            expected = both.cpu.step(both.map, both.view, both.keyframe, RenderBuffers(empty, empty, empty, features))
+            on_device = RenderBuffers(empty, empty, empty, features.to(both.device))
+            found = both.cuda.step(both.device_map, both.view, both.keyframe, on_device)
+            assert found is not None and expected is not None and expected.abs().max() > 1e-5
+            assert torch.allclose(found.cpu(), expected, atol=1e-7)
+        both.check()
 
 
 def test_neighbours_are_pulled_together_as_on_the_cpu(
@@ -288,9 +288,9 @@ def test_merges_removals_and_labels_are_those_of_the_cpu(cuda_library: CudaLibra
     both.check()
 
 
-def test_learned_labels_are_those_of_the_cpu(cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
+@overridden(CudaClassTuning, logits_at_once=100)
+def test_learned_labels_are_those_of_the_cpu(cuda_library: CudaLibrary) -> None:
     """Where votes are not sure. By parts of few Gaussians."""
-    monkeypatch.setattr("ggslam.mapping.cuda.class_table._LOGITS_AT_ONCE", 100)
     both = Both(cuda_library, min_confidence=0.7)
     both.begin()
     both.step(4)
@@ -303,8 +303,8 @@ def test_learned_labels_are_those_of_the_cpu(cuda_library: CudaLibrary, monkeypa
     assert len(both.map.object_id[:200].unique()) > 2
 
 
-def test_a_split_is_that_of_the_cpu(cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ggslam.mapping.cuda.identity.SPLIT_PIXELS", 100)
+@overridden(CudaIdentityTuning, split_pixels=100)
+def test_a_split_is_that_of_the_cpu(cuda_library: CudaLibrary) -> None:
     both = Both(cuda_library, np.where(picture() == 300, 1, picture()).astype(np.uint16))
     both.begin()
     both.step(2)
@@ -337,7 +337,7 @@ def test_consecutive_parts_of_a_pool_are_used(cuda_library: CudaLibrary, monkeyp
     monkeypatch.setattr(CudaIdentityLearner, "kept_pools", 2)
     both = Both(cuda_library)
     others = [MaskedKeyframe(number, both.keyframe.mask, both.device) for number in (1, 2)]
-    parts = [both.cuda._draw(both.keyframe)[0] for _ in range(POOL_STEPS)]
+    parts = [both.cuda._draw(both.keyframe)[0] for _ in range(IdentityTuning.pool_steps)]
     assert torch.equal(torch.cat(parts), both.cuda._pools[0].pixels)
     first = both.cuda._pools[0]
     both.cuda._draw(both.keyframe)

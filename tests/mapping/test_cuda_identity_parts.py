@@ -11,14 +11,14 @@ import torch
 from identity_picture import HEIGHT, WIDTH, picture
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.mapping.class_numbers import FIRST_CLASSES
+from ggslam.mapping.class_numbers import ClassTuning
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.cross_entropy import cross_entropy
 from ggslam.mapping.cpu.identity import by_parts
 from ggslam.mapping.cpu.neighbours import kl_gradient
 from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.cuda.class_learning import ClassKernels
-from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.class_table import CudaClassTable, CudaClassTuning
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
 from ggslam.mapping.identity import IDS
 from ggslam.mapping.identity_settings import IdentitySettings
@@ -26,6 +26,7 @@ from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.votes import merge_votes, vote_labels
 from ggslam.native.loader import NativeContext
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import overridden
 
 
 def test_votes_that_name_one_object_after_a_merge_are_added(cuda_library: CudaLibrary) -> None:
@@ -49,7 +50,7 @@ def test_classes_grow_and_go_as_on_the_cpu(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
     cpu = CpuClassTable(np.random.default_rng(0))
     cuda = CudaClassTable(np.random.default_rng(0), ClassKernels(device, cuda_library))
-    ids = np.arange(1, 2 * FIRST_CLASSES, dtype=np.uint16)
+    ids = np.arange(1, 2 * ClassTuning.initial_rows, dtype=np.uint16)
     for table in (cpu, cuda):
         table.add(ids)
         table.add(np.array([0, 5, 60000], np.uint16))
@@ -67,19 +68,17 @@ def test_classes_grow_and_go_as_on_the_cpu(cuda_library: CudaLibrary) -> None:
 
 
 @pytest.mark.parametrize("at_once", [2**24, 50])
-def test_vectors_have_the_labels_of_the_cpu(
-    cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch, at_once: int
-) -> None:
-    monkeypatch.setattr("ggslam.mapping.cuda.class_table._LOGITS_AT_ONCE", at_once)
-    random, device = np.random.default_rng(0), cuda_library.whole_device(None)
-    table = CudaClassTable(random, ClassKernels(device, cuda_library))
-    vectors = (0.4 * random.normal(size=(500, 16))).astype(np.float32)
-    assert not table.labels(torch.from_numpy(vectors).to(device)).any()
-    table.add(np.arange(1, 8, dtype=np.uint16))
-    for confidence in (0.0, 0.5):
-        expected = by_parts(table.classifier, vectors, confidence)
-        assert np.array_equal(table.labels(torch.from_numpy(vectors).to(device), confidence).cpu(), expected)
-        assert 0.1 < (expected == 0).mean() < 0.9
+def test_vectors_have_the_labels_of_the_cpu(cuda_library: CudaLibrary, at_once: int) -> None:
+    with overridden(CudaClassTuning, logits_at_once=at_once):
+        random, device = np.random.default_rng(0), cuda_library.whole_device(None)
+        table = CudaClassTable(random, ClassKernels(device, cuda_library))
+        vectors = (0.4 * random.normal(size=(500, 16))).astype(np.float32)
+        assert not table.labels(torch.from_numpy(vectors).to(device)).any()
+        table.add(np.arange(1, 8, dtype=np.uint16))
+        for confidence in (0.0, 0.5):
+            expected = by_parts(table.classifier, vectors, confidence)
+            assert np.array_equal(table.labels(torch.from_numpy(vectors).to(device), confidence).cpu(), expected)
+            assert 0.1 < (expected == 0).mean() < 0.9
 
 
 @pytest.mark.parametrize("classes", [1, 31, 70])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES
+from ggslam.mapping.class_numbers import ClassTuning
 from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.mapper import CpuMapper
@@ -26,7 +26,7 @@ from ggslam.rendering.labels import render_labels
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import NOTHING_LOGIT
+from ggslam.scene.identity import IdentityVectorTuning
 
 CAMERA = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
 
@@ -210,7 +210,9 @@ def test_the_map_shows_its_labels_to_the_next_keyframe() -> None:
 
 
 def with_nothing(logits: torch.Tensor) -> torch.Tensor:
-    return torch.cat([logits, torch.full((*logits.shape[:-1], 1), NOTHING_LOGIT, dtype=logits.dtype)], -1)
+    return torch.cat(
+        [logits, torch.full((*logits.shape[:-1], 1), IdentityVectorTuning.nothing_logit, dtype=logits.dtype)], -1
+    )
 
 
 def test_kl_has_the_gradients_of_torch() -> None:
@@ -267,13 +269,13 @@ def test_neighbours_pull_an_unseen_gaussian_along() -> None:
 
 def test_classes_grow_and_go() -> None:
     table = CpuClassTable(np.random.default_rng(0))
-    ids = np.arange(1, 2 * FIRST_CLASSES, dtype=np.uint16)
+    ids = np.arange(1, 2 * ClassTuning.initial_rows, dtype=np.uint16)
     table.add(ids)
     table.add(np.array([0, 5, 60000], np.uint16))
     assert table.count == len(ids) + 1 and table.classes(np.array([0, 60000])).tolist() == [-1, len(ids)]
     found, _ = table.classifier.labels(table.codes(ids))
     assert np.array_equal(found, ids)
-    assert np.allclose(np.linalg.norm(table.codes(ids), axis=1), CODE_LENGTH, atol=1e-5)
+    assert np.allclose(np.linalg.norm(table.codes(ids), axis=1), ClassTuning.code_length, atol=1e-5)
     assert not table.codes(np.array([0, 40000])).any()
     row = table.classifier.weight[-1].copy()
     table.remove(3)

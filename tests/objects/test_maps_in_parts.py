@@ -17,9 +17,8 @@ import torch
 from test_segmented_runs import done, refused, votes_for, write_run
 
 from ggslam.errors import FormatError
-from ggslam.formats import gaussian_rows
 from ggslam.formats.gaussian_ply import read_gaussian_ply, write_gaussian_parts, write_gaussian_ply
-from ggslam.formats.gaussian_rows import GaussianRows
+from ggslam.formats.gaussian_rows import GaussianRows, GaussianRowsTuning
 from ggslam.formats.point_ply import read_points
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.objects.segmented_map import ObjectVotes, SegmentedMapTuning
@@ -55,14 +54,13 @@ def stored(shared_segmented_room: Any, tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.fixture
-def pair(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[RunFolder, RunFolder]]:
+def pair(stored: Path, tmp_path: Path) -> Iterator[tuple[RunFolder, RunFolder]]:
     """A run in cells, and the same run without their index."""
     for name in ("cells", "whole"):
         shutil.copytree(stored, tmp_path / name)
     (tmp_path / "whole" / MAP_INDEX).unlink()
     accept_files(tmp_path / "whole")
-    monkeypatch.setattr(gaussian_rows, "BLOCK", 700)
-    with overridden(SegmentedMapTuning, rows_at_once=500):
+    with overridden(GaussianRowsTuning, rows_at_once=700), overridden(SegmentedMapTuning, rows_at_once=500):
         yield RunFolder.open(tmp_path / "cells"), RunFolder.open(tmp_path / "whole")
 
 
@@ -128,14 +126,14 @@ def test_cells_are_kept_up_to_a_bound(pair: tuple[RunFolder, RunFolder]) -> None
 @pytest.mark.parametrize("options", [[], ["--plain"], ["--min-opacity", "0.7"], ["--objects", "all"]])
 @pytest.mark.parametrize("kind", ["ply", "segmented"])
 def test_exports_do_not_depend_on_blocks(
-    pair: tuple[RunFolder, RunFolder], kind: str, options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pair: tuple[RunFolder, RunFolder], kind: str, options: list[str], tmp_path: Path
 ) -> None:
     cells, whole = pair
     for folder, block, name in ((cells, 700, "a"), (whole, 1 << 30, "b")):
-        monkeypatch.setattr(gaussian_rows, "BLOCK", block)
-        (tmp_path / name).mkdir()
-        out = tmp_path / name / ("objects" if options[:1] == ["--objects"] and kind == "ply" else "map.ply")
-        done("export", folder.path, "--format", kind, *options, "--out", out)
+        with overridden(GaussianRowsTuning, rows_at_once=block):
+            (tmp_path / name).mkdir()
+            out = tmp_path / name / ("objects" if options[:1] == ["--objects"] and kind == "ply" else "map.ply")
+            done("export", folder.path, "--format", kind, *options, "--out", out)
     assert files(tmp_path / "a") == files(tmp_path / "b") and len(files(tmp_path / "a")) > (options != ["--plain"])
 
 

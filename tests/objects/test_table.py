@@ -17,7 +17,7 @@ from ggslam.objects.colors import PaletteTuning, id_palette
 from ggslam.objects.settings import ClassifierTuning
 from ggslam.objects.table import ObjectRecord, ObjectTable, Observation
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IdentityClassifier, IdentityVectorTuning
 from ggslam.scene.oriented_box import OrientedBox
 from ggslam.system.tuning import overridden
 
@@ -74,7 +74,7 @@ def test_confidence_is_the_mean_probability_of_the_own_class() -> None:
     features[0, 0], features[1, 0], features[2, 1] = np.log(4), np.log(9), 0
     with overridden(ClassifierTuning, values_at_once=3):  # one Gaussian at a time
         table = ObjectTable.build(map_of([3, 3, 7], features=features), classifier, "masks")
-    nothing = np.exp(NOTHING_LOGIT)
+    nothing = np.exp(IdentityVectorTuning.nothing_logit)
     assert table.record(3).confidence == pytest.approx((4 / (5 + nothing) + 9 / (10 + nothing)) / 2)
     assert table.record(7).confidence == pytest.approx(1 / (2 + nothing))
 

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from ggslam.errors import RenderError
-from ggslam.rendering import labels
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.labels import label_image, render_labels, vote_label_image
+from ggslam.rendering.labels import LabelTuning, label_image, render_labels, vote_label_image
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
+from ggslam.system.tuning import overridden
 
 CAMERA = Camera(40, 30, 40.0, 40.0, 19.5, 14.5)
 
@@ -45,15 +45,15 @@ def two_walls() -> GaussianMap:
     return gaussians
 
 
-def test_pixels_get_the_most_probable_class(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixels_get_the_most_probable_class() -> None:
     rng = np.random.default_rng(1)
     classifier = classifier_of(30)
     features = rng.normal(size=(16, 12, 17)).astype(np.float32)
     alpha = rng.uniform(0, 1, (12, 17)).astype(np.float32)
     expected, probability = classifier.labels(features.transpose(1, 2, 0))
     for values_at_once in (1 << 18, 100, 7):  # in one part, in many, less than a pixel's logits
-        monkeypatch.setattr(labels, "_VALUES_AT_ONCE", values_at_once)
-        ids, confidence = label_image(features, torch.from_numpy(alpha), classifier)
+        with overridden(LabelTuning, logits_at_once=values_at_once):
+            ids, confidence = label_image(features, torch.from_numpy(alpha), classifier)
         assert ids.dtype == np.uint16 and (ids == np.where(alpha >= 0.5, expected, 0)).all()
         assert np.allclose(confidence, np.where(alpha >= 0.5, probability, 0), atol=1e-5)
     assert (label_image(features, alpha, classifier, min_alpha=0.9)[0] > 0).sum() == (alpha >= 0.9).sum()
@@ -100,7 +100,7 @@ def test_a_map_rendered_and_classified() -> None:
         render_labels(CpuRasterizer(), plain, classifier, CAMERA, np.eye(4))
 
 
-def test_the_heaviest_label_of_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_heaviest_label_of_a_pixel() -> None:
     gaussians, rasterizer = two_walls(), CpuRasterizer()
     own = gaussians.object_id.numpy().astype(np.uint16)
     one_hot = torch.from_numpy((own[:, None] == np.array([300, 7, 9])).astype(np.float32)).contiguous()
@@ -110,8 +110,8 @@ def test_the_heaviest_label_of_a_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     weights = view.features[:3].numpy()
     expected = np.where(view.alpha.numpy() >= 0.5, np.array([300, 7, 9])[weights.argmax(0)], 0)
     clear = np.sort(weights, 0)[-1] - np.sort(weights, 0)[-2] > 0.01
-    monkeypatch.setattr(labels, "_PIXELS_AT_ONCE", 500)
-    ids = vote_label_image(rasterizer, view, own)
+    with overridden(LabelTuning, pixels_at_once=500):
+        ids = vote_label_image(rasterizer, view, own)
     assert (ids == expected)[clear].all() and clear.mean() > 0.8 and {0, 300, 7} == set(np.unique(ids))
     assert (vote_label_image(rasterizer, view, own, stride=3) == ids[::3, ::3]).all()
     behind = np.where(own == 300, 0, own).astype(np.uint16)  # unlabelled Gaussians hide what weighs less

@@ -11,7 +11,7 @@ import pytest
 from ggslam.errors import FormatError
 from ggslam.runs.map_container import open_container
 from ggslam.runs.records.container import CONTAINER_FORMAT, CONTAINER_VERSION, ContainerRecord
-from ggslam.runs.records.mark import FileRecord
+from ggslam.runs.records.run_json import FileRecord
 
 
 def test_members_expand_to_a_budget_together(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ggslam.errors import FormatError
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IdentityClassifier, IdentityVectorTuning
 
 
 def classifier() -> IdentityClassifier:
@@ -23,7 +23,7 @@ def vector(*leading: float) -> np.ndarray:
 
 def test_probabilities_are_a_softmax_with_nothing() -> None:
     p = classifier().probabilities(np.stack([vector(2), vector()]))
-    e = np.exp([[8, 0, NOTHING_LOGIT], [0, 0, NOTHING_LOGIT]])
+    e = np.exp([[8, 0, IdentityVectorTuning.nothing_logit], [0, 0, IdentityVectorTuning.nothing_logit]])
     assert p.dtype == np.float32 and np.allclose(p, (e / e.sum(1, keepdims=True))[:, :2], atol=1e-6)
 
 

@@ -235,10 +235,10 @@ def test_missing_mask(make: Make) -> None:
     sequence = open_sequence(folder)
     assert [frame.mask is None for frame in sequence.stream()] == [False, True, False, False, True]
     assert "2 of 5 frames have no mask" in sequence.warnings
-    assert "1 of 2 frames have no mask" in open_sequence(folder, start=3).warnings
+    assert "1 of 2 frames has no mask" in open_sequence(folder, start=3).warnings
     assert open_sequence(folder, start=2, stop=4).warnings == []
     none = open_sequence(folder, start=4)
-    assert not none.has_masks and "1 of 1 frames have no mask" in none.warnings
+    assert not none.has_masks and "1 of 1 frames has no mask" in none.warnings
     assert open_sequence(make("tum")).warnings == []  # no masks at all is nothing to warn of
 
 

@@ -9,19 +9,7 @@ import numpy as np
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sight.margin import Margin
-from ggslam.sight.places import (
-    EVERY,
-    FEWEST,
-    KNOWN,
-    LEAST_SHARE,
-    NEAREST,
-    ROUGH,
-    SMOOTH,
-    CoarseView,
-    PairEvidence,
-    _window,
-    thin_out,
-)
+from ggslam.sight.places import CoarseView, PairEvidence, PlaceTuning, _window, thin_out
 
 
 def coarse_view(
@@ -43,7 +31,9 @@ def coarse_view(
     )
     mean = total / np.maximum(count, 1)
     spread = squares / np.maximum(count, 1) - mean * mean
-    smooth = (count >= KNOWN * window**2) & (spread < (SMOOTH * margin.sigma(mean)) ** 2)
+    smooth = (count >= PlaceTuning.min_known * window**2) & (
+        spread < (PlaceTuning.smooth_sigmas * margin.sigma(mean)) ** 2
+    )
     exact = thin_out(depth, factor)
     value = np.where(smooth, mean, exact)
     near, far = np.where(smooth, mean, near), np.where(smooth, mean, far)
@@ -69,9 +59,9 @@ def compare_views(view: CoarseView, other: CoarseView, margin: Margin, moved: np
     near, far = other.near.reshape(-1)[where], other.far.reshape(-1)[where]
     known = inside & other.whole.reshape(-1)[where]
     smooth = known & view.smooth.reshape(-1) & other.smooth.reshape(-1)[where]
-    told = np.flatnonzero(smooth if moved is None else smooth & ~moved.reshape(-1))[::EVERY]
+    told = np.flatnonzero(smooth if moved is None else smooth & ~moved.reshape(-1))[::PlaceTuning.stride]
     share = _measured_share(other, margin, u[told], v[told], z[told])
-    slack = margin(z, np.where(smooth, share, ROUGH).astype(np.float32))
+    slack = margin(z, np.where(smooth, share, PlaceTuning.rough_sigmas).astype(np.float32))
     passed, clearly = known & (near > z + slack), known & (near > z + 2 * slack)
     same = inside & (near < z + slack) & (far > z - slack)
     return PairEvidence(
@@ -81,12 +71,16 @@ def compare_views(view: CoarseView, other: CoarseView, margin: Margin, moved: np
 
 def _measured_share(other: CoarseView, margin: Margin, u: np.ndarray, v: np.ndarray, z: np.ndarray) -> float:
     """How much depths of smooth places differ."""
-    if len(z) < FEWEST:
-        return ROUGH
+    if len(z) < PlaceTuning.min_places:
+        return PlaceTuning.rough_sigmas
     left = np.clip(u.astype(np.int32), 0, other.camera.width - 2)
     top = np.clip(v.astype(np.int32), 0, other.camera.height - 2)
     a, b, depth = u - left, v - top, other.depth
     upper = (1 - a) * depth[top, left] + a * depth[top, left + 1]
     lower = (1 - a) * depth[top + 1, left] + a * depth[top + 1, left + 1]
     off = np.abs((1 - b) * upper + b * lower - z) / margin.sigma(z)
-    return float(np.clip(NEAREST * np.median(off) / 0.6745, LEAST_SHARE, ROUGH))
+    return float(
+        np.clip(
+            PlaceTuning.nearest_factor * np.median(off) / 0.6745, PlaceTuning.min_noise_share, PlaceTuning.rough_sigmas
+        )
+    )

@@ -11,7 +11,7 @@ from ggslam.errors import CoreInputError
 from ggslam.native.loader import NativeContext, available_instruction_sets
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import se3_exp, transform_points
-from ggslam.sight.margin import SIGMAS, Margin
+from ggslam.sight.margin import Margin, MarginTuning
 from ggslam.sight.view import Sight, View
 
 CAMERA = Camera(64, 48, 50.0, 52.0, 31.0, 24.5)
@@ -142,7 +142,7 @@ class _Noise:
 def test_the_margin_grows_with_noise_and_distance() -> None:
     z = np.array([1.0, 4.0])
     assert np.allclose(Margin()(z), [0.02, 0.04])
-    assert np.allclose(Margin.of(_Noise())(z), [0.02 + SIGMAS * 0.003, 0.04 + SIGMAS * 0.033])
+    assert np.allclose(Margin.of(_Noise())(z), [0.02 + MarginTuning.sigmas * 0.003, 0.04 + MarginTuning.sigmas * 0.033])
     assert np.allclose(Margin.of(_Noise()).times(2.5)(z), 2.5 * Margin.of(_Noise())(z))
     assert Margin.of(_Noise())(z.astype(np.float32)).dtype == np.float32
 

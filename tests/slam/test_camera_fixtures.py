@@ -17,7 +17,7 @@ from ggslam.scene.poses import inverse, se3_exp, transform_points
 from ggslam.sequences import open_sequence
 from ggslam.sight.fixed_to_camera import compare_views, shrink_depth
 from ggslam.slam.config import load_config
-from ggslam.slam.filters.camera_fixtures import VIEWS, CameraFixtures, find_fixtures
+from ggslam.slam.filters.camera_fixtures import CameraFixtures, FixtureTuning, find_fixtures
 from ggslam.slam.slam import Slam
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -74,7 +74,7 @@ def test_nothing_far_is_fixed_to_the_camera(size: float, found: bool) -> None:
 def test_a_wall_is_never_taken_for_it(slant: float) -> None:
     """Also one along which the camera goes, so that every pixel's depth stays the same."""
     found = look(lambda T: wall(T, slant), 30)
-    assert found.mask is None and found.views == VIEWS and not found.notes(1)
+    assert found.mask is None and found.views == FixtureTuning.max_views and not found.notes(1)
 
 
 def test_a_pillar_that_stays_ahead_of_a_turning_camera_is_of_the_world() -> None:

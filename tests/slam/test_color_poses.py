@@ -21,8 +21,9 @@ from ggslam.slam import color_poses
 from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
 from ggslam.synthetic import write_synthetic_sequence
+from ggslam.system.tuning import overridden
 from ggslam.tracking.points import FramePoints
-from ggslam.tracking.residual_noise import FEWEST, ResidualNoise
+from ggslam.tracking.residual_noise import ResidualNoise, ResidualNoiseTuning
 from ggslam.tracking.settings import DepthNoise
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
@@ -77,11 +78,11 @@ def test_hidden_noise_is_what_residuals_say_of_it() -> None:
     frame = FramePoints(
         points, points, np.zeros((2000, 6), np.float32), np.zeros((2000, 2), np.int32), np.ones(2000, np.float32)
     )
-    for _ in range(FEWEST):
+    for _ in range(ResidualNoiseTuning.min_measurements):
         noise = residuals.observe(frame, (0.008 * rng.standard_normal(2000)) ** 2, noise)
     assert 28 < residuals.hidden < 36 and abs(noise.sigma(2) - 0.008) < 1e-3
     exact = ResidualNoise()
-    for _ in range(FEWEST):
+    for _ in range(ResidualNoiseTuning.min_measurements):
         exact.observe(frame, (0.0005 * rng.standard_normal(2000)) ** 2, DepthNoise(2.5e-4, 0.0))
     assert exact.hidden == 1
 
@@ -124,7 +125,7 @@ def test_it_pays_where_depth_drifts(tmp_path: Path) -> None:
     assert error < 0.7 * without
     exact, _ = tracked(room, drift=False)
     assert not exact.color_poses._is_due
-    assert len(exact.color_poses.images) <= color_poses.UNDECIDED
+    assert len(exact.color_poses.images) <= color_poses.ColorPoseTuning.undecided_frames
 
 
 @pytest.mark.long("two runs over a small room")
@@ -150,9 +151,7 @@ def test_keyframes_are_aligned_before_the_last_steps_where_depth_drifts(
 
 
 @pytest.mark.long("three runs over a small room")
-def test_at_the_end_frames_are_laid_onto_the_map_where_depth_is_noisy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_at_the_end_frames_are_laid_onto_the_map_where_depth_is_noisy(tmp_path: Path) -> None:
     room = write_synthetic_sequence(tmp_path / "noisy", frames=24, width=160, height=120)
     slam, error = tracked(room, drift=False)
     tracked_only, without = tracked(room, "mapping.view_alignment.enabled=false", drift=False)
@@ -160,8 +159,8 @@ def test_at_the_end_frames_are_laid_onto_the_map_where_depth_is_noisy(
     assert error < 0.85 * without
     keyframes = {keyframe.frame_index for keyframe in slam.mapper.keyframes}
     assert [number for number, *_ in slam.color_poses.images] == [n for n in range(24) if n not in keyframes]
-    monkeypatch.setattr(color_poses, "KEPT_BYTES", 0)  # no memory for images: frames stay where they were found
-    stayed, error = tracked(room, drift=False)
+    with overridden(color_poses.ColorPoseTuning, kept_bytes=0):  # no memory for images: frames keep the tracker's poses
+        stayed, error = tracked(room, drift=False)
     assert not stayed.color_poses.images and error == without
     for a, b in zip(stayed.frames, tracked_only.frames, strict=True):
         assert np.array_equal(a.T_keyframe_camera, b.T_keyframe_camera)
@@ -180,7 +179,7 @@ def test_what_hides_the_map_is_not_compared(room: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(color_poses, "align_view", lambda _grey, _rendered, _depth, alpha, *_: seen.append(alpha))
     slam.tracker.state.residuals.hidden = 100
     slam.color_poses.align_last()
-    margin = color_poses.HIDDEN_MARGIN // 2
+    margin = color_poses.ColorPoseTuning.hidden_margin_pixels // 2
     assert len(seen) == 1 and not seen[0][40 - margin : 60 + margin, 50 - margin : 90 + margin].any()
     assert (seen[0][: 40 - margin] > 0.5).mean() > 0.5
 
@@ -196,8 +195,7 @@ def test_the_end_may_be_interrupted_between_frames(room: Path) -> None:
     def stop() -> None:
         raise KeyboardInterrupt
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(color_poses, "REPORT_EVERY", 2)
+    with overridden(color_poses.ColorPoseTuning, report_every=2), pytest.raises(KeyboardInterrupt):
         slam.color_poses.align_last(stop)
     assert slam.frames == before
     slam.color_poses.align_last()

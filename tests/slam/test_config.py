@@ -90,7 +90,7 @@ def test_presets_are_short_explained_and_change_what_they_list(name: str) -> Non
 
 
 def test_the_presets_are_told_of() -> None:
-    assert set(presets()) == {"default", "fast-cpu", "quality-cpu", "gpu", "tum"}
+    assert set(presets()) == {"default", "fast-cpu", "quality-cpu", "gpu", "replica", "tum"}
     page = Path(__file__).parents[2] / "docs" / "presets.md"
     if page.is_file():  # a checkout
         assert all(f"| `{name}` |" in page.read_text() for name in presets())

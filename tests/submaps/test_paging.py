@@ -14,9 +14,10 @@ from ggslam.geometry.frustums import Frustums
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, se3_exp
-from ggslam.submaps.gaussian_cells import PART, GaussianCells
+from ggslam.submaps.gaussian_cells import PART, GaussianCells, GaussianCellTuning
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
+from ggslam.system.tuning import overridden
 
 
 def random_map(count: int = 3000, channels: int = 4, seed: int = 0, extent: float = 6.0) -> GaussianMap:
@@ -177,7 +178,6 @@ def test_a_full_disk_loses_and_doubles_nothing(cells_for, monkeypatch: pytest.Mo
     """Some batches are written, then one is not: what was written is on disk, all else in the map."""
     gaussians = random_map()
     before, cells = content(gaussians), cells_for(gaussians)
-    monkeypatch.setattr("ggslam.submaps.gaussian_cells._BATCH_BYTES", 1)
     real, calls = cells.store.put_cells, []
 
     def put(writes) -> None:
@@ -187,7 +187,7 @@ def test_a_full_disk_loses_and_doubles_nothing(cells_for, monkeypatch: pytest.Mo
         real(writes)
 
     monkeypatch.setattr(cells.store, "put_cells", put)
-    with pytest.raises(RunFolderError, match="No space left"):
+    with pytest.raises(RunFolderError, match="No space left"), overridden(GaussianCellTuning, batch_bytes=1):
         cells.move_out(gaussians, cells.cells_of(gaussians))
     assert len(cells.sorted_keys()) == 3 and len(gaussians) + cells.count == 3000
     assert content(gaussians, *(part for _, part in cells.parts())) == before

@@ -13,7 +13,7 @@ import yaml
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import se3_exp, separation
 from ggslam.synthetic import RayCaster, Shutter, camera_path, furnished_room, write_synthetic_sequence
-from ggslam.synthetic.exposure import BANDS, poses_at
+from ggslam.synthetic.exposure import ExposureTuning, poses_at
 
 CAMERA = Camera(96, 72, 72.0, 72.0, 47.5, 35.5)
 
@@ -56,8 +56,8 @@ def test_depth_is_late_and_rows_are_of_their_own_time(caster: RayCaster) -> None
     late = Shutter(depth_delay=0.3).depth(seen, CAMERA, poses, frame)
     np.testing.assert_allclose(late, seen(CAMERA, poses_at(poses, frame, np.array([0.3]))[0]), atol=1e-5)
     rolled = Shutter(rolling=0.6).depth(seen, CAMERA, poses, frame)
-    first = seen(CAMERA, poses_at(poses, frame, np.array([0.6 * (0.5 / BANDS - 0.5)]))[0])
-    np.testing.assert_allclose(rolled[: 72 // BANDS], first[: 72 // BANDS], atol=1e-4)
+    first = seen(CAMERA, poses_at(poses, frame, np.array([0.6 * (0.5 / ExposureTuning.bands - 0.5)]))[0])
+    np.testing.assert_allclose(rolled[: 72 // ExposureTuning.bands], first[: 72 // ExposureTuning.bands], atol=1e-4)
 
 
 def test_blur_is_the_mean_of_the_exposure(caster: RayCaster) -> None:

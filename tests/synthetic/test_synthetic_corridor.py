@@ -15,10 +15,12 @@ from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sequences import open_sequence
-from ggslam.synthetic import RayCaster, Scene, camera_path, lighting
+from ggslam.synthetic import RayCaster, Scene, camera_path
 from ggslam.synthetic.houses import corridor as corridor_module
 from ggslam.synthetic.houses.corridor import furnished_corridor
 from ggslam.synthetic.houses.palette import HousePalette
+from ggslam.synthetic.lighting import LightingTuning
+from ggslam.system.tuning import overridden
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 FRAMES = 200
@@ -111,20 +113,20 @@ def test_a_shorter_recording_begins_like_a_longer_one(corridor: Scene) -> None:
     assert first != [(shape.half, shape.T_world_shape[0, 3]) for shape in other.shapes[2:]]
 
 
-def test_a_written_corridor_repeats(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(lighting, "LARGEST_MAP", 2)
-    for name in ("a", "b"):
-        options = ["--scene", "corridor", "--frames", "3", "--width", "80", "--height", "60"]
-        result = CliRunner().invoke(app, ["synth", str(tmp_path / name), *options])
-        assert result.exception is None, result.output
-    contents = [
-        {path.relative_to(tmp_path / name): path.read_bytes() for path in (tmp_path / name).rglob("*.*")}
-        for name in ("a", "b")
-    ]
-    assert contents[0] == contents[1]
-    sequence = open_sequence(tmp_path / "a")
-    assert len(sequence) == 3 and sequence.has_masks and sequence.timestamps[2] == pytest.approx(0.2)
-    frame = next(iter(sequence.stream()))
-    scene = furnished_corridor(0, 3)
-    expected, _ = RayCaster(scene).measure(frame.camera, camera_path(scene, 3, "walk")[0])
-    assert frame.depth is not None and np.median(np.abs(frame.depth - expected)[frame.depth > 0]) < 0.03
+def test_a_written_corridor_repeats(tmp_path: Path) -> None:
+    with overridden(LightingTuning, max_patches=2):
+        for name in ("a", "b"):
+            options = ["--scene", "corridor", "--frames", "3", "--width", "80", "--height", "60"]
+            result = CliRunner().invoke(app, ["synth", str(tmp_path / name), *options])
+            assert result.exception is None, result.output
+        contents = [
+            {path.relative_to(tmp_path / name): path.read_bytes() for path in (tmp_path / name).rglob("*.*")}
+            for name in ("a", "b")
+        ]
+        assert contents[0] == contents[1]
+        sequence = open_sequence(tmp_path / "a")
+        assert len(sequence) == 3 and sequence.has_masks and sequence.timestamps[2] == pytest.approx(0.2)
+        frame = next(iter(sequence.stream()))
+        scene = furnished_corridor(0, 3)
+        expected, _ = RayCaster(scene).measure(frame.camera, camera_path(scene, 3, "walk")[0])
+        assert frame.depth is not None and np.median(np.abs(frame.depth - expected)[frame.depth > 0]) < 0.03

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,13 +24,14 @@ from ggslam.synthetic import (
     Scene,
     SceneBuilder,
     camera_path,
-    lighting,
     scenes,
     write_synthetic_sequence,
 )
 from ggslam.synthetic.houses.house import ring_of_rooms
+from ggslam.synthetic.lighting import LightingTuning
 from ggslam.synthetic.materials import MaterialMaker
-from ggslam.synthetic.sensor import DISPARITY_STEP, disparity_distortion, noisy_depth
+from ggslam.synthetic.sensor import SensorTuning, disparity_distortion, noisy_depth
+from ggslam.system.tuning import overridden
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 39.5, 29.5)
 FRAMES = 480
@@ -52,10 +54,11 @@ def poses(house: Scene) -> np.ndarray:
 
 
 @pytest.fixture
-def quick_light(monkeypatch: pytest.MonkeyPatch, house: Scene) -> None:
+def quick_light(monkeypatch: pytest.MonkeyPatch, house: Scene) -> Iterator[None]:
     """A few patches a face instead of thousands, and the house that is there already."""
-    monkeypatch.setattr(lighting, "LARGEST_MAP", 2)
     monkeypatch.setitem(scenes.SCENES, "loop", replace(SCENES["loop"], build=lambda seed, frames: house))
+    with overridden(LightingTuning, max_patches=2):
+        yield
 
 
 def agreement(caster: RayCaster, T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
@@ -173,7 +176,7 @@ def test_distortion_is_fixed_smooth_and_in_disparity() -> None:
         wall = np.full((120, 160), z, np.float32)
         measured = np.stack([noisy_depth(wall, camera, np.random.default_rng(i), offset) for i in range(40)])
         error = np.nanmean(np.where(measured > 0, measured, np.nan), axis=0) - z
-        expected = -offset * DISPARITY_STEP * z**2
+        expected = -offset * SensorTuning.disparity_step * z**2
         assert np.corrcoef(error.ravel(), expected.ravel())[0, 1] > 0.6
         assert (error * expected).sum() / (expected**2).sum() == pytest.approx(1, abs=0.05)
 

@@ -17,7 +17,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sequences import open_sequence
 from ggslam.synthetic import write_synthetic_sequence
-from ggslam.synthetic.movers import LEAST_FRAMES, MOVERS
+from ggslam.synthetic.movers import MOVERS, MoverTuning
 
 FRAMES, SIZE = 16, {"width": 96, "height": 72}
 MOVER_IDS = {"person", "mug", "sideboard drawer"}
@@ -131,7 +131,7 @@ def test_the_command_repeats_bit_for_bit(tmp_path: Path) -> None:
      (("--movers", "mug", "--rig", "front,back"), "not with --rig"),
      (("--movers", "mug", "--changes", 2), "not at two visits"),
      (("--movers", "mug", "--scene", "loop"), "only the room"),
-     (("--movers", "mug", "--frames", LEAST_FRAMES - 1), f"at least {LEAST_FRAMES} frames")],
+     (("--movers", "mug", "--frames", MoverTuning.min_frames - 1), f"at least {MoverTuning.min_frames} frames")],
 )  # fmt: skip
 def test_what_cannot_move_is_refused(tmp_path: Path, words: tuple[object, ...], reason: str) -> None:
     done = ggslam("synth", tmp_path / "room", *words)

@@ -12,7 +12,7 @@ from command_line import ggslam
 
 from ggslam.errors import SequenceError
 from ggslam.sequences import open_sequence
-from ggslam.synthetic.changes import MOST_CHANGES, room_at_two_visits
+from ggslam.synthetic.changes import ChangeTuning, room_at_two_visits
 from ggslam.synthetic.scene import Scene
 
 
@@ -52,8 +52,8 @@ def test_moved_things_stand_free() -> None:
 
 
 def test_too_many_changes_are_refused() -> None:
-    with pytest.raises(SequenceError, match=f"expected 0 to {MOST_CHANGES}"):
-        room_at_two_visits(0, MOST_CHANGES + 1)
+    with pytest.raises(SequenceError, match=f"expected 0 to {ChangeTuning.max_changes}"):
+        room_at_two_visits(0, ChangeTuning.max_changes + 1)
 
 
 @pytest.mark.long("two recordings of a room are drawn")

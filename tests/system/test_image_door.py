@@ -14,7 +14,7 @@ import pytest
 from little_memory import with_little_memory
 
 from ggslam.errors import FormatError, MemoryFullError, RunFolderError
-from ggslam.system.images import MAX_PIXELS, PNG_SIGNATURE, claimed_size, decode_image, read_picture
+from ggslam.system.images import PNG_SIGNATURE, PictureLimits, claimed_size, decode_image, read_picture
 from ggslam.system.opencv import opencv_errors
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
@@ -86,7 +86,9 @@ def test_what_tells_no_size_is_not_decoded(content: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "most"), [((30000, 29000), MAX_PIXELS), ((9000, 9000), 3 * 100 * 3 * 80)], ids=["any", "of a known size"]
+    ("size", "most"),
+    [((30000, 29000), PictureLimits.max_pixels), ((9000, 9000), 3 * 100 * 3 * 80)],
+    ids=["any", "of a known size"],
 )
 def test_a_bomb_takes_no_memory(tmp_path: Path, size: tuple[int, int], most: int) -> None:
     """2.6 GB or 240 MB of pixels in at most 3 MB: within 100 MB of address space, less than 20 MB are taken."""

@@ -11,14 +11,7 @@ from ggslam.abi.arrays import address
 from ggslam.native.loader import NativeContext, available_instruction_sets, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, se3_exp, se3_log
-from ggslam.tracking.gicp import (
-    PLANE_VARIANCE,
-    AlignmentStatus,
-    GicpTarget,
-    align,
-    native_align_settings,
-    native_points,
-)
+from ggslam.tracking.gicp import AlignmentStatus, GicpTarget, GicpTuning, align, native_align_settings, native_points
 from ggslam.tracking.observability import about_point
 from ggslam.tracking.points import FramePoints, extract_points, grid_stride
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings, TargetSettings
@@ -94,7 +87,7 @@ def test_normal_equations_agree_with_numpy_and_finite_differences(context: Nativ
         reference.unpack(voxels["covariances"].astype(float))[match[used]], T[:3, :3],
     )  # fmt: skip
     given = (points.points[used].astype(float), points.weights[used].astype(float), voxels["means"][match[used]], M)
-    H_reference, b_reference = reference.normal_equations(*given, T, SETTINGS, NOISE, PLANE_VARIANCE)
+    H_reference, b_reference = reference.normal_equations(*given, T, SETTINGS, NOISE, GicpTuning.plane_variance)
     assert np.allclose(H, H_reference, rtol=1e-3, atol=1e-3 * np.abs(H_reference).max())
     assert np.allclose(b, b_reference, rtol=1e-3, atol=1e-3 * np.abs(b_reference).max())
     centre, gradient = T[:3, 3], np.zeros(6)
@@ -105,7 +98,7 @@ def test_normal_equations_agree_with_numpy_and_finite_differences(context: Nativ
             twist[k] = step
             moved = se3_exp(np.r_[np.zeros(3), twist[3:]]) @ T
             moved[:3, 3] = centre + twist[:3]
-            values.append(reference.cost(*given, moved, SETTINGS, NOISE, PLANE_VARIANCE))
+            values.append(reference.cost(*given, moved, SETTINGS, NOISE, GicpTuning.plane_variance))
         gradient[k] = (values[0] - values[1]) / 2e-6
     assert np.allclose(-2 * b, gradient, rtol=2e-3, atol=2e-3 * np.abs(gradient).max())
 

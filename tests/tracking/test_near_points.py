@@ -13,7 +13,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
 from ggslam.tracking.gicp import align
 from ggslam.tracking.gicp_tracker import GicpTracker
-from ggslam.tracking.motion import GREYS, CameraMotion
+from ggslam.tracking.motion import CameraMotion, MotionTuning
 from ggslam.tracking.points import extract_points, grid_stride, largest_weight
 from ggslam.tracking.settings import (
     AlignSettings,
@@ -95,10 +95,10 @@ def test_a_wary_tracker_bounds_near_points_for_a_while(frames: list[Frame]) -> N
 
 def test_images_that_suddenly_agree_far_less_are_noticed() -> None:
     motion = CameraMotion(np.eye(4))
-    for _ in range(GREYS):
+    for _ in range(MotionTuning.frames):
         assert not motion.is_sudden(0.5)  # what is usual is not known yet
         motion.note_greys(0.008)
     assert motion.is_sudden(0.03) and not motion.is_sudden(0.015)
-    for _ in range(GREYS):
+    for _ in range(MotionTuning.frames):
         motion.note_greys(0.03)
     assert not motion.is_sudden(0.04)  # a dark room is noisy all the time

@@ -9,12 +9,16 @@ import pytest
 from ggslam.scene.camera import Camera
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.points import FramePoints
-from ggslam.tracking.residual_noise import EVERY, FEWEST, ResidualNoise
+from ggslam.tracking.residual_noise import ResidualNoise, ResidualNoiseTuning
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
 
 
 def observed(
-    sigma: float, first: DepthNoise, frames: int = 2 * FEWEST, depth: float = 2.0, watch: ResidualNoise | None = None
+    sigma: float,
+    first: DepthNoise,
+    frames: int = 2 * ResidualNoiseTuning.min_measurements,
+    depth: float = 2.0,
+    watch: ResidualNoise | None = None,
 ) -> DepthNoise:
     """Noise after frames of points so far away whose distances to the surface have a standard deviation."""
     random, points = np.random.default_rng(0), np.zeros((2000, 3), np.float32)
@@ -63,6 +67,6 @@ def test_grey_values_are_compared_until_smooth_depth_has_shown_its_error(sigma: 
 
 def test_a_few_frames_are_no_evidence() -> None:
     first = DepthNoise(0.00025, 0.0)
-    assert observed(0.012, first, FEWEST - 1) is first
+    assert observed(0.012, first, ResidualNoiseTuning.min_measurements - 1) is first
     watch = ResidualNoise()
-    assert sum(watch.due() for _ in range(10 * EVERY)) == 10
+    assert sum(watch.due() for _ in range(10 * ResidualNoiseTuning.early_stride)) == 10

@@ -10,7 +10,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats.text_numbers import parse_numbers
 from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.system.untrusted_files import MAX_TEXT_BYTES, read_untrusted
+from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
 
 def read_pose_graph(path: str | Path) -> dict[str, np.ndarray]:
@@ -20,7 +20,7 @@ def read_pose_graph(path: str | Path) -> dict[str, np.ndarray]:
         FormatError: the file is missing, empty, or a line has something else.
     """
     path = Path(path)
-    lines = read_untrusted(path, MAX_TEXT_BYTES).splitlines()
+    lines = read_untrusted(path, FileTuning.max_text_bytes).splitlines()
     poses = {}
     for number, line in enumerate(lines, 1):
         words = line.split()

@@ -14,9 +14,9 @@ from typing import ClassVar
 from ggslam.errors import FormatError, GgslamError
 from ggslam.jobs.batch.manifest import BatchJob, Manifest, model_of, option
 from ggslam.runs.checkpoints import has_checkpoints
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.record import RecordFile
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.system.atomic import make_folder
 from ggslam.system.links import refuse_link
 from ggslam.system.tuning import Tuning

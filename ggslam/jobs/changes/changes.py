@@ -29,7 +29,7 @@ from ggslam.merging.settings import MergeSettings
 from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.records.changes import ChangesRecord
-from ggslam.runs.records.mark import RunRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.scene.poses import transform_points
 from ggslam.system.atomic import make_folder, write_failure, write_text
 from ggslam.system.json_files import json_ready

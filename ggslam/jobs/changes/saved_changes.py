@@ -14,7 +14,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.changes import ChangeRecord, ChangesRecord
 from ggslam.runs.writing import CHANGES_FOLDER
 from ggslam.scene.oriented_box import Vector
-from ggslam.system.images import MAX_PIXELS, read_picture
+from ggslam.system.images import PictureLimits, read_picture
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import refuse_links
 
@@ -25,7 +25,8 @@ class SavedChangesTuning(Tuning):
     pictures = 12
     """Pictures that a page shows."""
     max_pixels = 16_000_000
-    """Largest picture that is read, in pixels: two views of 8 megapixels. `MAX_PIXELS` limits the whole page."""
+    """Largest picture that is read, in pixels: two views of 8 megapixels. `PictureLimits.max_pixels` limits the whole
+    page."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def read_changes(place: Path, most: int = SavedChangesTuning.pictures) -> Change
     if record is None:
         raise ConfigError(f"{place}: holds no {ChangesRecord.FILE}; `ggslam changes OLD NEW --out FOLDER` writes one")
     named = [number for number, change in enumerate(record.changes) if change.picture]
-    found, unreadable, left = dict[int, np.ndarray](), list[str](), MAX_PIXELS
+    found, unreadable, left = dict[int, np.ndarray](), list[str](), PictureLimits.max_pixels
     for number in named[:most]:
         name = Path(record.changes[number].picture).name
         try:

@@ -17,7 +17,7 @@ from ggslam.geometry.icp import CloudRegistration
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.poses import fit_similarity, inverse
-from ggslam.sequences.association import TOLERANCE, pair_times
+from ggslam.sequences.association import PairingTuning, pair_times
 from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
@@ -65,7 +65,7 @@ def common_poses(a: Side, b: Side) -> np.ndarray:
     """Rows [M, 2] of poses at the same times."""
     if a.trajectory is None or b.trajectory is None:
         return np.empty((0, 2), np.int64)
-    return pair_times(a.trajectory.timestamps, b.trajectory.timestamps, TOLERANCE)
+    return pair_times(a.trajectory.timestamps, b.trajectory.timestamps, PairingTuning.tolerance_s)
 
 
 def by_trajectory(a: Side, b: Side, pairs: np.ndarray) -> np.ndarray:

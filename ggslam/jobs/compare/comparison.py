@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
-from ggslam.evaluation.geometry import THRESHOLDS_M, CloudScores, score_cloud
+from ggslam.evaluation.geometry import CloudScores, GeometryScoreTuning, score_cloud
 from ggslam.evaluation.trajectory import TrajectoryScores, score_trajectory
 from ggslam.formats.point_cloud import read_point_cloud
 from ggslam.formats.splat_formats import splat_format
@@ -110,8 +110,8 @@ class Comparison:
 
 
 def compare(
-    a: Path, b: Path, align: Alignment = "auto", max_distance: float = 0.05, thresholds: Sequence[float] = THRESHOLDS_M,
-    seed: int = 0,
+    a: Path, b: Path, align: Alignment = "auto", max_distance: float = 0.05,
+    thresholds: Sequence[float] = GeometryScoreTuning.thresholds_m, seed: int = 0,
 ) -> Comparison:  # fmt: skip
     """Compares A with B, B being the reference. Each is the folder of a run, or a PLY or PCD file with a cloud or mesh.
 

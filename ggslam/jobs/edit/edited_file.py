@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import ConfigError
-from ggslam.formats.positions import COARSE, coordinate_step
+from ggslam.formats.positions import PositionTuning, coordinate_step
 from ggslam.formats.splat_formats import write_splats
 from ggslam.formats.table import splat_writer
 from ggslam.jobs.edit.edit import Edit
@@ -82,7 +82,7 @@ def _edit_whole(
     turn = vector("rotation", edit.rotation) if edit.rotation else (0.0, 0.0, 0.0)
     middle = gaussians.means.double().mean(0).numpy()
     step = coordinate_step(float(np.abs(middle + shift).max()))
-    if step > COARSE:
+    if step > PositionTuning.coarse_m:
         raise ConfigError(
             f"`move` {WHOLE} {_text(shift)}: Gaussians are in single precision, which has steps of {step:.3g} m there; "
             "large offsets belong to the program that shows the map"

@@ -15,8 +15,8 @@ from ggslam.runs.copied_files import copy_files
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.publishing import publish_run
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import OBJECT_FILES, POINTS, REPORT_FILE, TRUTH_FILE, write_objects
 from ggslam.slam.saved_places import PLACES_FILE

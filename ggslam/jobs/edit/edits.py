@@ -42,8 +42,8 @@ from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
-from ggslam.system.plurals import counted
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 

@@ -15,7 +15,7 @@ from ggslam.errors import ConfigError, FormatError
 from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, arrays_of_map, gaussians_to_bytes
 from ggslam.jobs.submaps.stores import INDOORS, StoreMakingTuning
 from ggslam.runs.records.cells import CellMember, CellsRecord
-from ggslam.runs.records.mark import FileRecord
+from ggslam.runs.records.run_json import FileRecord
 from ggslam.runs.records.visit import VisitRecord
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.packed_arrays import unpack_bytes

@@ -25,15 +25,8 @@ import numpy as np
 
 from ggslam import __version__
 from ggslam.coding import CodecSettings, encode_cloud
-from ggslam.coding.outliers import SAMPLED, bulk_of
-from ggslam.coding.splats import (
-    POSITION_BITS,
-    finest_voxel,
-    means_of,
-    rest_range,
-    splat_attributes,
-    splat_settings,
-)
+from ggslam.coding.outliers import OutlierTuning, bulk_of
+from ggslam.coding.splats import SplatCodingTuning, finest_voxel, means_of, rest_range, splat_attributes, splat_settings
 from ggslam.errors import ConfigError, FormatError
 from ggslam.jobs.encode.coded_cells import HEAD, OBJECTS, VISIT
 from ggslam.jobs.progress import Observer, SilentObserver
@@ -46,7 +39,7 @@ from ggslam.jobs.submaps.cell_gaussians import (
 from ggslam.jobs.tasks.engines import Engine
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.runs.records.cells import CELLS_FORMAT, CELLS_VERSION, CellMember, CellsRecord
-from ggslam.runs.records.mark import FileRecord
+from ggslam.runs.records.run_json import FileRecord
 from ggslam.scene.packed_arrays import pack_bytes
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
@@ -205,8 +198,8 @@ def _file_of(key: CellKey) -> str:
 
 
 def _step(store: GridStore, counts: dict[CellKey, int]) -> float:
-    """Edge of the voxels: that of a grid of `POSITION_BITS` over the cells, but those of a few Gaussians far away."""
+    """Edge of the voxels: that of a grid of `position_bits` over the cells, but those of a few Gaussians far away."""
     keys = np.array(list(counts))
-    numbers = np.maximum(1, np.array(list(counts.values())) // max(1, sum(counts.values()) // SAMPLED))
+    numbers = np.maximum(1, np.array(list(counts.values())) // max(1, sum(counts.values()) // OutlierTuning.sample))
     extent = (np.ptp(bulk_of(np.repeat(keys, numbers, axis=0)), axis=0) + 1)[store.grid.spans].max()
-    return float(extent * store.grid.spacing) / (1 << POSITION_BITS)
+    return float(extent * store.grid.spacing) / (1 << SplatCodingTuning.position_bits)

@@ -24,9 +24,9 @@ from ggslam.reporting.pictures import write_picture
 from ggslam.reporting.plot_files import write_sheet
 from ggslam.reporting.plots import Plot, Series
 from ggslam.system.atomic import make_folder, write_text
-from ggslam.system.plurals import counted
 from ggslam.system.csv_text import csv_text
 from ggslam.system.json_files import write_json
+from ggslam.system.plurals import counted
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ from ggslam.sequences import Sequence
 from ggslam.sequences.rig import RigSequence
 from ggslam.slam.filters.camera_fixtures import CameraFixtures, find_fixtures
 from ggslam.system.atomic import make_folder, write_text
-from ggslam.system.plurals import counted
 from ggslam.system.csv_text import csv_text
+from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 
 

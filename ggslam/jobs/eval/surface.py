@@ -10,7 +10,7 @@ import numpy as np
 from ggslam.errors import FormatError, GgslamError
 from ggslam.evaluation.surface import SurfaceScores, score_surface
 from ggslam.formats.point_ply import METRIC_FILE, read_points
-from ggslam.formats.point_sampling import USUAL_VOXEL
+from ggslam.formats.point_sampling import PointSamplingTuning
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.frame import Frame
@@ -48,7 +48,7 @@ class SurfaceScorer:
             return
         self._points, self._voxel = cloud.points, cloud.voxel_size
         self._measured = np.zeros(len(self._points), bool)
-        self._times = max(1.0, self._voxel / USUAL_VOXEL)
+        self._times = max(1.0, self._voxel / PointSamplingTuning.voxel_m)
         self._tsdf = TsdfMap(surface_settings(self._voxel, self._times), points=False)
 
     def _cloud_of(self, folder: RunFolder) -> VoxelCloud | None:

@@ -35,15 +35,15 @@ from ggslam.localization.surface import SCAN_TARGET, FullSurface, PartialSurface
 from ggslam.native.loader import NativeContext
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
-from ggslam.scene.origin import GRID
+from ggslam.scene.origin import OriginTuning
 from ggslam.scene.poses import quaternion_to_matrix, separation
 from ggslam.sequences.rig import one_camera
 from ggslam.sequences.sequence import Sequence
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder
-from ggslam.system.plurals import counted
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.plurals import counted
 from ggslam.system.settings import tuning_note
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import TargetSettings
@@ -60,7 +60,7 @@ class LocateTuning(Tuning):
     """Letters of a run's fingerprint in the name of its store."""
     max_start_m = 1e7
     """Largest distance of a start pose from the map's origin, in metres."""
-    whole_voxel_m = GRID / 4
+    whole_voxel_m = OriginTuning.grid_m / 4
     """Coarser voxels for scans are a whole number of these, in metres, so that origins lie on the grid of the coarse
     voxels, which are four times as wide."""
     min_voxel_ratio = 1.5

@@ -26,7 +26,7 @@ from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import fingerprint, read_moving
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import MergedRecord, RunRecord
+from ggslam.runs.records.run_json import MergedRecord, RunRecord
 from ggslam.runs.records.sequence import PartRecord, SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.saving_parts import save_points

@@ -15,7 +15,7 @@ import torch
 
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.sight.margin import SIGMAS, Margin
+from ggslam.sight.margin import Margin, MarginTuning
 from ggslam.sight.view import View
 
 _KEPT = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
@@ -29,7 +29,10 @@ def find_seen(gaussians: GaussianMap, keyframes: Iterable[Keyframe], sigma: floa
         keyframes: with images.
         sigma: standard deviation of depth, metres.
     """
-    means, margin = gaussians.means.detach().numpy().astype(np.float64), Margin(sigmas=SIGMAS, constant=sigma)
+    means, margin = (
+        gaussians.means.detach().numpy().astype(np.float64),
+        Margin(sigmas=MarginTuning.sigmas, constant=sigma),
+    )
     left, found = np.arange(len(means)), np.zeros(len(means), bool)
     for keyframe in keyframes:
         view = View.of(keyframe.depth_m(), keyframe.camera, keyframe.T_world_camera, margin)

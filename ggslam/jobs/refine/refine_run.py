@@ -24,8 +24,8 @@ from ggslam.runs.copied_files import copy_files
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import publish_run
 from ggslam.runs.recordings import open_recording_of
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.movers import MOVER_FILES
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.saving_parts import save_points
 from ggslam.runs.writing import RUN_FILES, TRUTH_FILE, write_objects
 from ggslam.scene.gaussian_map import GaussianMap

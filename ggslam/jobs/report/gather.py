@@ -17,8 +17,8 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.records.sequence import RigRecord, SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.writing import REPORT_FILE, TRUTH_FILE

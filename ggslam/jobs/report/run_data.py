@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ggslam.jobs.changes.saved_changes import ChangesShown
-from ggslam.runs.records.mark import RunRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.movers import MoverRecord
+from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.records.sequence import SequenceRecord
 from ggslam.runs.records.timing import TimingRecord
 from ggslam.runs.records.verdict import RunVerdict

@@ -18,7 +18,7 @@ from ggslam.objects.table import ObjectTable
 from ggslam.runs.records.verdict import AspectRecord, Grade, worst
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
-from ggslam.slam.verdicts import LOST_SHARE
+from ggslam.slam.verdicts import VerdictTuning
 from ggslam.system.plurals import counted
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
@@ -121,7 +121,7 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
     jumps, dropped = path_jumps(result), len(result.dropped_frames)
     codes = {verdict.code for verdict in found}
     grades: list[Grade] = [
-        _at_most((lost + doubted) / max(1, total), LOST_SHARE, TrackingGradeTuning.bad_lost),
+        _at_most((lost + doubted) / max(1, total), VerdictTuning.lost_share, TrackingGradeTuning.bad_lost),
         "doubtful"
         if searched > TrackingGradeTuning.max_searched * total or len(jumps) or codes & {"degenerate", "dropped"}
         else "good",

@@ -39,9 +39,9 @@ from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.config import Config, load_config, settings_notes
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import reason_against_saving
-from ggslam.system.plurals import counted
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import StopRequest, stop_on_request
+from ggslam.system.plurals import counted
 
 T = TypeVar("T")
 

@@ -39,7 +39,7 @@ _CAUSES = (
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 
 
-class VerdictTuning(Tuning):
+class GainTuning(Tuning):
     """When a camera's gain changes."""
 
     same_gain = 1.3
@@ -188,7 +188,7 @@ def _start_later(result: SlamResult) -> str:
     gains = np.array([change_of(k.exposure) for k in ours])
     if not len(gains):
         return ""
-    usual = np.abs(np.log(gains / np.median(gains))) < np.log(VerdictTuning.same_gain)
+    usual = np.abs(np.log(gains / np.median(gains))) < np.log(GainTuning.same_gain)
     first = ours[int(usual.argmax())]
     source = {frame.frame_index: frame.source_index for frame in result.frames}.get(first.frame_index)
     return f"`start` {source}: the frames before have another exposure" if usual.any() and source else ""

@@ -27,8 +27,8 @@ from ggslam.slam.realtime import RealtimeSlam
 from ggslam.slam.result import SlamResult, StepReport, tracked_poses
 from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.slam import Slam
-from ggslam.system.plurals import counted
 from ggslam.system.interrupts import StopRequest
+from ggslam.system.plurals import counted
 from ggslam.system.staging import new_staging
 
 Follower = Callable[[Slam, Frame, StepReport], None]

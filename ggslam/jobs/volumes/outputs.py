@@ -36,8 +36,8 @@ from ggslam.runs.publishing import change_in_run
 from ggslam.runs.records.volumes import VolumesRecord
 from ggslam.scene.origin import moved_pose
 from ggslam.scene.poses import translation
-from ggslam.system.plurals import counted
 from ggslam.system.json_files import write_json
+from ggslam.system.plurals import counted
 from ggslam.system.staging import finish_saving, make_staging, publish
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name

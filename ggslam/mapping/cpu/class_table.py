@@ -8,8 +8,8 @@ from typing import Annotated
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
-from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
+from ggslam.mapping.class_numbers import ClassNumbers, ClassTuning, new_rows
+from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier, IdentityVectorTuning
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
 
@@ -28,8 +28,8 @@ class CpuClassTable:
 
     def __init__(self, rng: np.random.Generator, channels: int = IDENTITY_CHANNELS) -> None:
         self._rng, self._channels = rng, channels
-        self._rows = np.zeros((FIRST_CLASSES, channels + 1), np.float32)  # weights, then the bias
-        self._moments = np.zeros((2, FIRST_CLASSES, channels + 1), np.float32)
+        self._rows = np.zeros((ClassTuning.initial_rows, channels + 1), np.float32)  # weights, then the bias
+        self._moments = np.zeros((2, ClassTuning.initial_rows, channels + 1), np.float32)
         self._numbers = ClassNumbers()
         self._steps = 0
 
@@ -87,7 +87,7 @@ class CpuClassTable:
         class."""
         number = self._numbers.of(object_ids)
         weights = self._rows[: self.count, :-1]
-        codes = CODE_LENGTH * weights / np.maximum(np.linalg.norm(weights, axis=1, keepdims=True), 1e-12)
+        codes = ClassTuning.code_length * weights / np.maximum(np.linalg.norm(weights, axis=1, keepdims=True), 1e-12)
         return np.concatenate([codes, np.zeros((1, self._channels), np.float32)])[number]
 
     def members(
@@ -104,12 +104,15 @@ class CpuClassTable:
         Returns:
             Rows int64 [M] and the likeliest of `object_ids` [M].
         """
-        best, which = np.full(len(features), NOTHING_LOGIT, np.float32), np.zeros(len(features), np.int64)
+        best, which = (
+            np.full(len(features), IdentityVectorTuning.nothing_logit, np.float32),
+            np.zeros(len(features), np.int64),
+        )
         for k, number in enumerate(self._numbers.of(object_ids)):
             logits = features @ self._rows[number, :-1] + self._rows[number, -1]
             which[logits > best] = k
             np.maximum(best, logits, out=best)
-        rows = np.flatnonzero(best > NOTHING_LOGIT)
+        rows = np.flatnonzero(best > IdentityVectorTuning.nothing_logit)
         rival = self._numbers.of(rivals[rows])
         weights = self._rows[rival]
         of_rival = np.einsum("nf,nf->n", features[rows], weights[:, :-1]) + weights[:, -1]

@@ -10,7 +10,7 @@ import numpy as np
 from ggslam.abi.core import CrossEntropyOfPixels
 from ggslam.errors import RenderError
 from ggslam.native.loader import NativeContext, load_library
-from ggslam.scene.identity import NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IdentityClassifier, IdentityVectorTuning
 
 
 def cross_entropy(
@@ -43,7 +43,7 @@ def cross_entropy(
     gradient, rows = np.empty_like(features), np.empty((len(chosen), channels + 1), np.float32)
     job = CrossEntropyOfPixels(
         features.ctypes.data, true.ctypes.data, weight.ctypes.data, bias.ctypes.data, gradient.ctypes.data,
-        rows.ctypes.data, len(features), channels, len(chosen), NOTHING_LOGIT,
+        rows.ctypes.data, len(features), channels, len(chosen), IdentityVectorTuning.nothing_logit,
     )  # fmt: skip
     load_library().ggslam_cross_entropy_of_pixels(context.handle, ctypes.byref(job))
     return job.loss, gradient, rows

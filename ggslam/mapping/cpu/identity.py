@@ -13,7 +13,7 @@ from ggslam.mapping.cpu.class_table import CpuClassTable
 from ggslam.mapping.cpu.cross_entropy import cross_entropy
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import draw_pool
-from ggslam.mapping.identity import BIRTH_VOTE, MIN_WEIGHT, SPLIT_STRIDE, TERMS, IdentityLearner, MaskedKeyframe
+from ggslam.mapping.identity import IdentityLearner, IdentityTuning, MaskedKeyframe
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.votes import merge_votes, vote_labels, vote_labels_of
 from ggslam.rendering.cpu import CpuRasterizer
@@ -22,11 +22,16 @@ from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-KEPT_POOLS = 64
-"""Keyframes whose pixels drawn ahead are kept, 64 KB for each with the settings' defaults."""
-MANY_CLASSES = 128
-"""Beyond so many classes a step's softmax runs over those in its sample and this many others, drawn at random."""
+
+class CpuIdentityTuning(Tuning):
+    """Limits of identity learning on the CPU."""
+
+    kept_pools = 64
+    """Keyframes whose drawn pixels are kept; about 64 KB each with the default settings."""
+    other_classes = 128
+    """Classes outside a step's sample that its softmax includes, drawn at random if there are more."""
 
 
 @savable(not_saved="settings seed")
@@ -39,7 +44,7 @@ class CpuIdentityLearner(IdentityLearner):
         seed: of sampling.
     """
 
-    kept_pools = KEPT_POOLS
+    kept_pools = CpuIdentityTuning.kept_pools
     last_loss: float = float("nan")
     """Cross-entropy of the last step."""
 
@@ -71,7 +76,11 @@ class CpuIdentityLearner(IdentityLearner):
         splits = self._split_off(splits)
         if not splits:
             return
-        seen = np.arange(mask.size).reshape(mask.shape)[::SPLIT_STRIDE, ::SPLIT_STRIDE].reshape(-1)
+        seen = (
+            np.arange(mask.size)
+            .reshape(mask.shape)[:: IdentityTuning.split_stride, :: IdentityTuning.split_stride]
+            .reshape(-1)
+        )
         terms = rasterizer.pixel_terms(seen)
         used = np.arange(terms.weights.shape[1]) < terms.counts[:, None]
         gaussian, weight, size = terms.gaussians[used], terms.weights[used], len(gaussians)
@@ -98,7 +107,7 @@ class CpuIdentityLearner(IdentityLearner):
     def begin(self, gaussians: GaussianMap, rows: slice, labels: np.ndarray) -> None:
         ids = self.current(labels)
         gaussians.vote_ids.numpy()[rows, 0] = ids
-        gaussians.vote_weights.numpy()[rows, 0] = np.where(ids > 0, BIRTH_VOTE, 0)
+        gaussians.vote_weights.numpy()[rows, 0] = np.where(ids > 0, IdentityTuning.birth_vote, 0)
         if self.settings.initialisation == "votes":
             gaussians.features.numpy()[rows] = self.table.codes(ids)
         else:
@@ -113,7 +122,7 @@ class CpuIdentityLearner(IdentityLearner):
     ) -> None:  # fmt: skip
         assert keyframe.mask is not None
         labels = self.current(keyframe.mask.reshape(-1)[pixels])
-        terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
+        terms = rasterizer.pixel_terms(pixels, IdentityTuning.max_terms, IdentityTuning.min_weight)
         labels = self._as_mapped(gaussians, terms, labels)
         classes = self.table.classes(labels)
         if self.settings.schedule == "sampled" and (classes >= 0).any():
@@ -166,9 +175,11 @@ class CpuIdentityLearner(IdentityLearner):
 
     def _choose_competitors(self, classes: np.ndarray) -> np.ndarray:
         """Classes that a step's softmax runs over: all, or with very many those that appear and some others."""
-        if self.table.count <= MANY_CLASSES:
+        if self.table.count <= CpuIdentityTuning.other_classes:
             return np.arange(self.table.count)
-        return np.union1d(np.unique(classes), self._rng.choice(self.table.count, MANY_CLASSES, replace=False))
+        return np.union1d(
+            np.unique(classes), self._rng.choice(self.table.count, CpuIdentityTuning.other_classes, replace=False)
+        )
 
     def _pull_together(self, gaussians: GaussianMap) -> tuple[np.ndarray, np.ndarray]:
         """Rows [R] of the 3-D loss and their gradients float32 [R, F]; a row may appear more than once."""

@@ -12,7 +12,7 @@ from ggslam.mapping.cpu.exposure import ExposureAdam
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.rendering.exposure import (
-    BRIGHT,
+    ExposureTuning,
     SeenAgain,
     change_of,
     frame_weights,
@@ -24,14 +24,18 @@ from ggslam.rendering.exposure import (
     without_exposure,
 )
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-FEWEST_KEYFRAMES = 3
-"""So many exposures have to be known before one of them is called typical."""
-OVEREXPOSED = 1.1
-"""Where a keyframe is so much brighter than the map its saturated pixels are not compared: the map may be brighter."""
-BLURRED = 0.5
-"""A keyframe with less contrast from pixel to pixel than this share of the map's is out of focus; hands that shake
-leave 0.76 or more, a blur of four pixels 0.26."""
+
+class KeyframeExposureTuning(Tuning):
+    """When the colours of a keyframe are not used."""
+
+    min_keyframes = 3
+    """Fewest known exposures from which a typical one is computed."""
+    overexposed_gain = 1.1
+    """Gain from which saturated pixels of a keyframe are not compared: the map may be brighter there."""
+    min_contrast = 0.5
+    """Smallest contrast between neighbouring pixels, relative to the map's, of a keyframe in focus."""
 
 
 @savable()
@@ -141,7 +145,9 @@ class KeyframeExposures:
         if found is not None:
             self.known[keyframe.index] = True
             keyframe.exposure, self.optimizers[keyframe.index].anchor = found.copy(), found
-        self.blind[keyframe.index] = relative_sharpness(keyframe.color, seen, keyframe.exposure) < BLURRED
+        self.blind[keyframe.index] = (
+            relative_sharpness(keyframe.color, seen, keyframe.exposure) < KeyframeExposureTuning.min_contrast
+        )
 
     def is_exposed(self, keyframe: Keyframe) -> bool:
         """Whether a keyframe has an exposure of its own."""
@@ -151,8 +157,8 @@ class KeyframeExposures:
         """Where the colours of a keyframe tell something, bool [H, W]; None: everywhere."""
         if self.blind[keyframe.index]:
             return np.zeros(keyframe.color.shape[:2], bool)
-        if self.is_exposed(keyframe) and change_of(keyframe.exposure) > OVEREXPOSED:
-            return np.asarray((keyframe.color < BRIGHT * 255).all(2))
+        if self.is_exposed(keyframe) and change_of(keyframe.exposure) > KeyframeExposureTuning.overexposed_gain:
+            return np.asarray((keyframe.color < ExposureTuning.bright * 255).all(2))
         return None
 
     def typical(self, keyframes: Sequence[Keyframe]) -> np.ndarray | None:
@@ -162,7 +168,7 @@ class KeyframeExposures:
             return None
         weights = frame_weights([keyframe.frame_index for keyframe in keyframes])
         told = [k.index for k in keyframes if self.known[k.index] and not self.blind[k.index]]
-        if len(told) < FEWEST_KEYFRAMES:
+        if len(told) < KeyframeExposureTuning.min_keyframes:
             return None
         return typical_gain([keyframes[number].exposure[:, 0] for number in told], weights[told])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
@@ -130,8 +131,8 @@ def _pitch(color: np.ndarray, depth: np.ndarray, valid: np.ndarray | None) -> tu
     return (row, step) if alike and 1 <= step <= row <= _LONGEST_ROW else None
 
 
-_LONGEST_ROW = 1 << 15
-"""Pixels from row to row that the compiled core takes."""
+_LONGEST_ROW: Final = 1 << 15
+"""Most pixels between two rows that the compiled core accepts."""
 
 
 def _exposure(target: LossTarget[np.ndarray]) -> np.ndarray:

@@ -15,7 +15,7 @@ from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cpu.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
-from ggslam.mapping.identity import MIN_WEIGHT, TERMS
+from ggslam.mapping.identity import IdentityTuning
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
@@ -31,14 +31,18 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.array_forms import check_indices
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-FEW_LOOKS = 8
-"""Where fewer keyframes look for what surfaces hide, each looks with all its pixels; else with a quarter of them by
-turns, so that what one misses another one shows."""
-MOST_TERMS = 256
-"""Shares of a pixel that are looked at; a pixel has hardly more that count."""
-TERMS_AT_ONCE = 1 << 22
-"""Shares of pixels that are looked at together; each takes eight bytes."""
+
+class HiddenGaussianTuning(Tuning):
+    """Search for Gaussians behind surfaces."""
+
+    few_keyframes = 8
+    """Keyframes below which each looks with all its pixels. With more, each looks with a quarter of them by turns."""
+    max_terms = 256
+    """Most contributions to a pixel that are read."""
+    terms_at_once = 1 << 22
+    """Contributions that are read in one batch, of eight bytes each."""
 
 
 @savable(not_saved="settings residency extra_loss _rasterizer _loss _adam_of_pixel", check="check")
@@ -182,7 +186,7 @@ class CpuMapper(Mapper):
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
         height, width = alpha.shape
         grid = np.arange(height * width, dtype=np.int32).reshape(height, width)[::stride, ::stride]
-        terms = self._rasterizer.pixel_terms(grid.reshape(-1), TERMS, MIN_WEIGHT)
+        terms = self._rasterizer.pixel_terms(grid.reshape(-1), IdentityTuning.max_terms, IdentityTuning.min_weight)
         ids, share = terms.labels(self.vote_labels())
         ids, share = ids.reshape(grid.shape), share.reshape(grid.shape) * (alpha[::stride, ::stride] > 0.5)
         return MapLabels.from_grid(ids, share, depth, stride)
@@ -197,10 +201,14 @@ class CpuMapper(Mapper):
         born = self.map.birth_keyframe.numpy()
         stays = ~np.isin(born, [k.index for k in own if k.index not in untrained])
         for keyframe in own:
-            grid = WHOLE if len(own) < FEW_LOOKS else grid_of_turn(keyframe.index, keyframe.camera)
+            grid = (
+                WHOLE
+                if len(own) < HiddenGaussianTuning.few_keyframes
+                else grid_of_turn(keyframe.index, keyframe.camera)
+            )
             view = self._render(keyframe, features=False, grid=grid)
-            terms = min(int(1 / least) + 1, MOST_TERMS)  # a pixel has no more of such a share
-            pixels, some = np.arange(view.alpha.numel(), dtype=np.int32), TERMS_AT_ONCE // terms
+            terms = min(int(1 / least) + 1, HiddenGaussianTuning.max_terms)  # a pixel has no more of such a share
+            pixels, some = np.arange(view.alpha.numel(), dtype=np.int32), HiddenGaussianTuning.terms_at_once // terms
             for begin in range(0, len(pixels), some):
                 stays[self._rasterizer.pixel_terms(pixels[begin : begin + some], terms, least).rows()] = True
         self.map.keep(torch.from_numpy(stays))

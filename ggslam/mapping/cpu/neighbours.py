@@ -13,11 +13,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import NOTHING_LOGIT
+from ggslam.scene.identity import IdentityVectorTuning
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-MOST_POINTS = 65536
-"""Of a larger map neighbours are looked for among every second, third, ... Gaussian, as few as are at most so many."""
+
+class NeighbourTuning(Tuning):
+    """Neighbours for the regularisation of identity vectors."""
+
+    max_points = 65536
+    """Most Gaussians that are indexed. Of a larger map, every second, third, ... one is."""
+
+
 _COUNTERS = ("_growth", "_order", "_size", "_stride", "built")
 
 
@@ -56,10 +63,10 @@ class NeighbourIndex:
 
     def neighbours(self, gaussians: GaussianMap, rows: np.ndarray, k: int) -> np.ndarray:
         """int64 [M, k], the k nearest other Gaussians of each of `rows` [M]; k is less in a tiny map. In a map of more
-        than `MOST_POINTS` those of a part of it."""
+        than `NeighbourTuning.max_points` those of a part of it."""
         size, means = len(gaussians), gaussians.means.numpy()
         if self._tree is None or self._order != gaussians.order or size > self._size * (1 + self._growth):
-            self._stride = -(-size // MOST_POINTS)
+            self._stride = -(-size // NeighbourTuning.max_points)
             self._tree = self.tree_of(means[:: self._stride].copy())
             self._order, self._size = gaussians.order, size
             self.built += 1
@@ -94,7 +101,7 @@ def kl_gradient(logits: np.ndarray, neighbour_logits: np.ndarray) -> tuple[float
 
 def _log_softmax(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of the classes [..., C] and of nothing [..., 1]."""
-    highest = z.max(-1, keepdims=True, initial=NOTHING_LOGIT)
-    z, nothing = z - highest, NOTHING_LOGIT - highest
+    highest = z.max(-1, keepdims=True, initial=IdentityVectorTuning.nothing_logit)
+    z, nothing = z - highest, IdentityVectorTuning.nothing_logit - highest
     log_sum = np.log(np.exp(z).sum(-1, keepdims=True) + np.exp(nothing))
     return z - log_sum, nothing - log_sum

@@ -10,13 +10,18 @@ import numpy as np
 import torch
 
 from ggslam.cuda.streams import let_go
-from ggslam.mapping.class_numbers import CODE_LENGTH, FIRST_CLASSES, ClassNumbers, new_rows
+from ggslam.mapping.class_numbers import ClassNumbers, ClassTuning, new_rows
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.identity import IDS
-from ggslam.scene.identity import IDENTITY_CHANNELS, NOTHING_LOGIT, IdentityClassifier
+from ggslam.scene.identity import IDENTITY_CHANNELS, IdentityClassifier, IdentityVectorTuning
+from ggslam.system.tuning import Tuning
 
-_LOGITS_AT_ONCE = 2**24
-"""Of many vectors so many logits are in memory at a time."""
+
+class CudaClassTuning(Tuning):
+    """Limits of the classifier on a GPU."""
+
+    logits_at_once = 2**24
+    """Logits that are in memory at a time."""
 
 
 class CudaClassTable:
@@ -33,8 +38,8 @@ class CudaClassTable:
     ) -> None:
         self._rng, self._kernels, self._channels, self._device = rng, kernels, channels, kernels.device
         self._numbers = ClassNumbers()
-        self._rows = self._zeros(FIRST_CLASSES)  # weights, then the bias
-        self._moments = (self._zeros(FIRST_CLASSES), self._zeros(FIRST_CLASSES))
+        self._rows = self._zeros(ClassTuning.initial_rows)  # weights, then the bias
+        self._moments = (self._zeros(ClassTuning.initial_rows), self._zeros(ClassTuning.initial_rows))
         self._steps = torch.zeros(1, dtype=torch.int32, device=self._device)
         self.ids = torch.zeros(0, dtype=torch.int32, device=self._device)
         """Object id of each class, int32 [count]."""
@@ -111,7 +116,11 @@ class CudaClassTable:
     def codes(self, object_ids: torch.Tensor) -> torch.Tensor:
         """Identity vectors that the classifier takes for these objects (int32 [M] on the device), float32 [M, F]; zeros
         for those without a class."""
-        codes = CODE_LENGTH * self.weight / torch.linalg.vector_norm(self.weight, dim=1, keepdim=True).clamp_min(1e-12)
+        codes = (
+            ClassTuning.code_length
+            * self.weight
+            / torch.linalg.vector_norm(self.weight, dim=1, keepdim=True).clamp_min(1e-12)
+        )
         padded = torch.cat([torch.zeros(1, self._channels, device=self._device), codes])
         return padded[self.class_of[object_ids.long()].long() + 1]
 
@@ -123,12 +132,14 @@ class CudaClassTable:
         """Most probable object of each identity vector [N, F], int32 [N]; 0 where nothing is more probable than every
         object, and below `min_confidence`."""
         out = torch.zeros(len(features), dtype=torch.int32, device=self._device)
-        part = max(1, _LOGITS_AT_ONCE // max(1, self.count))
+        part = max(1, CudaClassTuning.logits_at_once // max(1, self.count))
         for begin in range(0, len(features) if self.count else 0, part):
             logits = self.logits(features[begin : begin + part])
             highest, best = logits.max(1)
-            probability = 1 / ((logits - highest[:, None]).exp().sum(1) + (NOTHING_LOGIT - highest).exp())
-            something = (highest > NOTHING_LOGIT) & (probability >= min_confidence)
+            probability = 1 / (
+                (logits - highest[:, None]).exp().sum(1) + (IdentityVectorTuning.nothing_logit - highest).exp()
+            )
+            something = (highest > IdentityVectorTuning.nothing_logit) & (probability >= min_confidence)
             out[begin : begin + part] = torch.where(something, self.ids[best], 0)
         return out
 
@@ -137,7 +148,7 @@ class CudaClassTable:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Vectors [N, F] that are more probably one of some objects (with classes, [K]) than nothing and than a rival
         of their own (int32 [N]; without a class: none): bool [N], and the likeliest of `object_ids`, int32 [N]."""
-        best = torch.full((len(features),), NOTHING_LOGIT, device=self._device)
+        best = torch.full((len(features),), IdentityVectorTuning.nothing_logit, device=self._device)
         which = torch.zeros(len(features), dtype=torch.int32, device=self._device)
         for object_id, number in zip(object_ids.tolist(), self._numbers.of(object_ids).tolist(), strict=True):
             logits = torch.mv(features, self._rows[number, :-1]) + self._rows[number, -1]
@@ -146,7 +157,7 @@ class CudaClassTable:
         rival = self.class_of[rivals.long()].long()
         rows = self.rows[rival.clamp_min(0)]
         of_rival = (features * rows[:, :-1]).sum(1) + rows[:, -1]
-        return (best > NOTHING_LOGIT) & ((rival < 0) | (of_rival < best)), which
+        return (best > IdentityVectorTuning.nothing_logit) & ((rival < 0) | (of_rival < best)), which
 
     # --- training -----------------------------------------------------------------------------------------------------
 

@@ -20,15 +20,7 @@ from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.neighbours import cuda_neighbours
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
-from ggslam.mapping.identity import (
-    BIRTH_VOTE,
-    IDS,
-    MIN_WEIGHT,
-    SPLIT_STRIDE,
-    TERMS,
-    IdentityLearner,
-    MaskedKeyframe,
-)
+from ggslam.mapping.identity import IDS, IdentityLearner, IdentityTuning, MaskedKeyframe
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.mapping.votes import merge_votes, vote_labels
@@ -38,15 +30,26 @@ from ggslam.rendering.pixel_terms import FeatureAdamSettings
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import SH_C0, GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
+from ggslam.system.tuning import Tuning
 
 Neighbours = Callable[[torch.Tensor, torch.Tensor, int, CudaLibrary], torch.Tensor]
 """Of points (float32 [N, 3]), rows (int64 [M]) and k: the k nearest other points of each of the rows, int64 [M, k]."""
-LOGITS_AT_ONCE = 2**24
-"""The dense schedule takes as many pixels at a time as make so many logits; the 3-D loss no more than a tenth of it."""
-KEPT_POOLS = 256
-"""Keyframes whose pixels drawn ahead are kept, 64 KB for each with the settings' defaults. Those drawn first go."""
-SPLIT_PIXELS, SPLIT_TERMS, SPLIT_MIN_WEIGHT = 32768, 48, 1e-3
-"""A split looks at so many pixels at a time, with so many contributions to each, none lighter."""
+
+
+class CudaIdentityTuning(Tuning):
+    """Limits of identity learning on a GPU."""
+
+    logits_at_once = 2**24
+    """Logits computed in one batch of the dense schedule; the 3-D loss computes a tenth of it."""
+    kept_pools = 256
+    """Keyframes whose drawn pixels are kept, about 64 KB each with the default settings. The oldest are dropped
+    first."""
+    split_pixels = 32768
+    """Pixels that a split of an object reads in one batch."""
+    split_terms = 48
+    """Most contributions to a pixel that a split reads."""
+    split_min_weight = 1e-3
+    """Smallest weight, in [0, 1], of a contribution that a split reads."""
 
 
 class CudaMaskedKeyframe(MaskedKeyframe, Protocol):
@@ -71,7 +74,7 @@ class CudaIdentityLearner(IdentityLearner):
         NativeCoreError: the compiled kernels do not fit this code.
     """
 
-    kept_pools = KEPT_POOLS
+    kept_pools = CudaIdentityTuning.kept_pools
 
     def __init__(
         self,
@@ -131,16 +134,22 @@ class CudaIdentityLearner(IdentityLearner):
         splits = self._split_off(splits)
         if not splits:
             return
-        grid = np.arange(mask.size, dtype=np.int32).reshape(mask.shape)[::SPLIT_STRIDE, ::SPLIT_STRIDE].reshape(-1)
+        grid = (
+            np.arange(mask.size, dtype=np.int32)
+            .reshape(mask.shape)[:: IdentityTuning.split_stride, :: IdentityTuning.split_stride]
+            .reshape(-1)
+        )
         seen = torch.from_numpy(grid).to(self.device)
         seen_as = torch.from_numpy(self.current(mask.reshape(-1)[grid]).astype(np.int32)).to(self.device)
         everywhere, *here = (torch.zeros(len(gaussians), device=self.device) for _ in range(1 + len(splits)))
-        for begin in range(0, len(seen), SPLIT_PIXELS):
-            pixels = seen[begin : begin + SPLIT_PIXELS].contiguous()
-            terms = rasterizer.pixel_terms(pixels, SPLIT_TERMS, SPLIT_MIN_WEIGHT)
+        for begin in range(0, len(seen), CudaIdentityTuning.split_pixels):
+            pixels = seen[begin : begin + CudaIdentityTuning.split_pixels].contiguous()
+            terms = rasterizer.pixel_terms(pixels, CudaIdentityTuning.split_terms, CudaIdentityTuning.split_min_weight)
             everywhere += terms.weight_sums(len(gaussians))
             for k, (_, part) in enumerate(splits):
-                here[k] += terms.weight_sums(len(gaussians), (seen_as[begin : begin + SPLIT_PIXELS] == part).float())
+                here[k] += terms.weight_sums(
+                    len(gaussians), (seen_as[begin : begin + CudaIdentityTuning.split_pixels] == part).float()
+                )
         changed = torch.zeros(len(gaussians), dtype=torch.bool, device=self.device)
         for k, (whole, part) in enumerate(splits):
             chosen = here[k] > 0.5 * everywhere.clamp_min(1e-9)
@@ -167,7 +176,7 @@ class CudaIdentityLearner(IdentityLearner):
     def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
         ids = self._device_alias[labels.long()]
         gaussians.vote_ids[rows, 0] = ids
-        gaussians.vote_weights[rows, 0] = BIRTH_VOTE * (ids > 0)
+        gaussians.vote_weights[rows, 0] = IdentityTuning.birth_vote * (ids > 0)
         if self.settings.initialisation == "votes":
             gaussians.features[rows] = self.table.codes(ids)
         else:
@@ -182,7 +191,7 @@ class CudaIdentityLearner(IdentityLearner):
         vote_weights: torch.Tensor, rate_factor: float,
     ) -> None:  # fmt: skip
         labels = self._kernels.labels(_mask_of(keyframe), pixels, self._device_alias)
-        terms = rasterizer.pixel_terms(pixels, TERMS, MIN_WEIGHT)
+        terms = rasterizer.pixel_terms(pixels, IdentityTuning.max_terms, IdentityTuning.min_weight)
         labels = self._as_mapped(gaussians, terms, labels)
         if self.settings.schedule == "sampled" and self.table.count:
             self._train(gaussians, terms, labels, vote_weights, rate_factor)
@@ -223,7 +232,7 @@ class CudaIdentityLearner(IdentityLearner):
         )
         features, out = view.features.view(IDENTITY_CHANNELS, size), torch.empty_like(view.features)
         losses, rows = torch.empty(size, device=self.device), torch.zeros_like(self.table.rows)
-        part = max(1, LOGITS_AT_ONCE // max(1, self.table.count))
+        part = max(1, CudaIdentityTuning.logits_at_once // max(1, self.table.count))
         for begin in range(0, size, part):
             here = slice(begin, begin + part)
             gradient, of_rows = self.table.cross_entropy(
@@ -243,7 +252,7 @@ class CudaIdentityLearner(IdentityLearner):
         """Rows int64 [R] of the 3-D loss and their gradients float32 [R, F]; a row may appear more than once."""
         s, classes, size = self.settings.neighbours, self.table.count, len(gaussians)
         k = min(s.neighbours, size - 1)
-        samples = min(s.samples, max(16, LOGITS_AT_ONCE // 10 // ((k + 1) * classes)))
+        samples = min(s.samples, max(16, CudaIdentityTuning.logits_at_once // 10 // ((k + 1) * classes)))
         rows = torch.randint(size, (samples,), generator=self._drawer.generator, device=self.device)
         near = self._neighbours(gaussians.means, rows, k, self.library)
         pulled = torch.cat([rows, near.reshape(-1)])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -29,8 +29,8 @@ from ggslam.scene.camera import Camera
 
 _NUMBERS = ("alpha_threshold", "depth_tolerance_m", "depth_tolerance_relative", "scale_pixels", "flatness",
             "max_slope", "texture_threshold", "max_depth_m")  # fmt: skip
-_MOST_PIXELS = 1 << 29
-"""Pixels and points for filling are numbered together in 31 bits."""
+_MOST_PIXELS: Final = 1 << 29
+"""Most pixels of an image: the kernels number pixels and points for filling together in 31 bits."""
 
 
 

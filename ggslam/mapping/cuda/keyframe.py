@@ -12,10 +12,14 @@ import torch
 from ggslam.cuda.transfers import upload
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.keyframe import Keyframe
+from ggslam.system.tuning import Tuning
 
-IMAGE_BYTES = 512_000_000
-"""Images of keyframes kept on the device; beyond, those that were used longest ago go and are uploaded again when they
-are needed (2 MB for 640x480, a tenth of a millisecond)."""
+
+class DeviceImageTuning(Tuning):
+    """Images of keyframes on a GPU."""
+
+    max_bytes = 512_000_000
+    """Most bytes of images kept on the device. The least recently used ones are dropped and uploaded again."""
 
 
 @dataclass
@@ -99,7 +103,7 @@ class ImageStore:
         limit: bytes.
     """
 
-    def __init__(self, device: torch.device, limit: int = IMAGE_BYTES) -> None:
+    def __init__(self, device: torch.device, limit: int = DeviceImageTuning.max_bytes) -> None:
         self._device, self._limit = device, limit
         self._images: OrderedDict[int, CudaKeyframeImages] = OrderedDict()
         self.nbytes = 0

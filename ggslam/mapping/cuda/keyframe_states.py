@@ -20,10 +20,17 @@ from ggslam.cuda.streams import let_go
 from ggslam.errors import RenderError
 from ggslam.mapping.losses import LossValues
 from ggslam.mapping.settings import ExposureSettings
+from ggslam.system.tuning import Tuning
 
 _RESULTS = torch.Size([len(LossValues.__dataclass_fields__) + 6])
 _TWIST, _FLAG = torch.Size([6]), torch.Size([1])
-_FIRST_ROOM = 64
+
+
+class KeyframeStateTuning(Tuning):
+    """Table of the keyframes' poses and exposures on a GPU."""
+
+    initial_rows = 64
+    """Rows allocated at the start."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,7 @@ class KeyframeStates:
         self.library, self.device = library_and_device(device, library)
         self._count = 0
         self._stream: torch.cuda.Stream | None = None  # that rows were written on last
-        self._use(self._new_table(_FIRST_ROOM))
+        self._use(self._new_table(KeyframeStateTuning.initial_rows))
         self.totals = torch.zeros(6, dtype=torch.float64, device=self.device)
         """On the device, float64 [6]: the numbers of `IterationSums` in their order."""
         self.totals[4].fill_(torch.nan)

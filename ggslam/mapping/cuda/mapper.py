@@ -26,7 +26,7 @@ from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
-from ggslam.mapping.mapper import WHOLE_END_SHARE, LossSums, Mapper
+from ggslam.mapping.mapper import LossSums, Mapper, MapperTuning
 from ggslam.mapping.pixel_grid import WHOLE, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
@@ -180,7 +180,7 @@ class CudaMapper(Mapper):
         return WHOLE
 
     def last_iterations(self, before: int) -> int:
-        return round(WHOLE_END_SHARE * before)
+        return round(MapperTuning.all_pixels_end_share * before)
 
     def _render(
         self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE, close_below: float = 0.0

@@ -11,9 +11,14 @@ import torch
 from ggslam.abi.cuda import MOST_NEIGHBOURS, NeighbourJob
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
+from ggslam.system.tuning import Tuning
 
-_DISTANCES_AT_ONCE = 1 << 24
-"""Distances that the search for many neighbours keeps at a time."""
+
+class CudaNeighbourTuning(Tuning):
+    """Search for neighbours on a GPU."""
+
+    distances_at_once = 1 << 24
+    """Distances that are in memory at a time."""
 
 
 def cuda_neighbours(points: torch.Tensor, rows: torch.Tensor, k: int, library: CudaLibrary) -> torch.Tensor:
@@ -66,7 +71,7 @@ def _check(points: torch.Tensor, rows: torch.Tensor, library: CudaLibrary) -> No
 def _by_sorting(points: torch.Tensor, rows: torch.Tensor, k: int) -> torch.Tensor:
     """The slower way, for more neighbours than a warp has lanes."""
     found = []
-    for part in rows.split(max(1, _DISTANCES_AT_ONCE // points.shape[0])):
+    for part in rows.split(max(1, CudaNeighbourTuning.distances_at_once // points.shape[0])):
         distances = torch.zeros(part.shape[0], points.shape[0], device=points.device)
         for coordinate in points.unbind(1):
             distances += (coordinate[part][:, None] - coordinate).square_()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ctypes
 import weakref
 from dataclasses import dataclass, field
+from typing import Final
 
 import torch
 
@@ -16,9 +17,17 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
 from ggslam.rendering.types import GaussianTensors, RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.system.tuning import Tuning
 
-_MAX_PAIRS = 2**31 - 1
-_STEP = 4096
+_MAX_PAIRS: Final = 2**31 - 1
+"""Largest number of pairs: kernels number them in 31 bits."""
+
+
+class PairRoomTuning(Tuning):
+    """Room for pairs of a Gaussian and a tile."""
+
+    step = 4096
+    """The room is a multiple of this many pairs."""
 
 
 class Counter:
@@ -67,7 +76,8 @@ class Counter:
         if self._needed == 0:
             return None
         # Whole steps, so that the plan of the memory stays the same for a while.
-        room = (self._needed + self._needed // 4 + self.spare_pairs + _STEP - 1) // _STEP * _STEP
+        step = PairRoomTuning.step
+        room = (self._needed + self._needed // 4 + self.spare_pairs + step - 1) // step * step
         return min(room, _MAX_PAIRS)
 
     def __del__(self) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass, field
+from typing import Final
 
 import torch
 
@@ -22,7 +23,8 @@ from ggslam.rendering.adam import ADAM_GROUPS
 from ggslam.rendering.pixel_terms import MAX_CHANNELS, FeatureAdamSettings
 from ggslam.scene.gaussian_map import VOTE_SLOTS, GaussianMap
 
-_MAX_PLACES = 2**31 - 1
+_MAX_PLACES: Final = 2**31 - 1
+"""Largest number of terms: kernels number them in 31 bits."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import pydantic
 
-from ggslam.runs.records.mark import FileRecord
 from ggslam.runs.records.record import Record
+from ggslam.runs.records.run_json import FileRecord
 from ggslam.submaps.settings import GridAxes
 
 CELLS_FORMAT, CELLS_VERSION = "ggslam cells", 2

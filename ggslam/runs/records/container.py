@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import pydantic
 
-from ggslam.runs.records.mark import FileRecord
 from ggslam.runs.records.record import Record
+from ggslam.runs.records.run_json import FileRecord
 
 CONTAINER_FORMAT = "ggslam map"
-CONTAINER_VERSION = 2
+CONTAINER_VERSION: Final = 2
+"""Version of the format of map containers."""
 
 
 class ContainerRecord(Record):

@@ -12,6 +12,7 @@ from ggslam.mapping.keyframe import ELSEWHERE
 from ggslam.rendering.exposure import frame_weights, identity_exposure, typical_gain
 from ggslam.runs.records.record import Array, NumberOrNone, Record, RecordFile
 from ggslam.slam.result import SlamResult
+from ggslam.system.plurals import agreeing, counted
 
 
 class KeyframeRecord(Record):
@@ -92,7 +93,8 @@ class KeyframesRecord(RecordFile):
     def notes(self) -> list[str]:
         """What a user should know, a line each."""
         recovered = sum(f.status == "recovered" for f in self.frames)
-        return [f"{recovered} frames were located only after another start was tried (recovered)"] if recovered else []
+        were = f"{counted(recovered, 'frame')} {agreeing(recovered, 'was', 'were')}"
+        return [f"{were} located only after another start was tried (recovered)"] if recovered else []
 
     def poses(self) -> dict[int, np.ndarray]:
         """T_world_camera [4, 4] of each frame that was not lost, by its index, from the keyframes as refined.

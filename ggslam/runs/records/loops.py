@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from ggslam.runs.records.record import Number, Record, RecordFile
 from ggslam.slam.result import SlamResult
+from ggslam.system.plurals import counted
 
 
 class LoopEventRecord(Record):
@@ -61,9 +62,8 @@ class LoopsRecord(RecordFile):
             elif stretch.after is not None:
                 reason = reasons.get(stretch.after)
                 ending = f", found again at frame {stretch.after}" + (f": {reason}" if reason else "")
-            notes.append(
-                f"lost for {stretch.frames} frames ({stretch.seconds:.2f} s) from frame {stretch.first}{ending}"
-            )
+            length = f"{counted(stretch.frames, 'frame')} ({stretch.seconds:.2f} s)"
+            notes.append(f"lost for {length} from frame {stretch.first}{ending}")
         return notes
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 from ggslam.runs.records.record import RecordFile
 from ggslam.runs.records.sequence import OpenRecord
 from ggslam.system.json_files import json_ready
 
-VERSION = 3
-"""Of the format of checkpoints."""
+VERSION: Final = 3
+"""Version of the format of checkpoints."""
 
 
 class StartRecord(RecordFile):

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from ggslam.runs.records.record import Number, NumberOrNone, Record, RecordFile
 from ggslam.slam.result import SlamResult
+from ggslam.system.plurals import agreeing, counted
 from ggslam.system.process_memory import peak_memory_mb
 
 
@@ -68,5 +69,6 @@ class TimingRecord(RecordFile):
         """What a user should know, a line each."""
         if not self.dropped_frames:
             return []
-        first = self.dropped_frames[0]
-        return [f"{len(self.dropped_frames)} frames were dropped because the run fell behind (the first: {first})"]
+        first, count = self.dropped_frames[0], len(self.dropped_frames)
+        were = f"{counted(count, 'frame')} {agreeing(count, 'was', 'were')}"
+        return [f"{were} dropped because the run fell behind (the first: {first})"]

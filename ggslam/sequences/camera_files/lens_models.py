@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from ggslam.errors import SequenceError
@@ -10,8 +12,8 @@ from ggslam.errors import SequenceError
 OPENCV_NAMES = ("opencv", "plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "pinhole", "perspective")
 FISHEYE_NAMES = ("fisheye", "equidistant", "kannalabrandt8", "kannala_brandt", "opencv_fisheye")
 NO_DISTORTION = ("none", "no_distortion", "rectified")
-COUNTS = (4, 5, 8, 12, 14)
-"""Coefficients that OpenCV takes: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [two tilts]]]]."""
+COUNTS: Final = (4, 5, 8, 12, 14)
+"""Numbers of coefficients that OpenCV takes: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [two tilts]]]]."""
 
 
 def distortion_of(place: object, model: str, values: np.ndarray) -> tuple[np.ndarray | None, bool]:

@@ -8,9 +8,14 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import SequenceError
+from ggslam.system.tuning import Tuning
 
-MOST_SKEW = 1e-3
-"""Of the focal length: what rounding leaves. A pinhole camera of four numbers has no skew."""
+
+class MatrixTuning(Tuning):
+    """When a camera matrix is a pinhole camera."""
+
+    max_skew = 1e-3
+    """Largest skew that rounding may leave, as a share of the focal length."""
 
 
 def matrix_numbers(place: object, value: Any) -> np.ndarray:
@@ -50,6 +55,6 @@ def intrinsics_of_matrix(place: object, numbers: np.ndarray) -> dict[str, float]
         raise SequenceError(f"{place}: expected positive focal lengths, found fx {fx:g}, fy {fy:g}")
     if K[2].tolist() != [0, 0, 1] or K[1, 0] != 0:
         raise SequenceError(f"{place}: expected a camera matrix [fx 0 cx; 0 fy cy; 0 0 1], found {K.tolist()}")
-    if abs(K[0, 1]) > MOST_SKEW * fx:
+    if abs(K[0, 1]) > MatrixTuning.max_skew * fx:
         raise SequenceError(f"{place}: a camera matrix with skew ({K[0, 1]:g}) is not supported")
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -26,8 +26,8 @@ COLMAP_MODELS: dict[str, tuple[str, str]] = {
 }
 """COLMAP's model -> its parameters in order, and the lens model that they are of."""
 COEFFICIENTS = {"opencv": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), "fisheye": ("k1", "k2", "k3", "k4")}
-COLMAP_CORNER = 0.5
-"""COLMAP counts pixels from the corner of the image; here the centre of the first pixel is 0."""
+COLMAP_CORNER: Final = 0.5
+"""COLMAP's pixel coordinates start at the image's corner; here the centre of the first pixel is 0."""
 
 
 def from_text(place: object, text: str) -> Entries:

@@ -31,10 +31,10 @@ from ggslam.sequences.pose_files import (
 )
 from ggslam.sequences.recording import (
     NO_OPTIONS,
-    NOMINAL_RATE,
     FrameFiles,
     ReadOptions,
     Recording,
+    RecordingTuning,
     image_numbers,
     missing_depth_problems,
     nominal_timestamps,
@@ -133,7 +133,7 @@ def _timestamps(
         return times, path.name
     if pairs.times is not None:
         return pairs.times, OF_NAMES
-    rate = number_entry(camera_file, settings, "frame_rate") if "frame_rate" in settings else NOMINAL_RATE
+    rate = number_entry(camera_file, settings, "frame_rate") if "frame_rate" in settings else RecordingTuning.rate_hz
     if rate <= 0:
         raise SequenceError(f"{camera_file}: expected a positive 'frame_rate', found {rate:g}")
     source = f"{rate:g} frames/s of {camera_file.name}" if "frame_rate" in settings else f"nominal {rate:g} frames/s"

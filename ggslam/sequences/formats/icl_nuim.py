@@ -9,6 +9,7 @@ as it looks. Trajectories are thus those of the file with y mirrored.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -25,7 +26,8 @@ from ggslam.sequences.recording import (
 )
 
 CAMERA = Camera(640, 480, 481.20, 480.0, 319.5, 239.5)
-DEPTH_SCALE = 5000.0
+DEPTH_SCALE: Final = 5000.0
+"""Units per metre of ICL-NUIM's depth images."""
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 

@@ -27,9 +27,16 @@ from ggslam.sequences.recording import (
     missing_depth_problems,
     nominal_timestamps,
 )
+from ggslam.system.tuning import Tuning
 
-MEDIUM, HIGH = 27, 155
-"""Grey values from which confidence counts as medium and high: half-way between the values that are written."""
+
+class ConfidenceTuning(Tuning):
+    """From which grey value Polycam's confidence counts as medium and high: half-way between the stored values."""
+
+    medium = 27
+    """Smallest grey value of medium confidence."""
+    high = 155
+    """Smallest grey value of high confidence."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,7 @@ class PolycamConfidence:
 
     def read(self) -> np.ndarray:
         grey = read_confidence(self.path)
-        return (grey >= MEDIUM).astype(np.uint8) + (grey >= HIGH)
+        return (grey >= ConfidenceTuning.medium).astype(np.uint8) + (grey >= ConfidenceTuning.high)
 
 
 class PolycamFormat:

@@ -21,11 +21,17 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.pixel_grid import ImageGeometry, image_size
 from ggslam.sequences.recording import NO_OPTIONS, DepthCamera, FrameFiles, NumberedImage, ReadOptions, Recording
+from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import open_untrusted
 
-TIMEOUT_MS = 5000
-SNIFFED = 1 << 20
-"""Bytes of a .bag that are searched for the topics of a RealSense recording."""
+
+class RealsenseTuning(Tuning):
+    """How long a camera or a file is waited for or searched."""
+
+    timeout_ms = 5000
+    """Longest wait for a frame, in milliseconds."""
+    sniffed_bytes = 1 << 20
+    """Bytes of a .bag file that are searched for RealSense's topics."""
 
 
 def _library() -> Any:
@@ -104,7 +110,7 @@ class Device:
     def pairs(self) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
         """Time in seconds, colour uint8 [H, W, 3] RGB, depth uint16 [H, W], for as long as they come."""
         while True:
-            arrived, frames = self._pipeline.try_wait_for_frames(TIMEOUT_MS)
+            arrived, frames = self._pipeline.try_wait_for_frames(RealsenseTuning.timeout_ms)
             if not arrived:
                 return
             color, depth = frames.get_color_frame(), frames.get_depth_frame()
@@ -207,7 +213,7 @@ class RealSenseFormat:
         if not path.is_file() or path.suffix.lower() != ".bag":
             return False
         with open_untrusted(path, SequenceError) as file:
-            return b"/device_0/sensor_" in file.read(SNIFFED)
+            return b"/device_0/sensor_" in file.read(RealsenseTuning.sniffed_bytes)
 
     def read(self, path: Path, options: ReadOptions = NO_OPTIONS) -> Recording:
         playback = Playback(path, options)

@@ -25,17 +25,22 @@ from ggslam.sequences.lzfse_blocks import END, claimed_bytes
 from ggslam.sequences.pose_files import pose_of_numbers, poses_of_frames
 from ggslam.sequences.recording import (
     NO_OPTIONS,
-    NOMINAL_RATE,
     FrameFiles,
     ReadOptions,
     Recording,
+    RecordingTuning,
     natural_key,
     nominal_timestamps,
 )
 from ggslam.system.images import find_damage
+from ggslam.system.tuning import Tuning
 
-LARGEST_IMAGE = 64_000_000
-"""Bytes; what a damaged file may claim is not believed beyond."""
+
+class Record3dTuning(Tuning):
+    """A limit on damaged files."""
+
+    max_image_bytes = 64_000_000
+    """Largest decompressed image, in bytes."""
 
 
 class Record3DFormat:
@@ -80,12 +85,14 @@ def _depth_size(archive: Archive, metadata: dict[str, Any], place: str, colors: 
     for name in (f"{color.removesuffix('.jpg')}.depth" for color in colors):
         try:
             content, image = archive.read(name), f"{archive.path}, {name}"
-            count = len(content if _is_plain(content) else _decompress(image, content, LARGEST_IMAGE)) // 4
+            count = (
+                len(content if _is_plain(content) else _decompress(image, content, Record3dTuning.max_image_bytes)) // 4
+            )
         except SequenceError as error:
             reason = str(error)
             continue
         rows = round((count * height / width) ** 0.5) if width > 0 and height > 0 else 0
-        if not 0 < 4 * count <= LARGEST_IMAGE or rows < 1 or rows * (count // rows) != count:
+        if not 0 < 4 * count <= Record3dTuning.max_image_bytes or rows < 1 or rows * (count // rows) != count:
             reason = (
                 f"the {count} numbers of {name} are no image of the shape of the colour image, {width:g}x{height:g}"
             )
@@ -122,7 +129,7 @@ def _decode_color(place: str, content: bytes) -> np.ndarray:
 def _decode_array(place: str, content: bytes, *, size: tuple[int, int], dtype: np.dtype) -> np.ndarray:
     """Image [H, W] of LZFSE bytes; bytes of the full length count as not compressed."""
     expected = size[0] * size[1] * dtype.itemsize
-    if not 0 < expected <= LARGEST_IMAGE:
+    if not 0 < expected <= Record3dTuning.max_image_bytes:
         raise SequenceError(f"{place}: impossible size {size[1]}x{size[0]}")
     raw = content if len(content) == expected else _decompress(place, content, expected)
     if len(raw) != expected:
@@ -167,7 +174,7 @@ def _cameras(place: str, metadata: dict[str, Any], count: int) -> list[Camera | 
 def _times(place: str, metadata: dict[str, Any], count: int) -> tuple[np.ndarray, str]:
     if isinstance(metadata.get("frameTimestamps"), list) and len(metadata["frameTimestamps"]) >= count:
         return numbers_of(place, metadata, "frameTimestamps")[:count], "metadata, frameTimestamps"
-    rate = number_of(place, metadata, "fps") if "fps" in metadata else NOMINAL_RATE
+    rate = number_of(place, metadata, "fps") if "fps" in metadata else RecordingTuning.rate_hz
     if rate <= 0:
         raise SequenceError(f"{place}: expected a positive 'fps', found {rate:g}")
     return nominal_timestamps(count, rate), f"{rate:g} frames/s of metadata"

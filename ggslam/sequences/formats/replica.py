@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
@@ -22,7 +22,8 @@ from ggslam.sequences.recording import (
 )
 
 DEFAULT_CAMERA = Camera(1200, 680, 600.0, 600.0, 599.5, 339.5)
-DEFAULT_DEPTH_SCALE = 6553.5
+DEFAULT_DEPTH_SCALE: Final = 6553.5
+"""Units per metre of the depth images of Replica recordings without `cam_params.json`."""
 
 
 class ReplicaFormat:

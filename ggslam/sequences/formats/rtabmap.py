@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -39,7 +39,8 @@ from ggslam.sequences.recording import (
     nominal_timestamps,
 )
 
-DEPTH_SCALE = 1000.0
+DEPTH_SCALE: Final = 1000.0
+"""Units per metre of RTAB-Map's depth images."""
 PARTS = ("rgb", "depth", "calib")
 POSES = ("camera_poses.txt", "poses.txt")
 """In the order in which they are looked for."""

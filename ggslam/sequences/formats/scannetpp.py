@@ -10,7 +10,7 @@ with OpenCV axes of the iPhone.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -33,8 +33,8 @@ from ggslam.sequences.video import Video, VideoFrame
 
 DSLR_FILE = Path("nerfstudio") / "transforms_undistorted.json"
 IPHONE_FILE = "pose_intrinsic_imu.json"
-IPHONE_SIZE = (1920, 1440)
-"""Of the iPhone's colour images, for which its intrinsics hold."""
+IPHONE_SIZE: Final = (1920, 1440)
+"""(width, height) of the iPhone's colour images, for which its intrinsics hold."""
 
 
 class ScanNetPlusFormat:

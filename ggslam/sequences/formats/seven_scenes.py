@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -21,10 +22,10 @@ from ggslam.sequences.recording import (
     nominal_timestamps,
 )
 
-DEPTH_CALIBRATION = (585.0, 585.0, 320.0, 240.0)
-"""Of the depth camera, as published with 7-Scenes."""
-COLOR_CALIBRATION = (525.0, 525.0, 320.0, 240.0)
-"""Of the colour camera, for depth that somebody has registered to it (`.depth.proj.png`)."""
+DEPTH_CALIBRATION: Final = (585.0, 585.0, 320.0, 240.0)
+"""fx, fy, cx, cy of the depth camera in pixels, as published with 7-Scenes."""
+COLOR_CALIBRATION: Final = (525.0, 525.0, 320.0, 240.0)
+"""fx, fy, cx, cy of the colour camera in pixels, for depth that was registered to it (`.depth.proj.png`)."""
 
 UNREGISTERED = "; intrinsics 585 585 320 240 of the depth camera are used"
 

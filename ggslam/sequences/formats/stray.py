@@ -36,13 +36,17 @@ from ggslam.sequences.recording import (
     read_text,
 )
 from ggslam.sequences.video import Video, VideoFrame
+from ggslam.system.tuning import Tuning
 
 POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
 
-PLACES = 8
-"""Where colour is laid on depth both ways: where the camera turns fastest."""
+class StrayTuning(Tuning):
+    """How the direction of depth is found."""
+
+    places = 8
+    """Frames, the fastest turns of the camera, in which colour is laid on depth both ways."""
 
 
 class StrayFormat:
@@ -113,7 +117,7 @@ def _fits_better_one_later(table: dict[str, np.ndarray], depths: dict[str, Path]
     poses, numbers = _poses(table), table["frame"].astype(int)
     turns = np.array([turning_angle(a, b) for a, b in pairwise(poses)])
     gain = 0.0
-    for row in np.argsort(-np.nan_to_num(turns), kind="stable")[:PLACES] + 1:
+    for row in np.argsort(-np.nan_to_num(turns), kind="stable")[: StrayTuning.places] + 1:
         name = f"{numbers[row]:06d}"
         if name not in depths or not 1 <= numbers[row] < video.count:
             continue

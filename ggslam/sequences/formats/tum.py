@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -28,7 +29,8 @@ from ggslam.sequences.recording import (
     missing_depth_problems,
 )
 
-DEPTH_SCALE = 5000.0
+DEPTH_SCALE: Final = 5000.0
+"""Units per metre of TUM's depth images."""
 
 CALIBRATIONS = {
     "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -36,9 +38,10 @@ CALIBRATIONS = {
     "3": ((535.4, 539.2, 320.1, 247.6), None),
 }
 """Published calibration of the three cameras: (fx, fy, cx, cy) and (k1, k2, p1, p2, k3)."""
-SIZE = (640, 480)
-"""(width, height) of the images that these and the default are for."""
-DEFAULT_CALIBRATION = (525.0, 525.0, 319.5, 239.5)
+SIZE: Final = (640, 480)
+"""(width, height) of the images that TUM's calibrations are for."""
+DEFAULT_CALIBRATION: Final = (525.0, 525.0, 319.5, 239.5)
+"""fx, fy, cx, cy in pixels that TUM recommends for recordings without a calibration of their own."""
 CAMERA_IN_NAME = re.compile(r"(?:freiburg|fr)([123])")
 
 

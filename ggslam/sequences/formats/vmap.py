@@ -7,6 +7,7 @@ A scene holds the renderings in imap/00 (and imap/01, another walk); the folder 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
@@ -23,7 +24,8 @@ from ggslam.sequences.recording import (
 )
 
 CAMERA = Camera(1200, 680, 600.0, 600.0, 599.5, 339.5)
-DEPTH_SCALE = 1000.0
+DEPTH_SCALE: Final = 1000.0
+"""Units per metre of vMAP's depth images."""
 
 
 class VmapFormat:

@@ -20,28 +20,42 @@ from ggslam.slam.filters.frame_filter import FrameFilter
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import DepthImage, Form, Mask, Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
-COLUMNS = 80
-"""Of the images that are compared, about."""
-EARLIER, VIEWS = 3, 16
-"""Each view is compared with so many before; after so many views nothing is looked for any more."""
-APART, TURNED_DEG = 0.05, 4.0
-"""Views are so far apart: metres for each metre of median depth, or degrees."""
-FEWEST, STILL_SHARE, AGAINST = 6, 0.3, 3
-"""So many comparisons of views, and this share of them, find depth where it was, this many times as many as find it to
-be of the world."""
-SEEDS, SEED_SHARE = 2, 0.05
-"""So many look through where something would be in the world, at this share of its pixels."""
-FARTHEST_M = 5.0
-"""A tool, a bonnet, a wing reach no farther; what is still in the image beyond is depth that a network guessed alike in
-frame after frame."""
-LEAST_SHARE = 0.005
-"""Of the image: less is left alone."""
-NEARER, NEARER_THAN_SCENE = 1.5, 0.5
-"""Nothing of the world is nearer than this many times the distance of what is fixed to the camera, if that is less than
-this share of the scene's distance: such depth is its flying pixels."""
+
+class FixtureTuning(Tuning):
+    """When something in the image counts as fixed to the camera."""
+
+    columns = 80
+    """Approximate width, in pixels, of the images that are compared."""
+    earlier_views = 3
+    """Earlier views that each view is compared with."""
+    max_views = 16
+    """Views after which the search ends."""
+    apart_share = 0.05
+    """Smallest distance between two views, as a share of the median depth."""
+    apart_deg = 4.0
+    """Smallest angle between two views, in degrees, where they are closer than that."""
+    min_comparisons = 6
+    """Fewest comparisons of views in which a pixel must keep its depth."""
+    min_still_share = 0.3
+    """Smallest share of all comparisons in which a pixel must keep its depth."""
+    still_per_world = 3
+    """Comparisons that find a pixel fixed for each one that finds it part of the world, at least."""
+    seed_views = 2
+    """Views that must look through the place where a seed pixel would lie in the world."""
+    min_seed_share = 0.05
+    """Smallest share of seeds among the pixels of one fixture."""
+    max_depth_m = 5.0
+    """Largest depth of a fixture, in metres. Depth that stays the same beyond it is a network's guess."""
+    min_image_share = 0.005
+    """Smallest fixture, and smallest growth of one, as a share of the image."""
+    flying_pixel_factor = 1.5
+    """Depth below this many times the distance of the fixture is its flying pixels, in all of the image..."""
+    max_scene_share = 0.5
+    """...if the fixture is closer than this share of the median distance of the scene."""
 
 
 @savable()
@@ -108,16 +122,16 @@ class CameraFixtures(FrameFilter):
         depth, self._depth = self._depth, None
         if T_world_camera is None:
             self.latest = []
-        elif depth is not None and self.views < VIEWS:
+        elif depth is not None and self.views < FixtureTuning.max_views:
             self._look(depth, camera, T_world_camera)
 
     def _look(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
-        factor = max(1, round(camera.width / COLUMNS))
+        factor = max(1, round(camera.width / FixtureTuning.columns))
         if self.latest:
             moved, turned = separation(self.latest[-1][1], T_world_camera)
             known = depth[:: 2 * factor, :: 2 * factor]
             median = float(np.median(known[known > 0])) if (known > 0).any() else 0.0
-            if not median or (moved < APART * median and turned < TURNED_DEG):
+            if not median or (moved < FixtureTuning.apart_share * median and turned < FixtureTuning.apart_deg):
                 return
         small, smaller = shrink_depth(depth, camera, factor)
         if self.counts is None:
@@ -130,31 +144,42 @@ class CameraFixtures(FrameFilter):
             ):
                 self.counts += np.stack([found.fixed, found.still, found.world])
                 self.comparisons += 1
-        self.latest, self.views = [*self.latest[1 - EARLIER :], (small, T_world_camera.copy())], self.views + 1
-        if self.comparisons >= FEWEST:
+        self.latest, self.views = (
+            [*self.latest[1 - FixtureTuning.earlier_views :], (small, T_world_camera.copy())],
+            self.views + 1,
+        )
+        if self.comparisons >= FixtureTuning.min_comparisons:
             self._judge(camera, factor, small)
-        if self.views == VIEWS:
+        if self.views == FixtureTuning.max_views:
             self.latest = []
 
     def _judge(self, camera: Camera, factor: int, depth: np.ndarray) -> None:
         assert self.counts is not None
         fixed, still, world = self.counts
-        candidates = (still >= max(FEWEST, STILL_SHARE * self.comparisons)) & (still >= AGAINST * world)
-        candidates &= depth < FARTHEST_M
-        found = parts_with_seeds(candidates & (fixed >= SEEDS), candidates, SEED_SHARE)
-        if found.mean() < LEAST_SHARE:
+        candidates = (still >= max(FixtureTuning.min_comparisons, FixtureTuning.min_still_share * self.comparisons)) & (
+            still >= FixtureTuning.still_per_world * world
+        )
+        candidates &= depth < FixtureTuning.max_depth_m
+        found = parts_with_seeds(
+            candidates & (fixed >= FixtureTuning.seed_views), candidates, FixtureTuning.min_seed_share
+        )
+        if found.mean() < FixtureTuning.min_image_share:
             return
         grown = cv2.dilate(found.astype(np.uint8), np.ones((3, 3), np.uint8))
         large = cv2.resize(grown, (grown.shape[1] * factor, grown.shape[0] * factor), interpolation=cv2.INTER_NEAREST)
         right, below = camera.width - large.shape[1], camera.height - large.shape[0]
         mask = np.pad(large, ((0, below), (0, right)), mode="edge") > 0
         mask = mask if self.mask is None else mask | self.mask
-        if self.mask is None or (mask & ~self.mask).mean() > LEAST_SHARE:
+        if self.mask is None or (mask & ~self.mask).mean() > FixtureTuning.min_image_share:
             self.mask, self.changes = mask, self.changes + 1
             own, scene = depth[found & (depth > 0)], depth[~found & (depth > 0)]
             if len(own) and len(scene):
                 distance = float(np.percentile(own, 90))
-                self.nearest = NEARER * distance if distance < NEARER_THAN_SCENE * float(np.median(scene)) else 0.0
+                self.nearest = (
+                    FixtureTuning.flying_pixel_factor * distance
+                    if distance < FixtureTuning.max_scene_share * float(np.median(scene))
+                    else 0.0
+                )
 
 
 def find_fixtures(frames: Iterable[Frame], poses: Mapping[int, np.ndarray]) -> CameraFixtures:
@@ -166,7 +191,7 @@ def find_fixtures(frames: Iterable[Frame], poses: Mapping[int, np.ndarray]) -> C
     """
     fixtures = CameraFixtures()
     for frame in frames:
-        if fixtures.views == VIEWS:
+        if fixtures.views == FixtureTuning.max_views:
             break
         fixtures.clean(frame)
         fixtures.follow(frame.camera, poses.get(frame.index))

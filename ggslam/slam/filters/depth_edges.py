@@ -11,11 +11,18 @@ from ggslam.geometry.soft_edges import edge_sharpness, soft_edges
 from ggslam.scene.frame import Frame
 from ggslam.slam.filters.frame_filter import FrameFilter, InRigs
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 
-SHARP = 0.4
-"""Outlines are sharp if this share of the change lies between two neighbouring pixels, in the median."""
-FEWEST, FRAMES = 200, 30
-"""Pixels on outlines that have to tell it, and frames among which one must have so many; else outlines are sharp."""
+
+class DepthEdgeTuning(Tuning):
+    """When a depth camera counts as smoothing its outlines."""
+
+    min_sharpness = 0.4
+    """Smallest median share of a depth step that lies between two neighbouring pixels where outlines are sharp."""
+    min_pixels = 200
+    """Fewest pixels on outlines that a decision is made from."""
+    max_frames = 30
+    """Frames after which outlines count as sharp if none had enough pixels."""
 
 
 @savable()
@@ -40,8 +47,8 @@ class DepthEdges(FrameFilter):
         if self.soft is None:
             self.frames += 1
             sharpness, told = edge_sharpness(frame.depth, reach)
-            if told >= FEWEST or self.frames == FRAMES:
-                self.soft = told >= FEWEST and sharpness < SHARP
+            if told >= DepthEdgeTuning.min_pixels or self.frames == DepthEdgeTuning.max_frames:
+                self.soft = told >= DepthEdgeTuning.min_pixels and sharpness < DepthEdgeTuning.min_sharpness
         if not self.soft:
             return frame
         return replace(frame, depth=np.where(soft_edges(frame.depth, reach), np.float32(0), frame.depth))

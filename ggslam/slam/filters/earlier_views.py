@@ -29,16 +29,22 @@ from ggslam.slam.filters.movers import SURE
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult
 
-APART_M, APART_DEG = 0.05, 4.0
-"""Poses are different that are so far apart, or turned so far; of keyframes at one pose the first counts alone, for
-what is wrong with its view is wrong with theirs."""
-MOST_THROUGH = 0.5
-"""A keyframe that looks through more than this share of what can be compared is somewhere else than it seems."""
-SAMPLES = 5
-"""Places of an earlier view along each axis by which it is told whether a keyframe may see the same."""
+
+class EarlierViewTuning(Tuning):
+    """Comparison of an earlier run's views with the keyframes of this one."""
+
+    apart_m = 0.05
+    """Keyframes closer than this, in metres, count once: they share the error of their pose..."""
+    apart_deg = 4.0
+    """...if they are also turned by less than this, in degrees."""
+    max_through = 0.5
+    """Largest share of compared places that a keyframe may look through. Beyond it, its pose is not trusted."""
+    samples = 5
+    """Places of an earlier view along each image axis that tell whether a keyframe can see the same scene."""
 
 
 @savable(not_saved="context")
@@ -108,7 +114,7 @@ class EarlierViews(FrameFilter):
         placed = [self.views[k.index].at(k.T_world_camera) for k in near]
         evidence, come = compare_both_ways(placed, view, margin, context)
         through, same = sum(int(e.passed.sum()) for e in evidence), sum(int(e.same.sum()) for e in evidence)
-        if through > MOST_THROUGH * (through + same):
+        if through > EarlierViewTuning.max_through * (through + same):
             return []
         self.counted.append(T_world_newest.copy())
         for k, at, says, before in zip(near, placed, evidence, come, strict=True):
@@ -139,7 +145,10 @@ class EarlierViews(FrameFilter):
         """Whether the pose differs from all that count."""
         for T in self.counted:
             shift = float(np.linalg.norm(T[:3, 3] - T_world_camera[:3, 3]))
-            if shift < APART_M and np.degrees(turning_angle(T, T_world_camera)) < APART_DEG:
+            if (
+                shift < EarlierViewTuning.apart_m
+                and np.degrees(turning_angle(T, T_world_camera)) < EarlierViewTuning.apart_deg
+            ):
                 return False
         return True
 
@@ -147,8 +156,8 @@ class EarlierViews(FrameFilter):
         """Those keyframes that may show what the newest frame sees."""
         T_newest_world, found = inverse(T_world_newest), []
         for keyframe in earlier:
-            rows = np.linspace(0, keyframe.depth.shape[0] - 1, SAMPLES).astype(int)
-            columns = np.linspace(0, keyframe.depth.shape[1] - 1, SAMPLES).astype(int)
+            rows = np.linspace(0, keyframe.depth.shape[0] - 1, EarlierViewTuning.samples).astype(int)
+            columns = np.linspace(0, keyframe.depth.shape[1] - 1, EarlierViewTuning.samples).astype(int)
             grid = np.ix_(rows, columns)
             depth = keyframe.depth[grid].astype(np.float32) * keyframe.depth_unit
             points = (keyframe.camera.rays()[grid] * depth[..., None]).reshape(-1, 3).astype(float)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.geometry.moved_depth import largest_shift
 from ggslam.mapping.keyframe import ELSEWHERE
-from ggslam.movers.detector import GROWN, MoverDetector, coarse_factor, grow
+from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor, grow
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
@@ -25,19 +25,26 @@ from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 SURE = (TrackingStatus.FIRST, TrackingStatus.OK, TrackingStatus.DEGENERATE)
 """How frames are tracked in which something may be found that did not move before."""
-SWIFT = 3.0
-"""Widths of the image a second by which it shifts where rolling shutters warp it: by a tenth of its width between the
-first row and the last, if they are a thirtieth of a second apart."""
+
+
+class MoverFilterTuning(Tuning):
+    """Search for moving things while a run is made."""
+
+    max_shift_per_s = 3.0
+    """Fastest shift of the image, in image widths per second. Beyond it, a rolling shutter warps the image."""
+    max_keyframes = 64
+    """Latest keyframes that are searched for what has moved since."""
+
+
 DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
-LOOKED_BACK = 64
-"""So many of the latest keyframes are searched for what has moved since."""
 
 
 @savable(not_saved="_reads_masks _margin context")
@@ -128,7 +135,7 @@ class MoverFilter(FrameFilter):
         if before is None or T_world_camera is None or not frame.timestamp > before[0]:
             return False
         shift = largest_shift(inverse(T_world_camera) @ before[1], frame.camera, depth_m)
-        return shift > SWIFT * frame.camera.width * (frame.timestamp - before[0])
+        return shift > MoverFilterTuning.max_shift_per_s * frame.camera.width * (frame.timestamp - before[0])
 
     def after_insertion(self, removal: MapRemoval, newest: Frame) -> None:
         """Removes what was mapped before it began to move, as far as the newest frame, which has just become a
@@ -136,7 +143,10 @@ class MoverFilter(FrameFilter):
         if not self.has_trail or removal.is_paged:
             return
         keyframes = removal.keyframes
-        latest, earlier = keyframes[-1], [k for k in keyframes[-1 - LOOKED_BACK : -1] if k.frame_index != ELSEWHERE]
+        latest, earlier = (
+            keyframes[-1],
+            [k for k in keyframes[-1 - MoverFilterTuning.max_keyframes : -1] if k.frame_index != ELSEWHERE],
+        )
         views = [(k.depth_m(), k.T_world_camera, k.mask) for k in earlier]
         gone = self.gone_since(views, newest, latest.T_world_camera)
         parts = [(k, part) for k, part in zip(earlier, gone, strict=True) if part is not None]
@@ -172,7 +182,7 @@ class MoverFilter(FrameFilter):
                 continue
             old = CoarseView.of(depth, camera, factor, T_world_camera, self._margin, self.context)
             part = gone_since(old, view, trail, segments, depth.shape, factor, self._margin, settings, self.context)
-            found.append(None if part is None else grow(part, GROWN))
+            found.append(None if part is None else grow(part, DetectorTuning.mask_margin))
         return found
 
     def notes(self, frames: int) -> list[str]:

@@ -13,15 +13,20 @@ from ggslam.scene.poses import inverse, se3_exp, se3_log
 from ggslam.slam.filters.frame_filter import FrameFilter, InRigs
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
-LEAST_SHIFT = 0.5
-"""Pixels by which depth and colour have to be apart in a corner of the image."""
-LONGEST_S = 0.2
-"""Seconds between two frames beyond which the motion between them says nothing of that at the shutter."""
-LARGEST_SHARE = 0.6
-"""Of the time between two frames: depth that is farther from colour is left as it is."""
+
+class ShutterTuning(Tuning):
+    """Alignment of depth and colour images that were taken at different times."""
+
+    min_shift_pixels = 0.5
+    """Smallest shift between depth and colour that is corrected, in pixels at a corner of the image."""
+    max_interval_s = 0.2
+    """Longest time between two frames from which the motion at the shutter is interpolated, in seconds."""
+    max_delay_share = 0.6
+    """Largest delay of depth that is corrected, as a share of the time between two frames."""
 
 
 @savable()
@@ -50,14 +55,14 @@ class ShutterTimes(FrameFilter):
     def clean(self, frame: Frame) -> Frame:
         """The frame with depth as of the time of its colour: itself if they are together, or hardly anything moves."""
         self.time, self.T_color_depth = frame.timestamp + frame.depth_delay, np.eye(4)
-        if not frame.depth_delay or self.motion is None or not 0 < self.interval <= LONGEST_S:
+        if not frame.depth_delay or self.motion is None or not 0 < self.interval <= ShutterTuning.max_interval_s:
             return frame
         share = frame.depth_delay / self.interval
         known = frame.depth[frame.depth > 0]
-        if not abs(share) <= LARGEST_SHARE or not len(known):  # not a number neither
+        if not abs(share) <= ShutterTuning.max_delay_share or not len(known):  # not a number neither
             return frame
         T_color_depth = se3_exp(share * se3_log(self.motion))
-        if largest_shift(T_color_depth, frame.camera, float(np.median(known))) < LEAST_SHIFT:
+        if largest_shift(T_color_depth, frame.camera, float(np.median(known))) < ShutterTuning.min_shift_pixels:
             return frame
         self.T_color_depth = T_color_depth
         return replace(frame, depth=moved_depth(frame.depth, frame.camera, T_color_depth), depth_delay=0.0)

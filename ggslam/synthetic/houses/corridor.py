@@ -18,18 +18,31 @@ from ggslam.synthetic.houses.palette import HousePalette
 from ggslam.synthetic.houses.rooms import ceiling_lamp
 from ggslam.synthetic.materials import Material
 from ggslam.synthetic.scene import Scene, SceneBuilder
+from ggslam.system.tuning import Tuning
 
-SECTION, WIDTH, HEIGHT = 4.0, 3.2, 2.6
-"""Length of a section, width and height of the corridor, metres."""
-WALL = 0.1
-START = 1.5
-"""Metres from the first wall to where the camera starts."""
-AHEAD = 5.0
-"""Metres of corridor beyond the end of the way, at least."""
-PACE = 0.061
-"""Metres per frame that the way is made for, a little more than the camera goes."""
-SWING_DEG, TURN_AFTER = 48.0, 2.0
-"""How far the camera looks to the sides, and after how many metres it looks elsewhere."""
+
+class CorridorTuning(Tuning):
+    """Size of the corridor, and the way through it."""
+
+    section_m = 4.0
+    """Length of a section, in metres."""
+    width_m = 3.2
+    """Width, in metres."""
+    height_m = 2.6
+    """Height, in metres."""
+    wall_m = 0.1
+    """Thickness of walls, in metres."""
+    start_m = 1.5
+    """Distance from the first wall to where the camera starts, in metres."""
+    ahead_m = 5.0
+    """Shortest corridor beyond the end of the way, in metres."""
+    pace_m = 0.061
+    """Metres per frame that the way is made for, a little more than the camera goes."""
+    swing_deg = 48.0
+    """Angle by which the camera looks to the sides, in degrees."""
+    turn_after_m = 2.0
+    """Way after which it looks elsewhere, in metres."""
+
 
 Piece = Callable[["_Spot"], None]
 
@@ -39,32 +52,48 @@ def furnished_corridor(seed: int = 0, frames: int = 720, bare: bool = False) -> 
     and there are no arches."""
     m = HousePalette(seed)
     b = SceneBuilder()
-    way = PACE * frames + TURN_AFTER
-    sections = int(np.ceil((START + way + AHEAD) / SECTION))
-    length = sections * SECTION
-    b.instance("first wall").box((-WALL / 2, WIDTH / 2, HEIGHT / 2), (WALL, WIDTH, HEIGHT), m.brick)
-    b.instance("last wall").box((length + WALL / 2, WIDTH / 2, HEIGHT / 2), (WALL, WIDTH, HEIGHT), m.brick)
+    way = CorridorTuning.pace_m * frames + CorridorTuning.turn_after_m
+    sections = int(np.ceil((CorridorTuning.start_m + way + CorridorTuning.ahead_m) / CorridorTuning.section_m))
+    length = sections * CorridorTuning.section_m
+    b.instance("first wall").box(
+        (-CorridorTuning.wall_m / 2, CorridorTuning.width_m / 2, CorridorTuning.height_m / 2),
+        (CorridorTuning.wall_m, CorridorTuning.width_m, CorridorTuning.height_m),
+        m.brick,
+    )
+    b.instance("last wall").box(
+        (length + CorridorTuning.wall_m / 2, CorridorTuning.width_m / 2, CorridorTuning.height_m / 2),
+        (CorridorTuning.wall_m, CorridorTuning.width_m, CorridorTuning.height_m),
+        m.brick,
+    )
     for number in range(sections):
         _section(b, m, number, seed, bare)
-    b.scene.bounds = ((0.0, 0.0, 0.0), (length, WIDTH, HEIGHT))
+    b.scene.bounds = ((0.0, 0.0, 0.0), (length, CorridorTuning.width_m, CorridorTuning.height_m))
     b.scene.lights = [
-        replace(light, bounds=((x - 1.5 * SECTION, 0.0, 0.0), (x + 1.5 * SECTION, WIDTH, HEIGHT)))
+        replace(
+            light,
+            bounds=(
+                (x - 1.5 * CorridorTuning.section_m, 0.0, 0.0),
+                (x + 1.5 * CorridorTuning.section_m, CorridorTuning.width_m, CorridorTuning.height_m),
+            ),
+        )
         for light in b.scene.lights
         for x in (float(light.points[:, 0].mean()),)
     ]
     b.scene.route = _route(way)
-    b.scene.walk = ((START + 1.0, WIDTH / 2, 1.45), (0.7, 0.3))
-    b.scene.interest = np.array([(START + 3.0, 0.2, 1.0), (START + 3.0, WIDTH - 0.2, 1.0)])
+    b.scene.walk = ((CorridorTuning.start_m + 1.0, CorridorTuning.width_m / 2, 1.45), (0.7, 0.3))
+    b.scene.interest = np.array(
+        [(CorridorTuning.start_m + 3.0, 0.2, 1.0), (CorridorTuning.start_m + 3.0, CorridorTuning.width_m - 0.2, 1.0)]
+    )
     return b.scene
 
 
 def _route(way: float) -> np.ndarray:
-    """Rows of `Scene.route` every `TURN_AFTER` metres: straight on, left, straight on, right."""
-    i = np.arange(max(3, int(np.ceil(way / TURN_AFTER)) + 1))
-    x = START + TURN_AFTER * i
-    y = WIDTH / 2 + 0.25 * np.sin(1.3 * i)
+    """Rows of `Scene.route` every `CorridorTuning.turn_after_m` metres: straight on, left, straight on, right."""
+    i = np.arange(max(3, int(np.ceil(way / CorridorTuning.turn_after_m)) + 1))
+    x = CorridorTuning.start_m + CorridorTuning.turn_after_m * i
+    y = CorridorTuning.width_m / 2 + 0.25 * np.sin(1.3 * i)
     z = 1.45 + 0.04 * np.sin(2.1 * i)
-    return np.stack([x, y, z, SWING_DEG * np.sin(np.pi / 2 * i), -9 + 3 * np.cos(1.7 * i)], 1)
+    return np.stack([x, y, z, CorridorTuning.swing_deg * np.sin(np.pi / 2 * i), -9 + 3 * np.cos(1.7 * i)], 1)
 
 
 class _Spot:
@@ -76,7 +105,7 @@ class _Spot:
 
     def at(self, out: float, z: float = 0.0) -> tuple[float, float, float]:
         """So many metres before the wall, at height z."""
-        return self.x, WIDTH - out if self.north else out, z
+        return self.x, CorridorTuning.width_m - out if self.north else out, z
 
     def one_of(self, materials: list[Material]) -> Material:
         """A material at random."""
@@ -86,27 +115,51 @@ class _Spot:
 def _section(b: SceneBuilder, m: HousePalette, number: int, seed: int, bare: bool) -> None:
     """Floor, ceiling, walls and what stands before them. Depends on nothing but the section's number and the seed."""
     rng = np.random.default_rng([seed, 12, number])
-    x = (number + 0.5) * SECTION
+    x = (number + 0.5) * CorridorTuning.section_m
     walls = [m.wallpaper, m.stripes, m.plaster, m.slate, m.lilac, m.rosy, m.sage, m.ochre, m.panels, m.teal,
              m.brickwork, m.brick, m.wall_tiles]  # fmt: skip
     floors = [m.floor, m.carpet, m.parquet, m.kitchen_floor, m.flagstones, m.clay]
     floor, south, north = number * 5 % 6, *((number * step + rng.integers(4)) % len(walls) for step in (4, 5))
-    b.instance("floor").box((x, WIDTH / 2, -WALL / 2), (SECTION, WIDTH, WALL), floors[floor])
-    b.instance("ceiling").box((x, WIDTH / 2, HEIGHT + WALL / 2), (SECTION, WIDTH, WALL), m.ceiling)
-    for name, y, inward, material in (("south wall", 0.0, 1, walls[south]), ("north wall", WIDTH, -1, walls[north])):
+    b.instance("floor").box(
+        (x, CorridorTuning.width_m / 2, -CorridorTuning.wall_m / 2),
+        (CorridorTuning.section_m, CorridorTuning.width_m, CorridorTuning.wall_m),
+        floors[floor],
+    )
+    b.instance("ceiling").box(
+        (x, CorridorTuning.width_m / 2, CorridorTuning.height_m + CorridorTuning.wall_m / 2),
+        (CorridorTuning.section_m, CorridorTuning.width_m, CorridorTuning.wall_m),
+        m.ceiling,
+    )
+    for name, y, inward, material in (
+        ("south wall", 0.0, 1, walls[south]),
+        ("north wall", CorridorTuning.width_m, -1, walls[north]),
+    ):
         wall = b.instance(name)
-        wall.box((x, y - inward * WALL / 2, HEIGHT / 2), (SECTION, WALL, HEIGHT), material)
-        wall.box((x, y + inward * 0.008, 0.05), (SECTION, 0.016, 0.10), m.white)
-    ceiling_lamp(b, m, x, WIDTH / 2, (2.3, 2.1, 1.75))
+        wall.box(
+            (x, y - inward * CorridorTuning.wall_m / 2, CorridorTuning.height_m / 2),
+            (CorridorTuning.section_m, CorridorTuning.wall_m, CorridorTuning.height_m),
+            material,
+        )
+        wall.box((x, y + inward * 0.008, 0.05), (CorridorTuning.section_m, 0.016, 0.10), m.white)
+    ceiling_lamp(b, m, x, CorridorTuning.width_m / 2, (2.3, 2.1, 1.75))
     if bare:
         return
     arch = b.instance("arch")
-    for y in (0.1, WIDTH - 0.1):
-        arch.box((number * SECTION, y, HEIGHT / 2), (0.24, 0.2, HEIGHT), m.white, faces={0: m.oak, 1: m.oak})
-    arch.box((number * SECTION, WIDTH / 2, HEIGHT - 0.11), (0.24, WIDTH - 0.4, 0.22), m.walnut)
+    for y in (0.1, CorridorTuning.width_m - 0.1):
+        arch.box(
+            (number * CorridorTuning.section_m, y, CorridorTuning.height_m / 2),
+            (0.24, 0.2, CorridorTuning.height_m),
+            m.white,
+            faces={0: m.oak, 1: m.oak},
+        )
+    arch.box(
+        (number * CorridorTuning.section_m, CorridorTuning.width_m / 2, CorridorTuning.height_m - 0.11),
+        (0.24, CorridorTuning.width_m - 0.4, 0.22),
+        m.walnut,
+    )
     pieces = [rng.permutation(len(PIECES))[:4], ("south", "south", "north", "north"), (1.15, 2.95, 1.15, 2.95)]
     for piece, side, place in zip(*pieces, strict=True):
-        along = number * SECTION + place + float(rng.uniform(-0.1, 0.1))
+        along = number * CorridorTuning.section_m + place + float(rng.uniform(-0.1, 0.1))
         PIECES[piece](_Spot(b, m, rng, along, side == "north"))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from ctypes import sizeof
 from itertools import accumulate
+from typing import Final
 
 import numpy as np
 import torch
@@ -13,8 +14,8 @@ from ggslam.abi.cuda import PointArrays, PointsHeader
 from ggslam.tracking.points import FramePoints
 
 _ROWS = {"points": 3, "normals": 3, "covariances": 6, "pixels": 2, "weights": 1}
-_BEGIN = 64
-"""Words before the arrays, of which the header takes the first two."""
+_BEGIN: Final = 64
+"""Words before the arrays of the block. Its header takes the first two."""
 
 
 class CudaPoints:

@@ -17,10 +17,15 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Upload
 from ggslam.native.loader import load_library
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import GicpTarget
 
-_PLACES_PER_BLOCK = 4
-"""Of the hash table, at least: most look-ups end at the first place."""
+
+class HashTableTuning(Tuning):
+    """Hash table of voxels on the device."""
+
+    min_slots_per_block = 4
+    """Fewest slots per block, so that most look-ups end at the first slot."""
 
 
 class CudaTarget:
@@ -80,7 +85,7 @@ class CudaTarget:
     def _level(self, level: int, job: VoxelLevelJob, voxel: float) -> VoxelLevel:
         """The level that the job is to make, with room for its hash table."""
         places = 64
-        while places < _PLACES_PER_BLOCK * job.block_count:
+        while places < HashTableTuning.min_slots_per_block * job.block_count:
             places *= 2
         slots = self._memory.block(f"slots {level}", sizeof(VoxelSlot) * places)
         size = np.float32(voxel) * np.float32(4 if level else 1)

@@ -18,17 +18,24 @@ import numpy as np
 import torch
 
 from ggslam.scene.poses import turning_angle
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
 from ggslam.tracking.edges_planes.settings import FeatureAlignSettings
 from ggslam.tracking.edges_planes.voxels import FeatureMap
 from ggslam.tracking.observability import about_point
 
-_MARGIN = 1.3
-"""Of what a step usually takes."""
+
+class StepTimeTuning(Tuning):
+    """Estimate of how long the next step takes."""
+
+    margin = 1.3
+    """Expected time of a step, in multiples of its usual time."""
+    renewal = 0.1
+    """Weight of the newest time in the running mean."""
+
+
 LAST_STEP = "result"
 """What is left to do when the pose is found."""
-_RENEWAL = 0.1
-"""Weight of the newest time against the earlier ones."""
 
 
 class FrameClock:
@@ -59,7 +66,7 @@ class FrameClock:
     def allows(self, step: str) -> bool:
         """Whether the step, and the last one of every frame after it, are likely to end in time; if so it begins."""
         self.begins(step)
-        expected = _MARGIN * (self._usual.get(step, 0.0) + self._usual.get(LAST_STEP, 0.0))
+        expected = StepTimeTuning.margin * (self._usual.get(step, 0.0) + self._usual.get(LAST_STEP, 0.0))
         return self._lifted or self._began[step] - self._start + expected <= self._budget
 
     def begins(self, step: str) -> None:
@@ -71,7 +78,7 @@ class FrameClock:
         took = time.perf_counter() - self._began[step]
         usual = self._usual.get(step, took)
         # An interruption by other programs says little about the next time.
-        self._usual[step] = usual + _RENEWAL * (min(took, 2 * usual) - usual)
+        self._usual[step] = usual + StepTimeTuning.renewal * (min(took, 2 * usual) - usual)
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import torch
 from torch import Tensor
 
 from ggslam.tracking.edges_planes.settings import ExtractionSettings
 
-HALF = 5
-"""Neighbours on either side."""
+HALF: Final = 5
+"""Neighbours on either side, as in LOAM."""
 WINDOW = 2 * HALF + 1
 _NOISE_GAIN = float(2 * HALF + (2 * HALF) ** 2)
 """Variance of the sum of 10 neighbours minus 10 times the point, in variances of a point."""

@@ -10,12 +10,17 @@ import torch
 from torch import Tensor
 
 from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.edges_planes.extraction import LineScanner, ScanFeatures, ScanLines
 from ggslam.tracking.edges_planes.settings import ExtractionSettings
 from ggslam.tracking.settings import DepthNoise
 
-_PATCH = 2
-"""A patch has (2 _PATCH + 1)^2 pixels."""
+
+class ScanPatchTuning(Tuning):
+    """Windows in depth images."""
+
+    half_patch = 2
+    """A patch has (2 `half_patch` + 1)^2 pixels."""
 
 
 class DepthImageFeatures:
@@ -36,7 +41,8 @@ class DepthImageFeatures:
         self._pitch = max(1, round(camera.width / 320))
         self._lines = _PixelLines(camera, settings, self._pitch, self._device)
         self._depth = torch.zeros(camera.height, camera.width, device=self._device)
-        offsets = torch.arange(-_PATCH, _PATCH + 1, device=self._device) * (settings.patch_step * self._pitch)
+        half = ScanPatchTuning.half_patch
+        offsets = torch.arange(-half, half + 1, device=self._device) * (settings.patch_step * self._pitch)
         dv, du = torch.meshgrid(offsets, offsets, indexing="ij")
         self._offsets = (dv * camera.width + du).reshape(-1)
         du, dv = du.reshape(-1).float(), dv.reshape(-1).float()
@@ -69,7 +75,8 @@ class DepthImageFeatures:
         )  # fmt: skip
 
     def _disc(self, z: Tensor) -> Tensor:
-        spread = math.sqrt(_PATCH * (_PATCH + 1) / 3) * self.settings.patch_step * self._pitch  # of -P..P
+        half = ScanPatchTuning.half_patch
+        spread = math.sqrt(half * (half + 1) / 3) * self.settings.patch_step * self._pitch  # of -half..half
         return z * (spread / self.camera.fx)
 
     def _rays(self, pixels: Tensor) -> Tensor:

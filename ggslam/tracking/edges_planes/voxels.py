@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -19,14 +20,17 @@ from ggslam.errors import FormatError
 from ggslam.system.savable import savable
 from ggslam.tracking.edges_planes.settings import FeatureMapSettings
 
-_OFFSET = 1 << 19
-"""Added to voxel coordinates to make them positive; 20 bits per axis."""
-_SHIFTS = (40, 20, 0)
-_EDGE_BIT = 1 << 60
-_EMPTY = -1
-_MULTIPLIER = -7046029254386353131
-"""2^64 over the golden ratio, as a signed number (Fibonacci hashing: D. Knuth, The Art of Computer Programming, 6.4).
-"""
+_OFFSET: Final = 1 << 19
+"""Added to voxel coordinates to make them positive. A key has 20 bits per axis."""
+_SHIFTS: Final = (40, 20, 0)
+"""Position of each coordinate in a key."""
+_EDGE_BIT: Final = 1 << 60
+"""Bit of a key that tells voxels of edges from voxels of planes."""
+_EMPTY: Final = -1
+"""Key of an empty slot."""
+_MULTIPLIER: Final = -7046029254386353131
+"""2^64 over the golden ratio, as a signed number (Fibonacci hashing: D. Knuth, The Art of Computer Programming,
+6.4)."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class MergedRecord(Record):
 
 
 class RunRecord(RecordFile):
-    """The mark of a run's folder.
+    """What run.json says of a run.
 
     Attributes:
         ggslam: version that the run was made with.
@@ -55,7 +55,7 @@ class RunRecord(RecordFile):
         stopped_by: why it is not.
         missing: names of files that were asked for and are not there (yet).
         verdicts: what seems wrong with the recording or the run.
-        files: the manifest: all files of the run but this one, by name; None: of before there was one.
+        files: the manifest: all files of the run but this one, by name; None: the run has none.
         environment: versions and machine, see `runs.environment`; older runs have none.
         edits: what was done to the map since, as sentences.
         displaced: objects that edits moved, as `Displacement.to_json` gives them.
