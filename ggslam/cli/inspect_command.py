@@ -36,7 +36,7 @@ EPILOG = """
 """
 
 
-class ClockTuning(Tuning):
+class ClockReportTuning(Tuning):
     """When depth and colour are of the same time."""
 
     max_offset_s = 0.005
@@ -224,14 +224,16 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
     ]  # fmt: skip
     if r.native_camera != r.camera:
         lines.insert(3, ("stored as", _camera(r.native_camera)))
-    if r.clocks is not None and abs(r.clocks.seconds) > max(ClockTuning.max_offset_s, 2 * r.clocks.error):
+    if r.clocks is not None and abs(r.clocks.seconds) > max(ClockReportTuning.max_offset_s, 2 * r.clocks.error):
         side = "after" if r.clocks.seconds > 0 else "before"
         apart, error = 1e3 * abs(r.clocks.seconds), 1e3 * r.clocks.error
         frames = counted(r.clocks.frames, "frame")
         words = f"depth {apart:.1f} ms {side} colour (to {error:.1f} ms, by the motion in {frames})"
         lines.append(("clocks", words))
     elif r.clocks is not None and not r.verdicts:
-        lines.append(("clocks", f"depth and colour are of the same time, to {1e3 * ClockTuning.max_offset_s:.0f} ms"))
+        lines.append(
+            ("clocks", f"depth and colour are of the same time, to {1e3 * ClockReportTuning.max_offset_s:.0f} ms")
+        )
     if r.motion is not None:
         step, turn = r.motion.step_m, r.motion.turn_deg
         lines.append(("motion", f"path {r.motion.path_m:.2f} m; a frame: {step[0] * 100:.1f} cm and {turn[0]:.1f} "

@@ -43,7 +43,7 @@ AddRun = Callable[[Path, GridStore, "str | None", "float | None"], object]
 """Writes a run (its folder) into a store that is open for writing, as a visit of a name at a time."""
 
 
-class FillTuning(Tuning):
+class StoreFillTuning(Tuning):
     """What a recording must bring to a store."""
 
     max_missed = 0.1
@@ -260,10 +260,10 @@ def _poses(
     before = after - 1
     last = np.minimum(after, len(times) - 1)
     nearest = np.where(np.abs(times[before] - timestamps) <= np.abs(times[last] - timestamps), before, last)
-    near = np.abs(times[nearest] - timestamps) <= FillTuning.max_time_gap_s
+    near = np.abs(times[nearest] - timestamps) <= StoreFillTuning.max_time_gap_s
     poses[near] = found.T_world_camera[order][nearest[near]]
     if not near.any():
-        raise FormatError(f"{request.poses}: none of its times is within {FillTuning.max_time_gap_s} s of a frame")
+        raise FormatError(f"{request.poses}: none of its times is within {StoreFillTuning.max_time_gap_s} s of a frame")
     return poses
 
 
@@ -271,7 +271,7 @@ def _words_of_missed(store: GridStore, poses: np.ndarray) -> str:
     """What to say of items, of poses [n, 4, 4], in cells that nothing is recorded of; empty if those are few."""
     known = poses[np.isfinite(poses).all((1, 2)), :3, 3]
     missed = sum(store.key_of(position) not in store for position in known)
-    if missed <= FillTuning.max_missed * len(known):
+    if missed <= StoreFillTuning.max_missed * len(known):
         return ""
     s, grid = store.settings, store.grid
     enough = math.ceil(50 * s.spacing * math.sqrt(grid.spans.sum())) / 100
