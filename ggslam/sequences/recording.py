@@ -166,7 +166,7 @@ class ReadOptions:
         """
         if self.own_camera is not None:
             return None
-        return _read_with_hint(read, "`camera` or `intrinsics` tell the camera instead")
+        return _read_with_hint(read, "give them with `camera` or `intrinsics`")
 
     def recorded_scale(self, read: Callable[[], float]) -> float:
         """Units of depth images per metre: what a user tells as such, else what `read` finds, else what a camera file
