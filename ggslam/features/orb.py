@@ -18,7 +18,7 @@ from ggslam.system.settings import setting, tuning_class
 
 @tuning_class(frozen=True)
 class FeatureSettings:
-    """Numbers of ORB features and of the poses that their matches give."""
+    """ORB features and the poses from their matches."""
 
     count: int = setting(1000, 1, 10**5)
     """Maximum number of features of a view."""

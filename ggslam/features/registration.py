@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose of one view relative to another when both have depth.
+"""Finds the pose of one view relative to another when both have depth.
 
 Three matches make a pose by aligning their points (Arun, Huang and Blostein, PAMI 1987); RANSAC (Fischler and Bolles,
 CACM 1981) counts the matches that agree with it in the image and in depth; the best is refined on the image. Against
@@ -34,7 +34,7 @@ class RegistrationTuning(Tuning):
 
 @tuning_class(frozen=True)
 class RegistrationSettings:
-    """Numbers of registering two views by their matches."""
+    """Registration of two views by their matches."""
 
     max_hamming: int = setting(64, 0, 256, "bits")
     """Largest distance of two matching descriptors, of 256 bits."""

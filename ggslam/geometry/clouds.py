@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds that are compared: which point of one is nearest to a point of the other.
+"""Comparison of point clouds by nearest points.
 
 `overlap` says how much of a cloud found its partner, in the terms of Open3D's `evaluate_registration`: fitness and
 inlier RMSE.
@@ -67,7 +67,7 @@ Points = np.ndarray | Cloud
 
 @dataclass(frozen=True)
 class Overlap:
-    """How one cloud lies upon another.
+    """How one cloud matches another.
 
     Attributes:
         fitness: share of the source's points that have a point of the target within the greatest distance.

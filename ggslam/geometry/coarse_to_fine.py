@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Registers one cloud upon another from a start that is wrong by a metre or so: point-to-plane ICP of thinned clouds,
-whose pairs may first be metres apart, then of all points.
+"""Registers a cloud to another from a start that is a metre or so off: point-to-plane ICP of thinned clouds, whose
+pairs may first be metres apart, then of all points.
 
 Two things mislead ICP between scans. Pairs that may only be near each other hold a cloud where it began. And points in
 rings or lines, as of laser scanners, have their nearest partners and neighbours along the lines, wherever the surface
@@ -52,7 +52,7 @@ class CoarseToFineTuning(Tuning):
 
 @dataclass(frozen=True)
 class TargetSurface:
-    """A cloud as the surface that another is registered upon.
+    """A cloud as the surface that another is registered to.
 
     Attributes:
         cloud: the points.

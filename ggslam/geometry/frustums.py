@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which boxes cameras may see: the test that decides what must be in memory before a view is rendered."""
+"""Tests which boxes cameras may see. What they see must be in memory before a view is rendered."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point-to-plane ICP: brings one cloud upon another (Y. Chen and G. Medioni, "Object Modelling by Registration of
+"""Point-to-plane ICP: registers a cloud to another (Y. Chen and G. Medioni, "Object Modelling by Registration of
 Multiple Range Images", 1992).
 
 For clouds that are compared once. The tracker aligns a frame to voxels of Gaussians instead, by compiled G-ICP, see

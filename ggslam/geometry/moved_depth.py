@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A depth image as it would have been from a place near by."""
+"""Predicts a depth image from a nearby pose."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras around a cloud that nobody recorded."""
+"""Camera paths around a cloud that has no recorded views."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Gauss-Newton step that brings points upon a surface: off it by its planes, along it by their partners."""
+"""A Gauss-Newton step that moves points onto a surface: along the normals of its planes, and weakly to partners."""
 
 from __future__ import annotations
 

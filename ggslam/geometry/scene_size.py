@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How large a scene is, and what follows for the voxels and the range of depth that surfaces are fused with.
+"""Estimates the size of a scene, and from it the voxels and range of depth for fusion.
 
 Pixels are as far apart as the depth they see is large: outdoors neighbouring points no longer fall into neighbouring
 voxels of a size made for rooms, and most of what is seen lies beyond the depth that is of use in a room.

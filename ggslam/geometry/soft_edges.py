@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth that hangs between a thing and what is behind it, where a camera smooths its images.
+"""Finds depth between a thing and its background, which cameras that smooth their images produce.
 
 At an outline the depth of most cameras jumps from one pixel to the next. Phones and headsets smooth it or make it
 larger: it becomes a slope, on which nothing is. A surface seen at a grazing angle slopes as well, but goes on on both

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far points lie from the surface that a cloud samples: point to plane where it has points near by.
+"""Measures the distance of points from the surface that a cloud samples: point to plane where the cloud has points
+nearby.
 
 Unlike the share of points with a partner within some distance, this does not improve when the rings of two laser scans
 are laid upon one another instead of their walls, or what moved along with the sensor."""

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds with one point per voxel, so that surfaces count by their area, however close to the sensor they were. Voxels
-are counted from the cloud's lowest corner: a cloud far from zero is thinned as it is near by."""
+"""Thins clouds to one point per voxel, so that surfaces count by area whatever their distance from the sensor. Voxels
+start at the cloud's lowest corner: a cloud far from zero is thinned like one near it."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voxels of a grid as whole numbers: equal for points of one voxel, and in the order of x, then y, then z."""
+"""Voxels as whole numbers: equal for points of one voxel, and sorted by x, then y, then z."""
 
 from __future__ import annotations
 

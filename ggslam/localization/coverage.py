@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map in memory can contain: points of a scan that lie beyond it say nothing about where the scan was made.
+"""The region that a map in memory covers. Points of a scan beyond it say nothing about the pose of the scan.
 
 Cells of a cloud hold what lies in them. Cells that a sensor recorded hold what it saw from near their centres, up to
 its range, so that they reach beyond their edges and overlap.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Locates RGB-D frames in a stored map: the tracker of SLAM against a target that is not its own, and places."""
+"""Locates RGB-D frames in a stored map: the tracker of SLAM with a stored target, and stored places."""
 
 from __future__ import annotations
 

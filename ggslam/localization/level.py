@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Level frames: z points up, the floor is somewhere below the sensor."""
+"""Levelled sensor frames: z points up, and the floor is somewhere below the sensor."""
 
 from __future__ import annotations
 

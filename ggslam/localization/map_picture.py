@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds scans in maps that no scan was recorded in, clouds or runs: the map as a picture from above.
+"""Finds scans in maps without recorded scans, clouds or runs, by a picture of the map from above.
 
 Its pixels tell where something stands upright. A scan makes such a picture, too, and one of where it looked through.
 Both are correlated with the map's by FFT at every turn: the score of a pose is the share of what stands in the scan
@@ -75,7 +75,7 @@ class _Picture:
 
 
 class MapPicture:
-    """Places in a map by what stands in it.
+    """Finds places in a map by the upright things in it.
 
     Args:
         points: of the map, [n, 3], in a level frame, one in a cube of 0.25 m.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a recording was made, roughly: a position that a receiver of satellites or a person tells."""
+"""A rough position of a recording, from a satellite receiver or a person."""
 
 from __future__ import annotations
 

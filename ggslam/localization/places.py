@@ -48,7 +48,7 @@ class StoredPlaceTuning(Tuning):
 
 @dataclass(frozen=True)
 class StoredView:
-    """A view as it is kept: its place and pose T_world_camera [4, 4]."""
+    """A stored view: its place and pose T_world_camera [4, 4]."""
 
     place: Place
     T_world_camera: np.ndarray

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other places where a scan matches as well as where it was located.
+"""Finds other places where a scan matches as well as at its pose.
 
 Along a plain corridor any place matches, along one with niches a shifted place matches nearly as well as the right one,
 and between pillars at equal distances there are places that cannot be told apart. The information of the matches does
@@ -59,14 +59,14 @@ class Rival:
 
 
 Aligned = Callable[[np.ndarray], ScanMatch]
-Settled = Callable[[ScanMatch], ScanMatch]
+Refine = Callable[[ScanMatch], ScanMatch]
 
 
 def look_around(
     match: ScanMatch,
     aligned: Aligned,
-    settled: Settled,
-    placed: Settled,
+    refine: Refine,
+    refine_there: Refine,
     centre: np.ndarray,
     span: float,
     rounds: int = RivalTuning.rounds,
@@ -76,15 +76,15 @@ def look_around(
     Args:
         match: of the place.
         aligned: aligns from a pose.
-        settled: aligns again from a match as long as that moves it.
-        placed: the same with the map around that place.
+        refine: aligns again from a match as long as that moves it.
+        refine_there: the same with the map around that place.
         centre: where the scan is believed to be, [3].
         span: metres from there within which places come into question.
         rounds: of going to a better place.
     """
     rival = None
     for _ in range(rounds):
-        better, rival = _one_round(match, aligned, settled, placed, centre, span)
+        better, rival = _one_round(match, aligned, refine, refine_there, centre, span)
         if better is None:
             break
         match = better
@@ -92,7 +92,7 @@ def look_around(
 
 
 def _one_round(
-    match: ScanMatch, aligned: Aligned, settled: Settled, placed: Settled, centre: np.ndarray, span: float
+    match: ScanMatch, aligned: Aligned, refine: Refine, refine_there: Refine, centre: np.ndarray, span: float
 ) -> tuple[ScanMatch | None, Rival | None]:
     step = RivalTuning.step_voxels * match.target.voxel
     better, rival = None, None
@@ -104,7 +104,7 @@ def _one_round(
         other = aligned(start)
         if not _rivals(other, match, seen, step, RivalTuning.far_margin if far else RivalTuning.margin):
             continue
-        other = placed(other) if far else settled(other)
+        other = refine_there(other) if far else refine(other)
         if not _rivals(other, match, seen, step, RivalTuning.margin):
             seen += [other.pose[:3, 3]] if far else []
             continue

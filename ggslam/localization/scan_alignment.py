@@ -83,7 +83,7 @@ class SearchSettings(SearchTuning):
 
 @dataclass(frozen=True)
 class ScanMatch:
-    """How a scan lies in the map.
+    """A scan, aligned to the map.
 
     Attributes:
         found: the alignment of the points that the map can contain.
@@ -184,7 +184,7 @@ class ScanAligner:
         dot = self._settings.min_normal_dot if surface.has_sides else ANY_NORMAL
         return self._match(source.dense, surface, target, guess, replace(self._settings, min_normal_dot=dot))
 
-    def settle(self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch) -> ScanMatch:
+    def refine(self, source: ScanSource, surface: Surface, target: GicpTarget, match: ScanMatch) -> ScanMatch:
         """Aligns again from a match while that still moves it: an alignment that begins far off ends short of the
         pose, with the points that the map can contain from where it began."""
         for _ in range(ScanAlignmentTuning.max_repeats):
@@ -233,7 +233,7 @@ class ScanAligner:
         """The match at a place, with the map around it: the surface moves there."""
         if surface.move_to(T[:3, 3]) and surface.target is not None:
             target = surface.target
-        return self.settle(source, surface, target, self.fine(source, surface, target, T))
+        return self.refine(source, surface, target, self.fine(source, surface, target, T))
 
     def _starts(self, guess: np.ndarray, up: np.ndarray) -> Iterator[np.ndarray]:
         """The guess, turned and moved over the ground, nearest first."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What laser scans are looked up in, for each kind of map."""
+"""Prepares each kind of map for looking up laser scans."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places in the cells of a grid store that laser scans are looked up among.
+"""Places in the cells of a grid store at which laser scans are looked up.
 
 The part `SCAN_PLACES` of a cell holds a row for each scan that was recorded in it:
 

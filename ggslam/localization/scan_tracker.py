@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Locates laser scans in the surface that the map shows around the sensor."""
+"""Locates laser scans in the part of the map around the sensor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import field
 import numpy as np
 
 from ggslam.localization.localizer import FrontEndResult, LocalizationStatus
-from ggslam.localization.rivals import Aligned, Rival, Settled, look_around
+from ggslam.localization.rivals import Aligned, Refine, Rival, look_around
 from ggslam.localization.scan_alignment import ScanAligner, ScanMatch, ScanSource, SearchSettings
 from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.surface import Surface
@@ -118,21 +118,21 @@ class ScanTracker:
 
     def _steps(
         self, source: ScanSource, surface: Surface, target: GicpTarget, here: np.ndarray
-    ) -> tuple[Aligned, Settled, Settled]:
+    ) -> tuple[Aligned, Refine, Refine]:
         """What `look_around` aligns with; the surface stays at `here` [3]."""
 
         def align_at(start: np.ndarray) -> ScanMatch:
             return self.aligner.fine(source, surface, surface.target or target, start)
 
-        def settle(other: ScanMatch) -> ScanMatch:
-            return self.aligner.settle(source, surface, surface.target or target, other)
+        def refine(other: ScanMatch) -> ScanMatch:
+            return self.aligner.refine(source, surface, surface.target or target, other)
 
-        def settle_there(other: ScanMatch) -> ScanMatch:
+        def refine_there(other: ScanMatch) -> ScanMatch:
             found = self.aligner.at_place(source, surface, target, other.pose)
             surface.move_to(here)
             return found
 
-        return align_at, settle, settle_there
+        return align_at, refine, refine_there
 
     def look_up(self, item: np.ndarray, surface: Surface) -> FrontEndResult | None:
         """See `FrontEnd`. After each scan that was not found, more are skipped, at most
@@ -147,7 +147,7 @@ class ScanTracker:
         def align_at(guess: np.ndarray) -> AlignmentResult:
             assert surface.target is not None
             match = self.aligner.fine(source, surface, surface.target, guess)
-            return self.aligner.settle(source, surface, surface.target, match).found
+            return self.aligner.refine(source, surface, surface.target, match).found
 
         found, reason = self._places.find(item, surface, align_at)
         if found is None:

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a place looks like to a laser scanner that stands upright: which heights above the floor hold something, by
-direction and distance.
+"""Describes a place as an upright laser scanner sees it: occupied heights above the floor, by direction and distance.
 
 Space around the sensor is divided into layers of height, rings of distance (each a fixed factor wider than the one
 within) and sectors of azimuth; a bit says whether anything was measured there. Bits do not depend on how dense points

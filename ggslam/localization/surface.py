@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame or scan is aligned to when it is located in a stored map: the cells around the sensor, or all of them.
+"""The target for locating frames or scans in a stored map: the cells around the sensor, or all of them.
 
 A cell's points become flat Gaussians along its surface. Their normals are those stored with the points (attribute
 `NORMAL`), else estimated from neighbours; then it is not known which side of a surface the sensor sees. A cell is

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording a visit: what the sensor sees along a recording whose poses are known goes into the cells of a store.
+"""Records a visit: what the sensor sees along a recording with known poses goes into the cells of a store.
 
 While the sensor is in a cell that is due, what it sees from near the cell's centre is gathered; it is written when the
 sensor leaves the cell. A camera that sees one way at a time so fills a cell with all that it saw from there. When a

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which keyframes the tracker may rely on.
+"""Chooses the keyframes that the tracker aligns to.
 
 A frame that is aligned to all that was ever mapped hides the drift at the end of a loop: the alignment slides from the
 surface mapped a moment ago onto the one mapped at the beginning, and the step between them is taken for motion.
@@ -31,7 +31,7 @@ class ActivityTuning(Tuning):
 
 @tuning_class(frozen=True)
 class ActivitySettings:
-    """Numbers of the set of active keyframes, whose points are tracked against."""
+    """The set of active keyframes, whose points are tracked against."""
 
     forget_after: float = setting(5.0, 0, 1e6)
     """A keyframe is deactivated after the camera has travelled this many times the median depth since it last saw its
@@ -49,7 +49,7 @@ class ActivitySettings:
 
 @savable(not_saved="settings", check="check")
 class ActiveKeyframes:
-    """Keeps the set of active keyframes as the camera moves.
+    """Keeps the set of active keyframes up to date as the camera moves.
 
     Args:
         settings: limits.

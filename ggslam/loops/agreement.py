@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the places that two runs, or two parts of one, have in common agree on how they lie to each other."""
+"""Selects those common places of two runs, or of two parts of one, that agree on the transform between them."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def agreeing_links(
 
 
 class Chain:
-    """The keyframes of a run as a chain of odometry, and how unsure it makes their places to each other.
+    """The keyframes of a run as a chain of odometry with its uncertainty.
 
     Args:
         poses: T_world_camera, float64 [K, 4, 4].

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose graph cut down to the nodes that closures touch.
+"""The pose graph, reduced to the nodes that closures touch.
 
 Odometry alone is a chain without contradictions. Between the keyframes that closures touch it is taken as one factor,
 its covariance being the sum along the chain; what a correction does to the keyframes in between follows from the same
@@ -84,7 +84,7 @@ class CondensedGraph:
         lengths = [(2 * graph.at(odometry + k).error(found)) ** 0.5 for k in range(len(self.loops))]
         return np.asarray(optimiser.getWeights()).reshape(-1)[odometry:] > 0.5, limit, np.array(lengths)
 
-    def settle(self, gtsam: ModuleType, believed: np.ndarray) -> tuple[float, float]:
+    def optimize(self, gtsam: ModuleType, believed: np.ndarray) -> tuple[float, float]:
         """Moves the kept nodes to agree with the believed closures; returns the error before and after."""
         graph, values = self._problem(gtsam, believed)
         before = graph.error(values)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Odometry as dead reckoning, with the covariance that gathers along it."""
+"""Odometry as dead reckoning, with its growing covariance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ggslam.system.savable import savable
 @savable(growing="parents poses covariances steps", check="check")
 @dataclass
 class OdometryTree:
-    """Odometry as dead reckoning: every node hangs on an earlier one.
+    """Odometry as dead reckoning: every node is linked to an earlier one.
 
     `poses` are relative to the first node; `covariances` of their left twists in its frame; `steps` the covariance of
     the last motion alone, in the frame of the node it starts from.
@@ -37,11 +37,11 @@ class OdometryTree:
         """Raises FormatError if nodes do not hang on earlier ones: it may come from a file."""
         count = len(self.poses)
         if not len(self.parents) == len(self.covariances) == len(self.steps) == count:
-            raise FormatError("odometry: numbers of poses and of motions that do not agree")
+            raise FormatError("odometry: the numbers of poses and motions disagree")
         if any(not 0 <= parent < node for node, parent in enumerate(self.parents) if node) or self.parents[:1] not in (
             [], [-1],
         ):  # fmt: skip
-            raise FormatError("odometry: a keyframe that hangs on a later one")
+            raise FormatError("odometry: a keyframe is linked to a later one")
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a recording: keyframes of one part lie right to one another, those of different parts at arbitrary places.
+"""Parts of a recording. Poses are consistent within a part; different parts lie at arbitrary places.
 
 A recording is one part until the camera is lost and tracking goes on elsewhere (`slam.part_start`). A loop between two
 parts makes them one. This is the atlas of ORB-SLAM3 (Campos et al., T-RO 2021) with one map.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which old keyframes see the same place: an index without vocabulary file and without training.
+"""Finds old keyframes that may show the same place. Needs no vocabulary file and no training.
 
 Words are bits sampled from ORB descriptors (locality-sensitive hashing: P. Indyk, R. Motwani, STOC 1998): descriptors
 alike share most of their bits and so some of their words. An inverted list per word (J. Sivic, A. Zisserman, ICCV
@@ -39,7 +39,7 @@ class FernTuning(Tuning):
 @savable()
 @dataclass(frozen=True)
 class Place:
-    """What a view is known by.
+    """The description of a view.
 
     Attributes:
         landmarks: its features with depth.
@@ -65,7 +65,7 @@ class PlaceMatch:
     after="list_again", check="check",
 )  # fmt: skip
 class PlaceIndex:
-    """Keyframes by what they look like.
+    """An index of keyframes by appearance.
 
     Args:
         camera: of all views.
@@ -107,9 +107,9 @@ class PlaceIndex:
         count, ferns = len(self._numbers), self.settings.ferns
         sized = len(self._places) == count <= len(self._codes) and self._codes.shape[1] == ferns
         if not sized or self._positions != {number: position for position, number in enumerate(self._numbers)}:
-            raise FormatError("places: not those of their keyframes")
+            raise FormatError("places do not match their keyframes")
         if any(len(place.codes) != ferns or len(place.words) for place in self._places):
-            raise FormatError("places: not of this program's features")
+            raise FormatError("places: their features are of another kind")
 
     def __contains__(self, number: int) -> bool:
         return number in self._positions
@@ -248,4 +248,4 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], ferns: int) -> None:
     if len(arrays["points"]) != landmarks:
         raise FormatError(f"places: 'points' has {len(arrays['points'])} rows, expected {landmarks}")
     if len(np.unique(arrays["numbers"])) != len(arrays["numbers"]):
-        raise FormatError("places: a keyframe has two")
+        raise FormatError("places: a keyframe has two places")

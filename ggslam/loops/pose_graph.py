@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of keyframe poses: odometry, closures, and which of the closures to believe.
+"""The graph of keyframe poses: odometry, closures, and the selection of closures that agree.
 
 Two tests decide. Each closure alone must be reachable by drift: the correction it asks for is compared with the summed
 covariance of the odometry between its ends (a chi-square test; closures that err in unison do not pass either). Taken
@@ -64,7 +64,7 @@ def closure_covariance(T_i_j: np.ndarray, information: np.ndarray, settings: Gra
 
 @dataclass(frozen=True)
 class GraphResult:
-    """Poses that satisfy odometry and the believed closures.
+    """Poses that satisfy odometry and the accepted closures.
 
     Attributes:
         poses: float64 [n, 4, 4], T_world_camera of all nodes; the first stays where it was.
@@ -196,7 +196,7 @@ class PoseGraph:
         judged = [k for k in range(len(self.loops)) if k not in aside]
         far = self._beyond_drift(start, self._beyond_drift(self._tree.poses, judged))
         while True:
-            condensed, disagreeing, errors = self._settle(gtsam, far | aside, start)
+            condensed, disagreeing, errors = self._optimize_condensed(gtsam, far | aside, start)
             poses = condensed.all_poses()
             nearer = self._beyond_drift(poses, far)
             if len(nearer) == len(far):
@@ -225,10 +225,11 @@ class PoseGraph:
                 )
         return rejected
 
-    def _settle(
+    def _optimize_condensed(
         self, gtsam: ModuleType, far: Mapping[int, str], start: list[np.ndarray]
     ) -> tuple[CondensedGraph, dict[int, str], tuple[float, float]]:
-        """The graph settled on those closures not too far that agree; the others' reasons; errors before and after."""
+        """The graph, optimized on the plausible closures that agree; why the others do not; the error before and
+        after."""
         candidates = [k for k in range(len(self.loops)) if k not in far]
         condensed = CondensedGraph(self._tree, start, [self.loops[k] for k in candidates])
         believed, limit, lengths = condensed.agreement(gtsam, self.settings.inlier_probability)
@@ -237,7 +238,7 @@ class PoseGraph:
             for number, ok, length in zip(candidates, believed, lengths, strict=True)
             if not ok
         }
-        return condensed, disagreeing, condensed.settle(gtsam, believed)
+        return condensed, disagreeing, condensed.optimize(gtsam, believed)
 
 
 def _isotropic(metres: float, degrees: float) -> np.ndarray:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which old keyframes a camera that stays in view of its map compares itself with.
+"""Chooses old keyframes to compare with while the camera stays in view of its map.
 
 What the tracker aligns to holds old and new keyframes together, so that drift between them is not seen: the camera
 follows whatever lies nearest. It shows when a frame is compared with the old keyframes alone. How far a keyframe may

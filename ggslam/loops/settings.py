@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of loop closing, documented."""
+"""Settings of loop closing."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class GraphSettings:
 
 @tuning_class(frozen=True)
 class PlaceSettings:
-    """Numbers of place recognition."""
+    """Place recognition."""
 
     features: FeatureSettings = field(default_factory=lambda: FeatureSettings(count=1000))
     """Of the ORB features that a place is known by."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a view really see the place that it looks like, and from where: features, then geometry, then both.
+"""Verifies that a view shows the place that it resembles, and finds its pose: by features, then geometry, then both.
 
 A candidate is refused with the first reason that is found; the reason says what was expected and what was seen.
 """
@@ -81,7 +81,7 @@ class LocalMap:
 
 @dataclass(frozen=True)
 class Verification:
-    """What came of a candidate.
+    """The outcome for a candidate.
 
     Attributes:
         accepted: whether all tests were passed.

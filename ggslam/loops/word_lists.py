@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where words occur, in few bytes: most words of an index of places occur once, and a list for each costs forty times
-what it says."""
+"""Inverted lists of words in little memory. Most words of an index occur once, and a list for each would take forty
+times its content."""
 
 from __future__ import annotations
 

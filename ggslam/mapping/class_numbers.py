@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which class of the classifier each object id has, and what a new class begins with; the same on every device."""
+"""Maps object ids to classes of the classifier and initializes new classes, equally on every device."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ClassNumbers:
         if not 0 <= self.count <= len(self._ids) or known.sum() != self.count or self._class_of.min() < -1:
             raise FormatError(f"classes of objects: expected numbers from 0 to below {self.count}")
         if not np.array_equal(self._class_of[self.ids], np.arange(self.count)):
-            raise FormatError("classes of objects: an id that has another class")
+            raise FormatError("classes of objects: an id has two classes")
 
     @property
     def ids(self) -> np.ndarray:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All colours of a map change at once: to another exposure, or to those that a better picture shows."""
+"""Changes all colours of a map at once: to another exposure, or to those of a better picture."""
 
 from __future__ import annotations
 

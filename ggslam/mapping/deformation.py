@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map follows its keyframes: each Gaussian moves rigidly with the keyframe that inserted it."""
+"""Moves each Gaussian rigidly with the keyframe that inserted it."""
 
 from __future__ import annotations
 

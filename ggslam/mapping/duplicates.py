@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a loop leaves double: the same surface mapped when the camera left and again when it came back."""
+"""Finds surfaces that a loop mapped twice: when the camera left and when it came back."""
 
 from __future__ import annotations
 

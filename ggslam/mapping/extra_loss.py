@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A loss of the user's own beside the mapper's: torch differentiates it, its gradients join those of the iteration."""
+"""A user's own loss beside the mapper's. torch differentiates it, and its gradients join those of the iteration."""
 
 from __future__ import annotations
 

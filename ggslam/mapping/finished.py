@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Training of finished maps: of a run, of a store's cell, at the seams of merged and updated runs."""
+"""Training of finished maps: of a run, of a cell of a store, and at the seams of merged and updated runs."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class FinishedMapTuning(Tuning):
     longest."""
 
 
-def adopt_finished(mapper: Mapper, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
+def load_finished(mapper: Mapper, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
     """Gives a mapper a finished map and its keyframes, numbered from 0. The map is changed by training."""
     gaussians.updates[:] = FinishedMapTuning.past_updates
     gaussians.feature_updates[:] = FinishedMapTuning.past_updates
-    mapper.adopt(gaussians, keyframes)
+    mapper.load_map(gaussians, keyframes)
 
 
 def train_by_turns(
@@ -58,7 +58,7 @@ def train_by_turns(
 
 
 class StillMapper(CpuMapper):
-    """Trains a finished map: poses and exposures stay as they are, nothing is inserted.
+    """Trains a finished map. Poses and exposures are fixed, and nothing is inserted.
 
     Args:
         gaussians: the map.
@@ -73,7 +73,7 @@ class StillMapper(CpuMapper):
         valid: Sequence[np.ndarray | None],
     ) -> None:  # fmt: skip
         super().__init__(gaussians, settings, context)
-        adopt_finished(self, gaussians, keyframes)
+        load_finished(self, gaussians, keyframes)
         self._counted = valid
 
     def train(

@@ -87,7 +87,7 @@ class Classes(Protocol):
 
 
 class MaskedKeyframe(Protocol):
-    """What is asked of a keyframe: its number, and its mask, uint16 [H, W], or None."""
+    """What identity learning reads of a keyframe: its number, and its mask, uint16 [H, W], or None."""
 
     @property
     def index(self) -> int: ...

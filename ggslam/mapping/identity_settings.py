@@ -11,7 +11,7 @@ from ggslam.system.settings import setting, settings_class, tuning_class
 
 @tuning_class(frozen=True)
 class NeighbourSettings:
-    """Numbers of the 3-D regularisation: similar class distributions of neighbouring Gaussians."""
+    """The 3-D regularisation: neighbouring Gaussians get similar class distributions."""
 
     weight: float = setting(1.0, 0, 1e6)
     """Weight l_obj3d; 0: none."""

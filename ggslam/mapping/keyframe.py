@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame that the map is trained on."""
+"""Keyframes: frames that the map is trained on."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Keyframe:
         height, width = self.camera.height, self.camera.width
         images = [image for image in (self.color, self.depth, self.mask, self.moving) if image is not None]
         if any(image.size and image.shape[:2] != (height, width) for image in images):
-            raise FormatError(f"keyframe {self.index}: images of another size than its camera's, {width}x{height}")
+            raise FormatError(f"keyframe {self.index}: its images do not have the size of its camera, {width}x{height}")
         if not self.depth_unit > 0 or self.iterations < 0:
             raise FormatError(f"keyframe {self.index}: {self.iterations} iterations, depth in {self.depth_unit} m")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What mapper and masks tell each other about a new keyframe."""
+"""What mapper and object masks exchange about a new keyframe."""
 
 from __future__ import annotations
 

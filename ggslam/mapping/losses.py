@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loss between a rendered view and a keyframe; what goes into it and comes out of it on any device.
+"""The loss between a rendered view and a keyframe: its inputs and outputs on any device.
 
     loss = (1 - dssim_weight) mean rho(x - y) + dssim_weight (1 - mean SSIM(x, y))
            + depth_weight mean_valid |D - D_target| + opacity_weight mean_valid (1 - alpha)
@@ -26,7 +26,7 @@ LOSS_WEIGHTS = (
 
 
 class RenderedImages(Protocol):
-    """What a renderer hands over; float32 on the device of the loss, contiguous."""
+    """Images from a renderer; float32 on the device of the loss, contiguous."""
 
     @property
     def image(self) -> torch.Tensor:
@@ -89,7 +89,7 @@ class LossValues:
 
 @dataclass(frozen=True)
 class LossGradients:
-    """What the loss gives to the rasterizer's backward pass, on the device of the loss.
+    """Gradients of the loss for the rasterizer's backward pass, on the device of the loss.
 
     Attributes:
         d_image: d loss / d rendered image (before exposure), float32 [3, H, W].

@@ -21,7 +21,7 @@ from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
 from ggslam.mapping.mean_map import MeanMap
-from ggslam.mapping.pixel_grid import WHOLE, PixelGrid, grid_of_turn
+from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.pruning import is_look_due, prune
 from ggslam.mapping.residency import Residency
 from ggslam.mapping.sampling import KeyframeSampler
@@ -103,7 +103,7 @@ class LossSums:
 
 
 class TrainingRasterizer(Protocol):
-    """What the mapper needs of a rasterizer besides rendering: the backward pass with the optimizer in it."""
+    """The part of a rasterizer that training needs: a backward pass that includes the optimizer step."""
 
     def backward_step(
         self, map: GaussianMap, grad_image: torch.Tensor | None, grad_depth: torch.Tensor | None = None,
@@ -216,7 +216,7 @@ class Mapper(ABC):
         self.times.keyframes += 1
         return keyframe
 
-    def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
+    def load_map(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         """Goes on with a map made before. Keyframes without images keep their Gaussians but are never trained on."""
         self.map, self.keyframes = gaussians, keyframes
 
@@ -244,7 +244,7 @@ class Mapper(ABC):
         gone = torch.tensor(sorted(self.left_out), dtype=self.map.birth_keyframe.dtype, device=self.map.device)
         self.map.keep(~torch.isin(self.map.birth_keyframe, gone))
 
-    def mend(self, kept: list[int], doubted: list[int], iterations: int) -> None:
+    def retrain_loop_ends(self, kept: list[int], doubted: list[int], iterations: int) -> None:
         """After the keyframes were moved so that two ends of a loop meet: drops what the newer end had mapped again,
         and trains both ends.
 
@@ -300,7 +300,7 @@ class Mapper(ABC):
         noisy, STEPS on every second pixel of as many. It is the same whether identities are trained, too, or not."""
         for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
             keyframe = self._draw(numbers)
-            grid = self._choose_grid(keyframe) if self._is_noisy else WHOLE
+            grid = self._choose_grid(keyframe) if self._is_noisy else ALL_PIXELS
             self._step(keyframe, (rate_factor, pose_factor), grid, step == 0 and self._is_identity_due(keyframe))
             if grid.is_whole:
                 break
@@ -309,7 +309,7 @@ class Mapper(ABC):
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         """Every second pixel of every second row of a keyframe, other ones each time; all if a loss needs them all."""
         if self.extra_loss is not None or self._is_identity_dense:
-            return WHOLE
+            return ALL_PIXELS
         return grid_of_turn(keyframe.iterations + keyframe.index, keyframe.camera)
 
     @property
@@ -376,7 +376,7 @@ class Mapper(ABC):
             keyframe: what to train on.
             rate_factor: multiplies every learning rate.
         """
-        self._step(keyframe, (rate_factor, rate_factor), WHOLE, self._is_identity_due(keyframe))
+        self._step(keyframe, (rate_factor, rate_factor), ALL_PIXELS, self._is_identity_due(keyframe))
         self._count_iteration()
 
     def _step(self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool) -> None:
@@ -455,13 +455,13 @@ class Mapper(ABC):
 
     @abstractmethod
     def _render(
-        self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE, close_below: float = 0.0
+        self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
     ) -> RenderBuffers:
         """The map as a keyframe sees it at a grid's pixels, with or without identities. `close_below` as the CPU
         rasterizer's; others may draw pixels to their end."""
 
     @abstractmethod
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> LossGradients:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> LossGradients:
         """The loss of a view rendered at a grid's pixels against its keyframe's images."""
 
     @abstractmethod

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every n-th pixel of every n-th row of an image, as an image of its own.
+"""Every n-th pixel of every n-th row of an image, as a smaller image.
 
 The map rendered by the grid's camera with the grid's low-pass filter has at each pixel what the whole image has there,
 to rounding: nothing is averaged. The loss is the whole image's at fewer pixels, but for SSIM, whose windows reach n
@@ -31,7 +31,7 @@ _ORDER: Final = ((0, 0), (1, 1), (0, 1), (1, 0))
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """Which pixels.
+    """The pixels of such a grid.
 
     Attributes:
         stride: every so manyth of each row and column.
@@ -64,12 +64,12 @@ class PixelGrid:
         return low_pass / self.stride**2
 
 
-WHOLE = PixelGrid()
+ALL_PIXELS = PixelGrid()
 
 
 def grid_of_turn(turn: int, camera: Camera) -> PixelGrid:
     """The grid of a view's next step, of which `turn` counts those before: every second pixel. In four turns each
     pixel comes once."""
     if min(camera.width, camera.height) < 2 * PixelGridTuning.min_size:
-        return WHOLE
+        return ALL_PIXELS
     return PixelGrid(2, *_ORDER[turn % 4])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Removal of Gaussians that do no good."""
+"""Removes useless Gaussians."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the mapper needs to know when a part of the map is on disk."""
+"""Tells the mapper which parts of the map are in memory."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which keyframe is trained next."""
+"""Chooses the keyframe that is trained next."""
 
 from __future__ import annotations
 

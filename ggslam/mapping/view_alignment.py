@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a camera is by the colours it sees: its image is laid onto the map as rendered from near by.
+"""Locates a camera by colour: aligns its image to the map as rendered from nearby.
 
 Depth whose errors are shared by neighbouring pixels pulls a pose along with them, however many points there are. The
 map is the mean over many frames, and a picture of it fits a camera's image to a tenth of a pixel.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the votes that Gaussians carry say: the rendering weight each had under the mask ids it was seen with most. All
-of it happens on the map's device, and nothing waits for it."""
+"""Evaluates the votes of Gaussians: the rendering weight of each under its most frequent mask ids. Everything stays on
+the map's device, and nothing waits for it."""
 
 from __future__ import annotations
 

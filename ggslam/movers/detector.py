@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds what moves, frame after frame.
+"""Detects moving things frame by frame.
 
 A place of a frame is evidence if several frames before it, or one without doubt, looked past it at something farther:
 something has come there. Such places are gathered into whole things, by segments where there are any, else by what is
@@ -46,7 +46,7 @@ class DetectorTuning(Tuning):
 @savable(not_saved="settings")
 @dataclass
 class MoverDetector:
-    """Looks at located frames, each once and in their order.
+    """Detects movers in located frames. It gets each frame once, in order.
 
     Attributes:
         settings: see there.

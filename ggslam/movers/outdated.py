@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which parts of an earlier visit's view are not as they were any more, by the depth of the visit that goes on.
+"""Finds outdated parts of the views of an earlier visit, by the depth of the current visit.
 
 Each view of the newer visit that is surely located says of each place of an earlier one whether it looks through what
 was there, or sees it again; and where it sees something that the earlier one looked through. One view may err: by its

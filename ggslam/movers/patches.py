@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame shows of one mover: points of its surface with colours and normals."""
+"""A patch: the visible surface of one mover in a frame, as points with colours and normals."""
 
 from __future__ import annotations
 

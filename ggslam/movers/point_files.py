@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.movers.found import FoundMover
+from ggslam.movers.mover_table import FoundMover
 
 POINTS_FILE = "mover_points.npz"
 """Of runs in which something was found to move."""

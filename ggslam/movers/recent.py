@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The latest located frames, to look back at when something turns out to have begun to move."""
+"""The latest located frames, kept to be searched once something starts to move."""
 
 from __future__ import annotations
 

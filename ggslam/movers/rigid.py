@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a mover is, frame after frame, by the surface that it showed before; whether it is one rigid thing."""
+"""Tracks a rigid mover by its surface, and decides whether it is rigid."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ggslam.movers.found import Kind
+from ggslam.movers.mover_table import Kind
 from ggslam.movers.patches import Patch
 from ggslam.movers.surface import MoverSurface, PatchFit
 from ggslam.scene.poses import inverse, orthonormalize, se3_exp, so3_log

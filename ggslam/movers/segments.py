@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places that are evidence of motion, gathered into whole things."""
+"""Groups places with evidence of motion into whole things."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _AROUND = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True)
 class Gathering:
-    """What is known of each place of a small image, bool [h, w] unless it says otherwise.
+    """What is known about each place of a small image, bool [h, w] unless stated otherwise.
 
     Attributes:
         novel: something has come there.

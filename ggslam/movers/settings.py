@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of the search for things that move, documented."""
+"""Settings of the detection of moving things."""
 
 from __future__ import annotations
 

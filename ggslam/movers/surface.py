@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surface of a rigid mover as it was seen so far, which grows, and which new frames are brought upon."""
+"""The surface of a rigid mover. It grows with what frames show, and new frames are registered to it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class MoverSurfaceTuning(Tuning):
 
 @dataclass(frozen=True)
 class PatchFit:
-    """A patch brought upon a surface.
+    """A patch, registered to a surface.
 
     Attributes:
         T_patch_surface: float64 [4, 4].

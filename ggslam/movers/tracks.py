@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells movers from one another, and follows each from before it began to move until it has come to rest."""
+"""Tracks movers, each from before it starts to move until it rests."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from ggslam.movers.found import FoundMover, MoverSight
+from ggslam.movers.mover_table import FoundMover, MoverSight
 from ggslam.movers.patches import Patch
 from ggslam.movers.recent import RecentFrame, Sight
 from ggslam.movers.rigid import RigidTracker
@@ -108,8 +108,8 @@ class Track:
             return not self.sights or frame - self.sights[-1].frame > TrackTuning.rested_frames
         return len(self.pending) >= TrackTuning.rested_frames or frame - self.tracker.frame > TrackTuning.hidden_frames
 
-    def settle(self) -> None:
-        """It has come to rest, or is lost from sight."""
+    def finish(self) -> None:
+        """Ends the track: the mover has come to rest or is lost from sight."""
         if len(self.pending) >= TrackTuning.rested_frames and self.sights and not self.tracker.flexible:
             self.after = self.pending[-1]
             self.scatter[1] = self.stood
@@ -175,7 +175,7 @@ class MoverTracks:
             if sight is not None:
                 track.follow(sight, view, detected is not None)
             if detected is None and track.is_over(view.index):
-                track.settle()
+                track.finish()
 
     def _assign(self, view: RecentFrame, things: np.ndarray, segments: np.ndarray | None) -> dict[int, np.ndarray]:
         """The mask of each mover that moves, by its place among `tracks`; new ones are begun."""

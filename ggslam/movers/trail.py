@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where movers have been, and which parts of earlier views showed something there that is gone now."""
+"""The space that movers passed through, and the parts of earlier views that showed something there that is gone."""
 
 from __future__ import annotations
 

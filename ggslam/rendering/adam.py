@@ -87,7 +87,7 @@ class AdamSettings:
 
 @dataclass(frozen=True)
 class _Shape:
-    """What a schedule is made of besides the rates, which change with every step of a final refinement."""
+    """The parameters of a schedule without the rates, which change with every step of a final refinement."""
 
     beta1: float
     beta2: float

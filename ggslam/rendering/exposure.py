@@ -67,7 +67,7 @@ def typical_gain(gains: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray
 
 @dataclass(frozen=True)
 class SeenAgain:
-    """What a map shows where a camera looks.
+    """The map, rendered at the pose of an image.
 
     Attributes:
         image: rendered colour [3, H, W].

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians as a torch module, for training loops of one's own."""
+"""Gaussians as a torch module for custom training loops."""
 
 from __future__ import annotations
 

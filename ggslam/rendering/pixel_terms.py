@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sampled compositing: the Gaussians that single pixels are made of.
+"""Sampled compositing: the Gaussians that contribute to single pixels.
 
 A feature rendered at a pixel is the sum of weight times feature over the pixel's terms. With the terms at hand, feature
 channels can be rendered and trained at a few thousand pixels of a view that is rendered for its colours anyway: whole

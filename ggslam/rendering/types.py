@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What goes into a renderer and what comes out of it, the same for all backends."""
+"""Inputs and outputs of a renderer, the same for all backends."""
 
 from __future__ import annotations
 

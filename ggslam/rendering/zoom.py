@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map as it has to be to look right where it is drawn larger than it was trained.
+"""Adapts a map to be drawn larger than it was trained.
 
 A renderer widens every projected Gaussian by `LOW_PASS`, a variance in its own pixels. Drawn at twice the size that
 is a quarter of what the map was trained with: splats come out thin, with seams between them. Mip-Splatting (Yu et al.,

@@ -95,10 +95,10 @@ class _Member:
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
         if npy.read_magic(file) != (1, 0):
-            raise ValueError("an array of an unknown version")
+            raise ValueError("an array has an unknown version")
         shape, fortran, self._dtype = npy.read_array_header_1_0(file)
         if self._dtype.hasobject or fortran or not shape:
-            raise ValueError("an array of an unknown kind")
+            raise ValueError("an array has an unknown kind")
         self._shape, self.rows = shape[1:], shape[0]
 
     def read(self, rows: int) -> np.ndarray:
@@ -153,13 +153,13 @@ def _read_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
     readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     version = npy.read_magic(file)
     if version not in readers:
-        raise ValueError(f"an array of version {version}")
+        raise ValueError(f"an array has the unknown version {version}")
     return readers[version](file)
 
 
 def _check_claim(claimed: int, held: int) -> None:
     if claimed > held:
-        raise ValueError(f"it claims {claimed:,} bytes of arrays, {held:,} can be there")
+        raise ValueError(f"it claims {claimed:,} bytes of arrays, at most {held:,} are possible")
 
 
 _DAMAGE = (*ZIP_DAMAGE, KeyError, TypeError, SyntaxError, RecursionError, tokenize.TokenError)

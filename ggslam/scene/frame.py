@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One instant of a recording."""
+"""A frame: one instant of a recording."""
 
 from __future__ import annotations
 

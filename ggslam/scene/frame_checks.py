@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a frame is what its recording promised."""
+"""Checks that a frame is as its recording promises."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the keyframes of a run are, in one place that all parts of the run read."""
+"""Poses of the keyframes of a run, in one place that all parts of the run read."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How objects are called before people, and in names of files."""
+"""Names of objects in texts and in file names."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A box around a thing, as files and pages have it."""
+"""An oriented box around a thing, as in files and pages."""
 
 from __future__ import annotations
 

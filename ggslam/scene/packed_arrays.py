@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Named arrays and files in few bytes, without loss: LZMA (the .xz format), of arrays after what makes them alike.
+"""Packs named arrays and files without loss: LZMA (the .xz format) after transforms that make arrays more regular.
 
 An array is compressed as it lies, as planes (the first bytes of all numbers, then the second ones), or as planes of the
 differences from row to row, whichever is smallest.
@@ -50,7 +50,7 @@ def unpack_bytes(data: bytes, most: int = ArrayLimits.max_bytes) -> bytes:
     except lzma.LZMAError as error:
         raise FormatError(f"damaged: {error}") from None
     if len(content) > most or not inflater.eof or inflater.unused_data:
-        raise FormatError("damaged: it does not end where it should")
+        raise FormatError("damaged: it is too short or too long")
     return content
 
 
@@ -79,7 +79,7 @@ def unpack_arrays(data: bytes) -> dict[str, np.ndarray]:
     """
     begin = len(_MAGIC) + 4
     if data[: len(_MAGIC)] != _MAGIC or len(data) < begin:
-        raise FormatError("no packed arrays of ggslam")
+        raise FormatError("these are not packed arrays of ggslam")
     at = begin + int.from_bytes(data[begin - 4 : begin], "little")
     arrays: dict[str, np.ndarray] = {}
     left = max(4 * ArrayLimits.max_bytes, ArrayLimits.max_ratio * len(data))
@@ -91,21 +91,21 @@ def unpack_arrays(data: bytes) -> dict[str, np.ndarray]:
     except (ValueError, TypeError, RecursionError, OverflowError) as error:
         raise FormatError(f"damaged: {error}") from None
     if at != len(data):
-        raise FormatError("damaged: it does not end where it should")
+        raise FormatError("damaged: it is too short or too long")
     return arrays
 
 
 def _array(data: bytes, kind: np.dtype, shape: Any, way: str, left: int) -> np.ndarray:
     if kind.kind not in "biuf" or any(not isinstance(n, int) or n < 0 for n in shape):
-        raise FormatError(f"damaged: an array of {kind}")
+        raise FormatError(f"damaged: an array has the type {kind}")
     size = math.prod(shape) * kind.itemsize
     if size > min(ArrayLimits.max_bytes, left):
-        raise FormatError(f"damaged: an array of {size} bytes")
+        raise FormatError(f"damaged: an array claims {size} bytes")
     content = unpack_bytes(data, size)
     if size == 0:
         return np.zeros(shape, kind.newbyteorder("="))
     if len(content) != size:
-        raise FormatError("damaged: an array of another size")
+        raise FormatError("damaged: an array has another size than it claims")
     if way == "plain":
         return np.frombuffer(content, kind).reshape(shape).astype(kind.newbyteorder("="))
     rows = np.frombuffer(content, np.uint8).reshape(kind.itemsize, -1).T

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What many views say of the same places.
+"""Counts what many views say about the same places.
 
 One view errs by its pose, at outlines, and where depth was guessed; several have to agree. While a map is made, views
 come, are moved by closed loops, and are forgotten: `SightCounts` takes each view's answers, and takes them back.
@@ -16,7 +16,7 @@ from ggslam.sight.view import Answers
 
 @dataclass(frozen=True)
 class SightCounts:
-    """How many views say what of each of n places, int32 [n] each.
+    """How many views give each answer for each of n places, int32 [n] each.
 
     Attributes:
         through: surely look through it.

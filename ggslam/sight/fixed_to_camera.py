@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is fixed to the camera: the tool of a robot, the bonnet of a car, whatever is in every image at the same place.
+"""Detects what is fixed to the camera (the tool of a robot, the bonnet of a car): it is in every image at the same
+place.
 
 It does not belong to the world: one looks through where it was a moment ago, and it is where it was in the image.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far measured depths of one surface may differ."""
+"""The margin between measured depths of one surface."""
 
 from __future__ import annotations
 

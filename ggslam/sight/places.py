@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole views against one another, several times smaller: where other views looked through what a view sees now. What
-moves, and what left since an earlier visit, is found by this.
+"""Compares whole views at reduced size: where other views looked through what a view shows. Finds what moves and what
+left since an earlier visit.
 
 Views are compared with the nearest (or the farthest) depth around each place, so that neither outlines nor
 the last millimetre of a pose are taken for something that moved. On smooth surfaces these are of means, whose noise is

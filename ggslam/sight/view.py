@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a located depth image says of places in the world: it looks through them, shows them, or something hides them.
+"""What a located depth image says about a place in the world: it looks through it, shows it, or something hides it.
 
     view = View.of(depth, camera, T_world_camera, Margin.of(noise), context)
     answers = view.classify_points(points)
@@ -107,7 +107,7 @@ class Answers:
 
 @dataclass(frozen=True)
 class View:
-    """A depth image, and where it was taken.
+    """A depth image and its pose.
 
     Attributes:
         depth: float32 [H, W], metres, 0 where unknown.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of frames by colour against the map: at the end where depth is noisy, and all along where it errs more than its
-images show."""
+"""Photometric alignment of frames to the map: at the end of a run where depth is noisy, and throughout where depth is
+further off than its own noise shows."""
 
 from __future__ import annotations
 
@@ -168,15 +168,15 @@ class ColorPoses:
             number, depth, *coded = kept if isinstance(kept, (tuple, list)) and len(kept) == 4 else (-1, 0.0)
             known = isinstance(number, int) and 0 <= number < len(self.poses.frames) and isinstance(depth, float)
             if not known or any(not isinstance(a, np.ndarray) or a.dtype != np.uint8 or a.ndim != 1 for a in coded):
-                raise FormatError("images of frames that are aligned at the end: not of this recording")
+                raise FormatError("images for the alignment at the end: one does not belong to this recording")
             if not len(coded[0]):
-                raise FormatError("images of frames that are aligned at the end: an empty one")
+                raise FormatError("images for the alignment at the end: one is empty")
 
     def _decode(self, coded: np.ndarray) -> np.ndarray:
         """A kept image, uint8 [H, W]."""
         image, camera = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), self.state.camera
         if image is None or image.shape != (camera.height, camera.width):  # out of a checkpoint that was tampered with
-            raise FormatError("images of frames that are aligned at the end: not of this recording")
+            raise FormatError("images for the alignment at the end: one does not belong to this recording")
         return image
 
     @property

@@ -37,7 +37,7 @@ def filter_classes() -> list[type[FrameFilter]]:
 
 @savable()
 class FilterChain(FrameFilter):
-    """Filters, of which each gets the frame as the one before it left it.
+    """Applies filters in a row. Each receives the frame as the previous one returned it.
 
     Args:
         filters: in their order.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When frames are due, and which come too late: a camera's pace for the frames of a recording, a live camera's own."""
+"""Paces the frames of a recording like a camera, and drops frames, also of a live camera, that come too late."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ClockTuning(Tuning):
 
 
 class FrameClock:
-    """Hands frames on at their time and drops those that come too late because the caller was busy.
+    """Yields each frame when it is due and drops frames that are late because the caller was busy.
 
     A recording's frame is due by its index, a live camera's by its timestamp, and never waited for. Only the caller's
     own delay makes frames late: where the source lets the caller wait (a camera that stalls, one slower than stated,

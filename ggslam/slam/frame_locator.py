@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where is the camera? It is aligned to the map; a lost one is looked up among known places, or begins a new part."""
+"""Locates frames by alignment to the map. A lost camera is located by known places or starts a new part."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 @dataclass(frozen=True)
 class Located:
-    """The frames of one instant, one of each camera: where they are.
+    """The poses of the frames of one instant, one frame of each camera.
 
     Attributes:
         frames: as they were located.
@@ -97,7 +97,7 @@ class FrameLocator:
                 result, early = self._try_new_part(frame, result, self._loops, takes_keyframes)
         if result.status is not TrackingStatus.LOST:
             self.part_start.forget()
-            self.left_parts.settle()
+            self.left_parts.forget_targets()
         result = self.color_poses.align(frame, result)
         return Located([frame], result, [result], early)
 

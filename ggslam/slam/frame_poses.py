@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of all frames, remembered relative to keyframes: they move when loops are closed and poses are refined."""
+"""Poses of all frames, stored relative to keyframes, so that they follow loop closures and refined poses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 @savable(growing="frames", check="check")
 class FramePoses:
-    """Where the frames so far were located."""
+    """Poses of the frames so far."""
 
     frames: list[TrackedFrame]
     _T_world_anchor: Pose

@@ -15,7 +15,7 @@ from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.votes import vote_labels
 from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.slam.keyframe_sights import KeyframeSights, SightedPose
+from ggslam.slam.keyframe_visibility import KeyframeVisibility, ViewReach
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.grid import GridStore
@@ -29,12 +29,12 @@ class GaussianPager:
 
     Args:
         settings: see there.
-        sights: what the keyframes see.
+        visibility: of the keyframes.
         folder: to page to; made when it is needed.
     """
 
-    def __init__(self, settings: PagingSettings, sights: KeyframeSights, folder: Path) -> None:
-        self._settings, self._sights, self._folder = settings, sights, folder
+    def __init__(self, settings: PagingSettings, visibility: KeyframeVisibility, folder: Path) -> None:
+        self._settings, self._visibility, self._folder = settings, visibility, folder
         self._mapper: Mapper | None = None
         self.cells: GaussianCells | None = None
         """What is on disk; None until the first Gaussians go there."""
@@ -77,22 +77,22 @@ class GaussianPager:
         if self.cells is None or not self.is_split or not len(numbers):
             return numbers
         found: list[int] = []
-        for asked, frustums in self._sights.batches(numbers):
+        for asked, frustums in self._visibility.batches(numbers):
             lacking = self.cells.visible_cells(frustums)
             found += [number for number, keys in zip(asked, lacking, strict=True) if not keys]
         return found or [numbers[-1]]  # the budget is less than one view: the newest is trained on what there is
 
     # --- to memory ---------------------------------------------------------------------------------------------------
 
-    def bring(self, sights: list[SightedPose], limit: int, room: int = 0) -> int:
+    def bring(self, views: list[ViewReach], limit: int, room: int = 0) -> int:
         """Brings what is seen into memory, and sends others away so that `room` is left of `limit` Gaussians. Returns
         as `send`."""
         wanted: list[CellKey] = []
         if self.cells is not None:
-            frustums = self._sights.frustums(sights)
+            frustums = self._visibility.frustums(views)
             wanted = sorted({key for keys in self.cells.visible_cells(frustums) for key in keys})
         incoming = 0 if self.cells is None else self.cells.count_in(wanted)
-        excess = self.send(sights, len(self.map) + incoming + room - limit, limit)
+        excess = self.send(views, len(self.map) + incoming + room - limit, limit)
         self._move_in(wanted)
         return excess
 
@@ -101,7 +101,7 @@ class GaussianPager:
         if self.cells is None:
             return
         for number in numbers:
-            keys = self.cells.visible_cells(self._sights.frustums(self._sights.of([number])))[0]
+            keys = self.cells.visible_cells(self._visibility.frustums(self._visibility.of([number])))[0]
             if len(self.map) + self.cells.count_in(keys) > limit:
                 return
             self._move_in(keys)
@@ -119,7 +119,7 @@ class GaussianPager:
 
     # --- to disk -----------------------------------------------------------------------------------------------------
 
-    def send(self, sights: list[SightedPose], excess: int, limit: int) -> int:
+    def send(self, views: list[ViewReach], excess: int, limit: int) -> int:
         """Sends at least `excess` Gaussians to disk, if so many are not seen from here, and some more, so that it is
         not needed again at once. Returns how many stay above `limit`."""
         if excess <= 0:
@@ -128,23 +128,23 @@ class GaussianPager:
         rows = cells.cells_of(self.map)
         if not rows:
             return 0
-        chosen = self._choose(sights, cells, rows, excess, excess + int(self._settings.slack * limit))
+        chosen = self._choose(views, cells, rows, excess, excess + int(self._settings.slack * limit))
         left = len(self.map) - sum(len(part) for part in chosen.values())
         with delay_interrupts():
             self.moved_out += cells.move_out(self.map, chosen) if chosen else 0
         return max(0, left - limit)
 
     def _choose(
-        self, sights: list[SightedPose], cells: GaussianCells, rows: dict[CellKey, np.ndarray], excess: int, enough: int
+        self, views: list[ViewReach], cells: GaussianCells, rows: dict[CellKey, np.ndarray], excess: int, enough: int
     ) -> dict[CellKey, np.ndarray]:
         """The cells to send: those seen the longest ago, of these the farthest first. Near ones only up to `excess`,
         others up to `enough` Gaussians."""
         keys = list(rows)
         centres = cells.store.grid.centres_of(np.array(keys))
         boxes = cells.boxes_of(self.map, rows)
-        seen = np.asarray(self._sights.frustums(sights).touch(*boxes).any(0))
-        last_seen = self._sights.last_seen(boxes)
-        positions = np.stack([sight.T_world_camera[:3, 3] for sight in sights])
+        seen = np.asarray(self._visibility.frustums(views).touch(*boxes).any(0))
+        last_seen = self._visibility.last_seen(boxes)
+        positions = np.stack([view.T_world_camera[:3, 3] for view in views])
         distance = np.linalg.norm(centres[:, None] - positions, axis=2).min(1)
         chosen: dict[CellKey, np.ndarray] = {}
         count = 0
@@ -187,7 +187,7 @@ class GaussianPager:
             sizes += np.bincount(vote_labels(part).numpy(), minlength=65536)
         return sizes
 
-    def settle(self) -> GaussianCells | None:
+    def move_all_out(self) -> GaussianCells | None:
         """Everything goes to disk, if anything is there, and its cells are handed over; None: all is in memory."""
         if self.cells is None:
             return None
@@ -197,7 +197,7 @@ class GaussianPager:
         self.map.shrink(0)
         if self.mapper.identity is not None:
             self.cells.change(self.mapper.identity.catch_up_and_label)
-        self.cells.settle()
+        self.cells.remove_emptied()
         return self.cells
 
     def _prune_nowhere(self) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the camera was last known in the parts of the map that it left.
+"""The last known pose of the camera in each part of the map that it left.
 
 What made the camera lose its way may have been a thing that covered the view for a while, and that a part began with.
 Once it is gone, the camera is where it was lost, or near.
@@ -72,7 +72,7 @@ class LeftParts:
         if motion.reference_view is not None:
             self.parts = [*self.parts, LeftPart(keyframe, T_world_keyframe.copy(), motion)][-LeftPartTuning.max_parts:]
 
-    def settle(self) -> None:
+    def forget_targets(self) -> None:
         """The camera is located: what was gathered to find it is not needed."""
         for part in self.parts:
             part.target = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places, verification and pose graph at work in the loop: what `Slam` asks after each keyframe and when it is lost."""
+"""Loop closing: `Slam` calls it after each keyframe and when the camera is lost."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from ggslam.tracking.tracker import Tracker, TrackingResult
 @savable()
 @dataclass(frozen=True)
 class LoopEvent:
-    """What came of a candidate, or of a frame that was lost.
+    """The outcome for a candidate, or for a lost frame.
 
     Attributes:
         kind: "closed", "verified" (believed later or never), "refused", "found again"; "new part", "joined",
@@ -95,7 +95,7 @@ class _Found:
     not_saved="settings comparison _camera _surface _tracker _lock _helper _begun", growing="events", check="check"
 )
 class LoopCloser:
-    """Remembers every keyframe's place and odometry; finds loops, and lost frames.
+    """Stores the place and odometry of every keyframe, and finds loops and lost frames.
 
     All methods may be called from tracker and mapper thread.
 
@@ -150,7 +150,7 @@ class LoopCloser:
         counts = [count, len(self.poses), len(self.graph), len(self.places), len(self.activity), len(self.revisits)]
         counts.append(len(self.parts.of))
         if len(set(counts)) > 1:
-            raise FormatError(f"loops: numbers of keyframes that do not agree: {counts}")
+            raise FormatError(f"loops: the parts of the state disagree about the number of keyframes: {counts}")
         named = [keyframe for found in self._verified for keyframe in (found.keyframe, found.old_keyframe)]
         named += [] if self._found_at is None else [self._found_at[1]]
         check_indices("loops", named, count)
@@ -179,7 +179,7 @@ class LoopCloser:
         """A keyframe was made of a frame, and its points are in the surface. Puts aside and takes back keyframes.
 
         Returns:
-            The correction if this closes a loop; `settle` it.
+            The correction if this closes a loop. `apply` it.
         """
         start = time.perf_counter()
         with self._lock:
@@ -203,8 +203,8 @@ class LoopCloser:
         self.seconds += time.perf_counter() - start
         return correction
 
-    def settle(self, correction: Correction) -> None:
-        """Takes over the poses of a correction; the surface is arranged accordingly."""
+    def apply(self, correction: Correction) -> None:
+        """Moves the tracked surface to the poses of a correction."""
         with self._lock:
             self._surface.arrange(correction.active, correction.T_world_camera)
             self._verified.clear()
@@ -383,8 +383,8 @@ class LoopCloser:
         Returns:
             As `add`; None if too few of the places agree.
         """
-        olds, news = self.parts.members(older), self.parts.members(younger)
-        agreeing = links_between(links, olds, news, self.poses, self.settings.graph)
+        old_members, new_members = self.parts.members(older), self.parts.members(younger)
+        agreeing = links_between(links, old_members, new_members, self.poses, self.settings.graph)
         if len(agreeing) < self.settings.confirmations:
             return None
         loops = [self.graph.add_loop(k.old, k.new, k.T_old_new, k.information) for k in agreeing]
@@ -393,7 +393,7 @@ class LoopCloser:
             return None
         self._note_joined(-1, agreeing[0].old, agreeing[0].new)
         T_new_old = result.poses @ inverse(self.poses.array())
-        return Correction(result.poses, T_new_old, olds, news, olds | news)
+        return Correction(result.poses, T_new_old, old_members, new_members, old_members | new_members)
 
     def begin_part(self, frame: Frame, first: int) -> None:
         """A lost frame, which will be added as a keyframe, begins a part; `first`: index of its first frame."""
@@ -494,7 +494,7 @@ class LoopCloser:
         places = {name.removeprefix("places_"): a for name, a in arrays.items() if name.startswith("places_")}
         self.places = PlaceIndex.from_arrays(self._camera, places, self.settings.places)
         if not np.array_equal(arrays["poses"], self.poses.array()):
-            raise FormatError("places and surfaces: not of the same keyframes")
+            raise FormatError("places and surfaces belong to different keyframes")
         for number, (T, depth) in enumerate(zip(self.poses, arrays["median_depths"], strict=True)):
             self.graph.add_node(T)
             T_before_this = inverse(self.poses[number - 1]) @ T if number else np.eye(4)
@@ -505,7 +505,7 @@ class LoopCloser:
             self._taken.append((None, 0))
             self.activity.add(T, float(depth))
         if not len(self) == len(self.places) == len(self._surface):
-            raise FormatError("places, poses and surfaces are not of the same keyframes")
+            raise FormatError("places, poses and surfaces belong to different keyframes")
         self.activity.active = set()
 
 

@@ -13,7 +13,7 @@ from ggslam.system.settings import setting, settings_class, tuning_class
 
 @tuning_class(frozen=True)
 class LoopTuning:
-    """Numbers of loop closing."""
+    """Internal settings of loop closing."""
 
     candidates: int = setting(3, 1, 1000)
     """Old keyframes tried for a new keyframe or a lost frame, the likeliest first."""

@@ -84,10 +84,10 @@ class MapCorrections:
             self._pager.move_keyframes(correction.T_new_old)
             self._pager.bring_ends(ends)
         with self.publishing:
-            loops.settle(correction)
+            loops.apply(correction)
             self.moves.append(correction.T_new_old[-1])
         self._unite_objects(correction)
-        self._mapper.mend(sorted(ends), sorted(correction.doubted), loops.settings.repair_iterations)
+        self._mapper.retrain_loop_ends(sorted(ends), sorted(correction.doubted), loops.settings.repair_iterations)
 
     def move_world(self, T_new_old: np.ndarray, loops: LoopCloser) -> None:
         """Moves everything [4, 4]; for the end, when nothing is tracked any more."""

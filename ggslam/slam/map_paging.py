@@ -27,7 +27,7 @@ from ggslam.mapping.mapper import Mapper
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.gaussian_paging import GaussianPager
-from ggslam.slam.keyframe_sights import KeyframeSights, SightedPose
+from ggslam.slam.keyframe_visibility import KeyframeVisibility, ViewReach
 from ggslam.slam.memory_budget import MB, MemoryBudget
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.submaps.paging_settings import PagingSettings
@@ -62,8 +62,8 @@ class MapPager:
         self.settings, self.budget, self.folder = settings, budget, folder
         self.archive = ArrayArchive(folder / "keyframes")
         """Keeps the keyframes' images and points."""
-        self._sights = KeyframeSights(camera, settings)
-        self._gaussians = GaussianPager(settings, self._sights, folder)
+        self._visibility = KeyframeVisibility(camera, settings)
+        self._gaussians = GaussianPager(settings, self._visibility, folder)
         self._new: list[int] = []
         self._place_bytes = 0
         self._trainable: Sequence[int] | None = None
@@ -72,7 +72,7 @@ class MapPager:
     def serve(self, mapper: Mapper) -> None:
         """Takes charge of a mapper's map, which must be empty."""
         self._gaussians.serve(mapper)
-        self._sights.keyframes = mapper.keyframes
+        self._visibility.keyframes = mapper.keyframes
         mapper.residency = self
         mapper.map.growth = PagingTuning.growth
 
@@ -95,8 +95,8 @@ class MapPager:
             T_world_camera: its pose [4, 4].
             depth: what it measured, metres [H, W].
         """
-        sight = self._sights.add(T_world_camera, depth)
-        self._bring([sight], max(self._new[1:][-PagingTuning.insertions:], default=0))
+        view = self._visibility.add(T_world_camera, depth)
+        self._bring([view], max(self._new[1:][-PagingTuning.insertions:], default=0))
 
     def finish_insertion(self, keyframe: Keyframe, added: int, place_bytes: int = 0) -> None:
         """After a keyframe was inserted and its points are in the surface: images are handed over, what is too much
@@ -118,7 +118,7 @@ class MapPager:
         if self.budget.map_bytes is None:
             return
         self.archive.limit = self.settings.images * self.budget.map_bytes
-        self._send([self._sights.newest()], len(self._map) - self._rows())
+        self._send([self._visibility.newest()], len(self._map) - self._rows())
         if reduced:
             self._map.shrink(int(1.05 * self._rows()))
 
@@ -127,19 +127,19 @@ class MapPager:
     def trainable(self) -> Sequence[int]:
         """See `Residency`."""
         if self._trainable is None:
-            self._trainable = self._gaussians.complete(range(len(self._sights.keyframes)))
+            self._trainable = self._gaussians.complete(range(len(self._visibility.keyframes)))
             if self._gaussians.mapper.identity is not None:
                 self._gaussians.mapper.identity.keep_pools(self._trainable)
         return self._trainable
 
     def stages(self) -> Iterator[Sequence[int]]:
         """See `Residency`: along the way, as many keyframes at a time as there is room for."""
-        left = list(range(len(self._sights.keyframes)))
+        left = list(range(len(self._visibility.keyframes)))
         while left:
             if self._gaussians.is_split:
-                sights = self._sights.of(left[:1])
-                self._send(sights, len(self._map) - self._rows() // 2)
-                self._bring(sights)
+                views = self._visibility.of(left[:1])
+                self._send(views, len(self._map) - self._rows() // 2)
+                self._bring(views)
                 self._gaussians.bring_while_there_is_room(left[1:], self._rows())
             complete = set(self._gaussians.complete(left))
             stage = [number for number in left if number in complete or number == left[0]]
@@ -164,7 +164,7 @@ class MapPager:
         of the loop may see."""
         if self.cells is None:
             return
-        self._bring(self._sights.of([len(self._sights.keyframes) - 1]))
+        self._bring(self._visibility.of([len(self._visibility.keyframes) - 1]))
         self._gaussians.bring_while_there_is_room(sorted(kept, reverse=True), self._rows())
         self._trainable = None
 
@@ -174,11 +174,11 @@ class MapPager:
         """Gaussians on disk by the object with the most votes, int64 [65536]."""
         return self._gaussians.vote_sizes()
 
-    def settle(self) -> GaussianCells | None:
+    def move_all_out(self) -> GaussianCells | None:
         """Everything goes to disk, if anything is there, and its cells are handed over; None: all is in memory."""
         if self.cells is not None:
             self.archive.limit = 0
-        return self._gaussians.settle()
+        return self._gaussians.move_all_out()
 
     def close(self) -> None:
         """Removes all files."""
@@ -217,23 +217,23 @@ class MapPager:
         left = (1 - self.settings.images) * self.budget.map_bytes - self._place_bytes
         return max(1, int(left / self._row_bytes()))
 
-    def _bring(self, sights: list[SightedPose], room: int = 0) -> None:
+    def _bring(self, views: list[ViewReach], room: int = 0) -> None:
         """Brings what is seen into memory, and makes room for it and for `room` more."""
         if self.budget.map_bytes is not None:
-            self._note_excess(self._gaussians.bring(sights, self._rows(), room))
+            self._note_excess(self._gaussians.bring(views, self._rows(), room))
             self._trainable = None
 
-    def _send(self, sights: list[SightedPose], excess: int) -> None:
+    def _send(self, views: list[ViewReach], excess: int) -> None:
         """Sends at least `excess` Gaussians to disk, if so many are not seen."""
         if excess > 0:
-            self._note_excess(self._gaussians.send(sights, excess, self._rows()))
+            self._note_excess(self._gaussians.send(views, excess, self._rows()))
             self._trainable = None
 
     def _note_excess(self, excess: int) -> None:
         if excess > 0 and not self._told:
             self._told = True
             self.budget.notes.append(
-                f"the map's part of the memory limit holds {self._rows()} Gaussians, but {self._rows() + excess} are "
-                "in view of one keyframe: the limit will be exceeded (a larger memory_limit_mb, a smaller `scale` or "
-                "paging.view_range helps)"
+                f"the map's part of the memory limit holds {self._rows()} Gaussians, but one keyframe sees "
+                f"{self._rows() + excess}: the limit will be exceeded. Raise memory_limit_mb, or lower `scale` or "
+                "paging.view_range"
             )

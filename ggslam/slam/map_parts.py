@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a run when it ends: those that have places in common become one, of the others one is the result.
+"""Joins the parts of a run at its end. Parts with places in common become one; the result is the largest.
 
 Parts that nothing joins lie at arbitrary places. They must not be in one map, nor in one trajectory: the largest stays,
 in a world that begins with its first keyframe; the frames of the others count as lost.
@@ -19,7 +19,7 @@ from ggslam.loops.agreement import GroundLink
 from ggslam.loops.parts import KeyframeParts
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
 from ggslam.mapping.mapper import Mapper
-from ggslam.movers.found import FoundMover
+from ggslam.movers.mover_table import FoundMover
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.slam.frame_poses import FramePoses
@@ -35,7 +35,7 @@ PART_EVENTS = ("new part", "left out")
 
 @savable(not_saved="_mapper _poses _corrections _loops")
 class MapParts:
-    """Makes one part of those there are.
+    """Joins the parts of a run.
 
     Args:
         mapper: whose map they are in.
@@ -49,8 +49,8 @@ class MapParts:
     ) -> None:
         self._mapper, self._poses, self._corrections, self._loops = mapper, poses, corrections, loops
 
-    def settle(self) -> None:
-        """After the last frame; does nothing where there is one part."""
+    def join_parts(self) -> None:
+        """Joins the parts of the map after the last frame, where they have places in common."""
         loops = self._loops
         if loops is None or self._mapper.left_out or len(loops.parts.all()) < 2:
             return

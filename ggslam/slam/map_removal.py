@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Removes from a map what turned out not to belong there: Gaussians, pixels of keyframes, points of the surface."""
+"""Removes transient things from a map: Gaussians, pixels of keyframes, points of the surface."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ggslam.tracking.surface import MeasuredSurface
 
 @savable(not_saved="_surface _mapper _publishing is_paged")
 class MapRemoval:
-    """What filters of frames remove things from the map with.
+    """The parts of a run that filters remove things with.
 
     Args:
         surface: that frames are aligned to.

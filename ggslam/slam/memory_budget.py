@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a limit of resident memory to bytes that a map may take."""
+"""Computes the bytes that a map may take from a limit on resident memory."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class BudgetTuning(Tuning):
 
 @dataclass
 class MemoryBudget:
-    """What the map may take of a memory limit. What the program needs besides is measured while it works.
+    """The share of a memory limit that the map may take. The memory of the rest of the program is measured.
 
     Args:
         limit: of the resident memory, bytes; 0: none.

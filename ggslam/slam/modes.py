@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What runs of a rig, on a GPU, with a limit of memory or in real time do without: one table, which is refused or noted
-at the start of a run, and which `ggslam doctor --modes` prints."""
+"""What runs of a rig, on a GPU, with a memory limit or in real time cannot do: one table. A run refuses or notes it at
+its start, and `ggslam doctor --modes` prints it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ggslam.slam.config import Config
 
 
 class Mode(Enum):
-    """A way of running that can less than a synchronous run of one camera on the CPU with all of the map in memory."""
+    """A way of running that does less than a synchronous run of one camera on the CPU with all of the map in memory."""
 
     RIG = "a rig of cameras"
     GPU = "a GPU"
-    PAGED = "a limit of memory"
+    PAGED = "a memory limit"
     REALTIME = "real time"
 
 
 class Lack(Enum):
-    """What becomes of something that a mode cannot do."""
+    """What happens to a capability that a mode lacks."""
 
     REFUSED = "refused"
     LEFT_OUT = "left out"
@@ -49,27 +49,27 @@ class Capability:
 _OUT, _NO = Lack.LEFT_OUT, Lack.REFUSED
 CAPABILITIES = (
     Capability("real time", {Mode.RIG: _NO}, "realtime_fps", lambda c: c.realtime_fps > 0),
-    Capability("a limit of memory", {Mode.RIG: _NO, Mode.GPU: _NO}, "memory_limit_mb", lambda c: c.memory_limit_mb > 0),
+    Capability("a memory limit", {Mode.RIG: _NO, Mode.GPU: _NO}, "memory_limit_mb", lambda c: c.memory_limit_mb > 0),
     Capability("a GPU", {Mode.RIG: _NO, Mode.PAGED: _NO}, "device", lambda c: c.device == "cuda"),
     Capability("tracking by edges and planes", {Mode.RIG: _NO}, "tracker", lambda c: c.tracker != "gicp"),
     Capability("starting in the map of another run", {Mode.PAGED: _NO}),
-    Capability("keeping what moves out of the map", {Mode.RIG: _OUT}, "movers.enabled", lambda c: c.movers.enabled),
+    Capability("masking moving things", {Mode.RIG: _OUT}, "movers.enabled", lambda c: c.movers.enabled),
     Capability(
-        "removing from the map what began to move later", {Mode.RIG: _OUT, Mode.PAGED: _OUT}, "movers.enabled",
+        "removing things from the map that start to move later", {Mode.RIG: _OUT, Mode.PAGED: _OUT}, "movers.enabled",
         lambda c: c.movers.enabled,
     ),
-    Capability("finding what is fixed to the camera", {Mode.RIG: _OUT}),
-    Capability("removing that from what was mapped before", {Mode.RIG: _OUT, Mode.PAGED: _OUT}),
+    Capability("masking what is fixed to the camera", {Mode.RIG: _OUT}),
+    Capability("removing what is fixed to the camera from the map", {Mode.RIG: _OUT, Mode.PAGED: _OUT}),
     Capability(
-        "beginning a new part of the map with a lost camera", {Mode.RIG: _OUT, Mode.PAGED: _OUT},
+        "starting a new part of the map with a lost camera", {Mode.RIG: _OUT, Mode.PAGED: _OUT},
         "tracking.recovery.new_part_after", lambda c: c.loops.enabled and c.tracking.recovery.new_part_after > 0,
     ),
     Capability(
-        "correcting poses by colour where depth errs", {Mode.RIG: _OUT, Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END},
+        "correcting poses by colour where depth is wrong", {Mode.RIG: _OUT, Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END},
         "mapping.view_alignment.enabled", lambda c: c.mapping.view_alignment.enabled,
     ),
     Capability(
-        "compensating exposures that change", {Mode.GPU: _OUT}, "mapping.exposure.compensate",
+        "compensating changes of exposure", {Mode.GPU: _OUT}, "mapping.exposure.compensate",
         lambda c: c.mapping.exposure.compensate,
     ),
     Capability(
@@ -107,11 +107,11 @@ def refuse(mode: Mode, config: Config) -> None:
 
 
 def notes(modes: Sequence[Mode], config: Config) -> list[str]:
-    """What the modes of a run leave out of what its settings ask for, a line for each mode."""
+    """What the settings of a run ask for and its modes leave out, one line for each mode."""
     found = []
     for mode in modes:
         wanted = [one for one in CAPABILITIES if one.is_wanted(config)]
-        for lack, words in ((Lack.LEFT_OUT, "does without"), (Lack.AT_END, "leaves to the end")):
+        for lack, words in ((Lack.LEFT_OUT, "does not support"), (Lack.AT_END, "postpones to the end")):
             names = [one.name for one in wanted if one.lacks.get(mode) is lack]
             if names:
                 found.append(f"{mode.value} {words}: {'; '.join(names)}")

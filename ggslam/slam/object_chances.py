@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How often an object could have been found: what a segmenter found now and then, though its place was in view nearly
-always, is noise."""
+"""Counts how often an object could have been detected. One that a segmenter found seldom, although its place was nearly
+always in view, is noise."""
 
 from __future__ import annotations
 

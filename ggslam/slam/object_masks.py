@@ -40,7 +40,7 @@ Source = Literal["auto", "recording", "geometry", "model", "none"]
 
 @tuning_class(frozen=True)
 class MaskTuning:
-    """Numbers of object masks."""
+    """Internal settings of object masks."""
 
     min_repeat: float = setting(0.35, 0, 1)
     """Objects found on a smaller share of the segmented keyframes that show their place are dropped as noise."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places that the parts of a run have in common: whole part against whole part, when the recording has ended.
+"""Finds places that parts of a run have in common, by comparing whole parts after the recording has ended.
 
 While it was recorded, a keyframe was compared with older ones alone, and a loop was believed if the next keyframes
 found the same. Here pairs from all over two parts may confirm one another, as where runs are merged.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a lost camera that no place tells of begins a new part of the map.
+"""Decides when a lost camera that no place matches starts a new part of the map.
 
 Frames that see no surface (a covered lens) or too little of one another (a shaken camera) could not be tracked from one
 another either; they begin nothing.
@@ -35,7 +35,7 @@ class PartStartTuning(Tuning):
 
 @dataclass(frozen=True)
 class PartBeginning:
-    """What a part begins with.
+    """The start of a part.
 
     Attributes:
         keyframes: of the frames watched before the last; there may be none.
@@ -52,7 +52,7 @@ class PartBeginning:
 @savable(not_saved="target")
 @dataclass
 class PartStart:
-    """Watches the frames that are lost.
+    """Observes lost frames.
 
     Attributes:
         poses: of the latest frames in a row that can be tracked from one another, in the camera's frame of the first of

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts of a run that its settings choose."""
+"""Constructs the parts of a run according to its settings."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame compared with an old keyframe: its features, and its points against the surface that was measured there."""
+"""Compares a frame with an old keyframe: its features, and its points with the surface measured there."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run gives: poses of its frames, keyframes, map, objects, times."""
+"""The result of a run: poses of its frames, keyframes, map, objects and times."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from ggslam.errors import ConfigError
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import MapperTimes
-from ggslam.movers.found import FoundMover
+from ggslam.movers.mover_table import FoundMover
 from ggslam.objects.lookup import objects_at
 from ggslam.objects.table import ObjectTable, Observation, Supervision
 from ggslam.scene.gaussian_map import GaussianMap
@@ -30,7 +30,7 @@ from ggslam.tracking.tracker import TrackingStatus
 @savable()
 @dataclass(frozen=True)
 class TrackedFrame:
-    """What is remembered of every frame.
+    """The record of a frame.
 
     Attributes:
         frame_index, source_index, timestamp: of the `Frame`.
@@ -55,7 +55,7 @@ class TrackedFrame:
 
 @dataclass
 class StepReport:
-    """What one step did.
+    """The outcome of one step.
 
     Attributes:
         frame: how the frame was tracked.
@@ -150,7 +150,7 @@ class LostStretch:
 
 @dataclass
 class SlamResult:
-    """A run.
+    """The result of a run.
 
     Attributes:
         gaussians: the map.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras of a rig whose shutters do not open together: how the rig moves from one's image to another's."""
+"""Motion of a rig between the images of cameras whose shutters do not open together."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class RigClockTuning(Tuning):
 @savable()
 @dataclass
 class RigClock:
-    """Knows the rig's motion from the last instant to the one before: it is taken to go on.
+    """Predicts the motion of a rig at the speed between its last two instants.
 
     Attributes:
         T_world_first: [4, 4], where the rig was at the last instant; None: not known.

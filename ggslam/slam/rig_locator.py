@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where is a rig of cameras? The points of all of them are aligned at once, as those of one body."""
+"""Locates a rig of cameras by aligning the points of all of them together, as one body."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop for a rig of cameras: all frames of an instant at a time, located as one body, mapped each by itself."""
+"""The loop for a rig of cameras: the frames of an instant are located as one body and mapped one by one."""
 
 from __future__ import annotations
 

@@ -56,8 +56,8 @@ def result_of(slam: RunState) -> SlamResult:
     slam.times.loops = slam.loops.seconds if slam.loops is not None else 0.0
     slam.mapper.end_refinement()
     slam.join_parts()
-    objects = slam.objects.settle(slam.mapper, pager) if slam.growing else slam.objects.learned
-    cells = None if pager is None else pager.settle()
+    objects = slam.objects.finalize(slam.mapper, pager) if slam.growing else slam.objects.learned
+    cells = None if pager is None else pager.move_all_out()
     gaussians = parts.gaussians()
     return SlamResult(
         gaussians, parts.keyframes(), parts.frames(), slam.times, slam.mapper.times, slam.dropped_frames,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run holds: its parts, wired together, and what there is so far."""
+"""The state of a run: its parts, wired together, and its results so far."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.slam.modes import modes_of, notes
+from ggslam.slam.object_finalizer import ObjectFinalizer
 from ggslam.slam.parts import RunParts, check_arguments, make_parts
 from ggslam.slam.result import LearnedObjects, SlamTimes, TrackedFrame
-from ggslam.slam.run_objects import RunObjects
 from ggslam.slam.schedules import BesideTraining, Schedule
 from ggslam.slam.step_log import StepLog
 from ggslam.tracking.keyframes import KeyframePolicy
@@ -81,7 +81,7 @@ class RunState:
         self.corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
         self.removal = MapRemoval(self.surface, self.mapper, self.pager, self.corrections.publishing)
         self.parts = MapParts(self.mapper, self.poses, self.corrections, self.loops)
-        self.objects = RunObjects(self.masks)
+        self.objects = ObjectFinalizer(self.masks)
         self.moves_followed = 0
         """How many corrections of the map the newest tracked pose knows of."""
         self._noise = None
@@ -105,9 +105,9 @@ class RunState:
             ConfigError: memory is limited, and maps made before are taken whole.
         """
         if self.pager is not None:
-            raise ConfigError("memory_limit_mb: a run that starts in the map of another (`map`) has no limit of memory")
+            raise ConfigError("memory_limit_mb: cannot be combined with starting in the map of another run (`map`)")
         self.objects.learned, self.poses.keyframes_made = objects, len(keyframes)
-        self.mapper.adopt(gaussians, keyframes)
+        self.mapper.load_map(gaussians, keyframes)
         if objects is None or gaussians.feature_channels != IDENTITY_CHANNELS:
             self.mapper.identity = None
         elif self.mapper.identity is not None:
@@ -159,7 +159,7 @@ class RunState:
 
     def join_parts(self) -> None:
         """Makes one part of those that the recording fell into, see `MapParts`; when there are no more frames."""
-        self.parts.settle()
+        self.parts.join_parts()
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""

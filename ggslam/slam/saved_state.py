@@ -64,7 +64,7 @@ def check_state(slam: Slam) -> None:
         camera = keyframe.camera  # of another recording, which may have had more
         if keyframe.frame_index != ELSEWHERE:
             if not 0 <= keyframe.camera_number < len(slam.cameras):
-                raise FormatError(f"keyframe {number}: not of this recording")
+                raise FormatError(f"keyframe {number}: its camera is not the one of this recording")
             camera = slam.cameras[keyframe.camera_number]
         shape = (camera.height, camera.width)
         images = (keyframe.color, keyframe.depth)
@@ -72,17 +72,17 @@ def check_state(slam: Slam) -> None:
         good = empty or (keyframe.color.shape == (*shape, 3) and keyframe.depth.shape == shape)
         typed = keyframe.color.dtype == np.uint8 and keyframe.depth.dtype == np.uint16
         if not (good and typed and keyframe.index == number and keyframe.T_camera_world.shape == (4, 4)):
-            raise FormatError(f"keyframe {number}: not of this recording")
+            raise FormatError(f"keyframe {number}: its camera is not the one of this recording")
     if not all(view.fits() for view in slam.movers.detector.views):
-        raise FormatError("views of what may move: not of their camera")
+        raise FormatError("views for moving things: their camera is not the one of this recording")
     if not slam.filters.get(EarlierViews).check():
-        raise FormatError("views of the map that the run began with: not of their cameras")
+        raise FormatError("views of the starting map: their cameras are not those of its keyframes")
     slam.color_poses.check()
     counts = [len(surface), slam.poses.keyframes_made, len(mapper.keyframes)]
     if slam.loops is not None:
         counts += [len(slam.loops), len(slam.loops.places), len(slam.loops.parts.of)]
     if len(set(counts)) > 1:
-        raise FormatError(f"numbers of keyframes that do not agree: {counts}")
+        raise FormatError(f"the parts of the state disagree about the number of keyframes: {counts}")
 
 
 def rules_of_state() -> Rules:

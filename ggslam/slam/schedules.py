@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When keyframes are mapped and the map is trained: after each frame, or beside the next ones."""
+"""Schedules of mapping: keyframes are inserted and trained after each frame, or beside the next frames."""
 
 from __future__ import annotations
 

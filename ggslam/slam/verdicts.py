@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Verdicts on a run, from what it kept of its frames and keyframes: a fraction of a second at the end."""
+"""Judges a run by the records of its frames and keyframes. Takes a fraction of a second at the end of the run."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ class VerdictTuning(Tuning):
 
 
 def judge_run(result: SlamResult) -> list[Verdict]:
-    """What was measured while the run was made."""
+    """Verdicts on what was measured during the run."""
     checks = (_judge_motion, _judge_exposure, _judge_doubted, _judge_lost, _judge_parts, _judge_dropped)
     return [verdict for check in checks for verdict in check(result)]
 
 
 def _judge_motion(result: SlamResult) -> list[Verdict]:
-    """Whether geometry told where the camera went, and, where it did not, grey values."""
+    """Whether geometry, or at least grey values, determined the motion of the camera."""
     open_ = [f for f in result.frames if f.status == TrackingStatus.DEGENERATE.value]
     if len(open_) < VerdictTuning.min_frames:
         return []
@@ -58,14 +58,14 @@ def _judge_motion(result: SlamResult) -> list[Verdict]:
     if len(blind) >= max(VerdictTuning.min_frames, VerdictTuning.blind_share * total):
         text = (
             f"{len(blind)} of {total} frames (the first: {blind[0].frame_index}) show one bare surface and no "
-            "texture: nothing tells how the camera moved along it, and it seems to stand still; keep edges or texture "
-            "in view"
+            "texture, so that motion along it cannot be estimated; keep edges or texture in view"
         )
         return [Verdict("textureless", "wrong", text)]
     if len(open_) > VerdictTuning.degenerate_share * total:
         text = (
-            f"in {len(open_)} of {total} frames ({len(open_) / total:.0%}) the surfaces in view leave a direction of "
-            "motion open, and grey values alone tell it; keep more than one wall or the floor in view"
+            f"in {len(open_)} of {total} frames ({len(open_) / total:.0%}) the surfaces in view do not "
+            "constrain one direction of motion, which is estimated from grey values alone; keep a second wall or the "
+            "floor in view"
         )
         return [Verdict("degenerate", "doubtful", text)]
     return []
@@ -90,20 +90,20 @@ def _judge_exposure(result: SlamResult) -> list[Verdict]:
     frame, gain = max(changed.items(), key=lambda item: abs(np.log(item[1])))
     text = (
         f"the exposure changed: from frame {min(changed)} on {len(changed)} of {len(ours)} keyframes are darker or "
-        f"brighter than the map, frame {frame} {gain:.2f} times as bright; the map was trained with that compensated; "
-        "fix exposure and white balance if the camera lets you"
+        f"brighter than the map, frame {frame} {gain:.2f} times as bright; training compensates for it; "
+        "fix exposure and white balance if the camera can"
     )
     return [Verdict("exposure", "doubtful", text)]
 
 
 def _judge_doubted(result: SlamResult) -> list[Verdict]:
-    """Whether there are frames whose image contradicts the pose that was found for them."""
+    """Whether the images of some frames contradict their poses."""
     doubted = [f.frame_index for f in result.frames if f.status == TrackingStatus.DOUBTED.value]
     if not doubted:
         return []
     text = (
         f"the camera may have jumped: in {len(doubted)} of {len(result.frames)} frames (the first: {doubted[0]}) most "
-        "of the features shared with the frame before lie elsewhere than the pose found has them; move slower there"
+        "of the features shared with the previous frame contradict the estimated pose; move slower there"
     )
     return [Verdict("jump", "doubtful", text)]
 
@@ -113,11 +113,11 @@ def _judge_lost(result: SlamResult) -> list[Verdict]:
     if len(lost) < max(VerdictTuning.min_frames, VerdictTuning.lost_share * len(result.frames)):
         return []
     text = f"the camera was lost in {len(lost)} of {len(result.frames)} frames (the first: {lost[0]})"
-    return [Verdict("lost", "wrong", f"{text}; move slower, and back to where it was found last")]
+    return [Verdict("lost", "wrong", f"{text}; move slower and return to where it was located last")]
 
 
 def _judge_parts(result: SlamResult) -> list[Verdict]:
-    """Whether the recording fell into parts, of which the run has but one."""
+    """Whether the recording consists of parts that could not be joined."""
     left = [event.reason for event in result.loop_events if event.kind == "left out"]
     if not left:
         return []
@@ -125,7 +125,7 @@ def _judge_parts(result: SlamResult) -> list[Verdict]:
     level: Severity = (
         "wrong" if gone >= max(VerdictTuning.min_frames, VerdictTuning.lost_share * len(result.frames)) else "doubtful"
     )
-    hint = "record once more so that the camera comes back to a place that it has seen, or run the pieces by themselves"
+    hint = "record again and return to places that the camera has seen, or run each part on its own"
     return [Verdict("parts", level, f"{'; '.join(left)}; {hint}")]
 
 
@@ -133,12 +133,12 @@ def _judge_dropped(result: SlamResult) -> list[Verdict]:
     dropped, total = result.dropped_frames, len(result.frames) + len(result.dropped_frames)
     if len(dropped) < max(VerdictTuning.min_frames, VerdictTuning.dropped_share * total):
         return []
-    text = f"{len(dropped)} of {total} frames were dropped (the first: {dropped[0]}): they came faster than tracked"
+    text = f"{len(dropped)} of {total} frames were dropped (the first: {dropped[0]}): tracking was too slow"
     return [Verdict("dropped", "doubtful", f"{text}; choose a lower rate, a smaller `scale` or a faster machine")]
 
 
 def judge_path(result: SlamResult, truth: np.ndarray | None, depth_scale: float) -> list[Verdict]:
-    """Whether the path is as long as the true one, which tells the unit of depth.
+    """Whether the path is as long as the true one. If it is not, depth has another unit.
 
     Args:
         result: of the run.
@@ -162,4 +162,4 @@ def judge_path(result: SlamResult, truth: np.ndarray | None, depth_scale: float)
     error = np.sqrt(((ratio * true @ T[:3, :3].T + T[:3, 3] - ours) ** 2).sum(1).mean())
     if error > VerdictTuning.max_error_share * ratio * size:
         return []
-    return judge_scale_by(depth_scale, ratio, f"the camera's path comes out {ratio:.3g} times as long as the true one")
+    return judge_scale_by(depth_scale, ratio, f"the estimated path is {ratio:.3g} times as long as the true one")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decoded cells that may be needed again, within a hard bound of bytes: the least recently used one goes first."""
+"""Caches decoded cells within a fixed number of bytes: the least recently used cell is dropped first."""
 
 from __future__ import annotations
 

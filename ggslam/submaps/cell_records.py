@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the index of a grid store says about a cell, and what is handed to it to write."""
+"""Records of a cell in the index of a grid store, and requests to write one."""
 
 from __future__ import annotations
 

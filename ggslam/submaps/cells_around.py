@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cells of a stored map are around the sensor, decoded: looked up when the sensor enters a cell (SRT-PM), those
-ahead along the motion loaded in the background."""
+"""Keeps the decoded cells of a stored map around the sensor: they are updated when the sensor enters a cell (SRT-PM),
+and cells ahead along the motion are loaded in the background."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stores that appear when all of them is on the disk."""
+"""Stores that appear only when they are complete on the disk."""
 
 from __future__ import annotations
 

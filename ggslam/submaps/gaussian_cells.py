@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians that are not in memory: rows of a map in the cells of a grid store, by where their means lie.
+"""Gaussians on disk: rows of a map in the cells of a grid store, by the position of their means.
 
 Rows move as they are, with optimizer state, votes and births, and come back bit for bit. Which cells hold how many of
 them and how far they reach is kept in memory; the store itself is asked for contents only.
@@ -153,8 +153,8 @@ class GaussianCells:
             self._forget(key)
         return slice(begin, len(gaussians))
 
-    def settle(self) -> None:
-        """Removes what lies in the store of cells whose Gaussians are all in memory, or in other cells, now."""
+    def remove_emptied(self) -> None:
+        """Removes cells from the store whose Gaussians are now all in memory or in other cells."""
         for key in sorted(self._emptied):
             self.store.remove(key)
         self._emptied.clear()

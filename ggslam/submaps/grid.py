@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The grid store: a map on disk, cut in cells whose parts (points, Gaussians, features, places) are written together.
+"""The grid store: a map on disk, divided into cells whose parts (points, Gaussians, features, places) are written
+together.
 
     map.grid/
         index.sqlite                  what there is (index.py): settings, visits, cells, parts with size and CRC-32

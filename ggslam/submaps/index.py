@@ -329,7 +329,7 @@ def _check_size(path: Path, connection: sqlite3.Connection) -> None:
     page = connection.execute("PRAGMA page_size").fetchone()[0]
     size = path.stat().st_size
     if size % page and not _has_log(path):
-        raise FormatError(f"{path}: truncated: {size} bytes are no whole number of pages of {page}")
+        raise FormatError(f"{path}: truncated: {size} bytes are not a multiple of the page size {page}")
 
 
 def _read_settings(path: Path, connection: sqlite3.Connection) -> SubmapSettings:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of a store's index, what their columns may hold, and how an index from elsewhere is held against both.
+"""The tables of a store's index and the values their columns may hold; checks an index from elsewhere against both.
 
 A schema is a program: generated columns, constraints and views run whenever a table is read. So nothing is read of an
 index whose schema is not, but for spaces, what this program would have written; and of its rows nothing is taken that

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One background thread that works on the last thing it was asked for."""
+"""A background thread that works on its latest request only."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of Gaussian paging: what of a map is kept in memory when not all of it fits."""
+"""Settings of Gaussian paging: what is kept in memory of a map that does not fit."""
 
 from __future__ import annotations
 

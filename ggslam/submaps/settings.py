@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of the grid of sub-maps, documented. The letters S, R, T and R' are those of SRT-PM."""
+"""Settings of the grid of sub-maps. The letters S, R, T and R' are those of SRT-PM."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A grid store copied, also while somebody writes to it: the copy is what was complete at one moment."""
+"""Copies a grid store, also while it is written to: the copy is the state of one moment."""
 
 from __future__ import annotations
 

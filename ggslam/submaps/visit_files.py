@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a grid store remembers of its visits besides their names: a file for each, written before its cells.
+"""A file for each visit of a grid store, written before the cells of the visit.
 
     visits/5f3c1b0a9d2e4f60.json      named by the visit's name (SHA-256)
 """

@@ -55,8 +55,9 @@ class Kept(Protocol):
 
 
 def class_names(rules: Rules) -> dict[str, type]:
-    """Classes by the names that trees have for them."""
-    return {f"{kind.__module__}.{kind.__qualname__}": kind for kind in rules}
+    """Classes by the names that trees have for them; the names of earlier versions come first."""
+    formerly = {rule.formerly: kind for kind, rule in rules.items() if rule.formerly}
+    return formerly | {f"{kind.__module__}.{kind.__qualname__}": kind for kind in rules}
 
 
 def describe(value: Any, rules: Rules, keeper: Keeper | None) -> tuple[Any, list[np.ndarray]]:

@@ -30,6 +30,7 @@ class Rule:
         take: gets that for an object to be filled, instead of its attributes being set.
         after: called for every object when all of them are there.
         checked: made by calling the class with its fields, which checks them; for settings.
+        formerly: name, with its module, that states of earlier versions have for the class.
         check: raises ValueError if the attributes of an object do not fit together; called when all objects are there
             and their attributes are of the declared types, before `after`.
     """
@@ -42,6 +43,7 @@ class Rule:
     after: Callable[[Any], None] | None = None
     checked: bool = False
     check: Callable[[Any], None] | None = None
+    formerly: str = ""
 
 
 Rules = Mapping[type, Rule]
@@ -53,14 +55,14 @@ savable_classes: Rules = MappingProxyType(_RULES)
 
 def savable(
     *, not_saved: str = "", fixed: str = "", growing: str = "", save: str = "", take: str = "", after: str = "",
-    check: str = "", checked: bool = False,
+    check: str = "", checked: bool = False, formerly: str = "",
 ) -> Callable[[Class], Class]:  # fmt: skip
     """A decorator that registers the `Rule` of a class; it stands above `@dataclass`.
 
     Args:
         not_saved, fixed, growing: names of attributes with spaces between them, as `Rule` explains them.
         save, take, after, check: names of methods of the class.
-        checked: see `Rule`.
+        checked, formerly: see `Rule`.
     """
 
     def declare(kind: Class) -> Class:
@@ -68,7 +70,7 @@ def savable(
         methods = {"save": save, "take": take, "after": after, "check": check}
         said: dict[str, Any] = {key: frozenset(names.split()) for key, names in attributes.items()}
         said |= {key: getattr(kind, name) for key, name in methods.items() if name}
-        _RULES[kind] = Rule(**said, checked=checked)
+        _RULES[kind] = Rule(**said, checked=checked, formerly=formerly)
         return kind
 
     return declare

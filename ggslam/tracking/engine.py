@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tracker has computed for it, and where: points of depth images, and alignments."""
+"""The heavy work of a tracker, on the CPU or a GPU: points of depth images, and alignments."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings
 
 
 class TrackingEngine(Protocol):
-    """Where a tracker's work is done."""
+    """Extracts points and aligns them."""
 
     def points(self, depth: np.ndarray, settings: PointSettings, noise: DepthNoise) -> PointSource:
         """Points of a depth image, float32 [H, W] in metres; see `points.extract_points`.
@@ -34,7 +34,7 @@ class TrackingEngine(Protocol):
 
 @dataclass(frozen=True)
 class CpuTrackingEngine:
-    """The compiled core.
+    """Extracts points and aligns them with the compiled core.
 
     Attributes:
         camera: of all frames.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Holds an alignment to matched features where geometry leaves it free, or leads it astray."""
+"""Holds an alignment to matched features where geometry is degenerate or misleading."""
 
 from __future__ import annotations
 

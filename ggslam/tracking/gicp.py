@@ -127,7 +127,7 @@ class GicpTarget:
         positions = np.ascontiguousarray(np.zeros((1, 3)) if camera_positions is None else camera_positions, np.float32)
         target.voxel = settings.voxel if voxel is None else voxel
         if base is not None and base.composed_with is not None:
-            raise ValueError("a target that was composed of parts grows by parts")
+            raise ValueError("a target composed of parts can only grow by parts")
         arrays = (means, quaternions, log_scales, opacity_logits)
         given = structures.TargetInput(
             *(address(a) for a in arrays), None if birth is None else address(birth),
@@ -171,7 +171,7 @@ def native_target_settings(settings: TargetSettings, voxel: float) -> structures
 
 
 class AlignmentStatus(enum.Enum):
-    """What an alignment is worth."""
+    """How reliable an alignment is."""
 
     OK = "ok"
     DEGENERATE = "degenerate"
@@ -206,7 +206,7 @@ class MatchSource(Protocol):
 
 @dataclass(frozen=True)
 class AlignmentResult:
-    """Where the frame is and how well that is known.
+    """The pose of a frame and its certainty.
 
     Attributes:
         T_world_camera: float64 [4, 4].
@@ -261,7 +261,7 @@ class GicpTuning(Tuning):
 
 @dataclass(frozen=True)
 class PhotometricPart:
-    """What grey values contribute to an alignment: points of the frame, what they are compared with, and how."""
+    """The photometric terms of an alignment: points of the frame, the image they are compared with, and settings."""
 
     points: PhotometricPoints
     reference: PhotometricReference

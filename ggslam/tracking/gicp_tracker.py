@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tracker that aligns frames by G-ICP, with the way back after it was lost."""
+"""The tracker that aligns frames by G-ICP and recovers when the camera is lost."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import orthonormalize
+from ggslam.system.plurals import counted
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
@@ -268,6 +269,7 @@ class GicpTracker(Tracker):
                 f"(mean grey difference {found.photometric_residual:.3f} over {found.photometric_share:.0%} of it)"
             )
         if len(points) < self.settings.align.min_matches:
-            reason = f"only {len(points)} points have depth, {self.settings.align.min_matches} needed"
+            needed = self.settings.align.min_matches
+            reason = f"only {counted(len(points), 'point has', 'points have')} depth, {needed} needed"
         pose = self.state.motion.T_world_camera.copy()
         return TrackingResult.by_gicp(pose, TrackingStatus.LOST, reason, points, found)

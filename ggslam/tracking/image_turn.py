@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the camera turned between two frames, told by how the whole image shifted.
+"""Estimates the rotation of the camera between two frames from the shift of the whole image.
 
 Small images hide motion blur, and their phases tell large shifts (`cv2.phaseCorrelate`, which has its sources): where
 a turn is too fast for features and for constant velocity this is right to a few degrees. A shift that the camera's

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a frame becomes a keyframe."""
+"""Decides when a frame becomes a keyframe."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ggslam.system.settings import setting, settings_class, tuning_class
 
 
 class LocatedFrame(Protocol):
-    """What the policy wants to know of a tracked frame (`tracker.TrackingResult` has it)."""
+    """The part of a `tracker.TrackingResult` that the policy reads."""
 
     @property
     def T_world_camera(self) -> np.ndarray:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a tracker knows of the camera's motion, and the located frames that it remembers."""
+"""The motion of the camera and its last located frames, as a tracker remembers them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class MotionTuning(Tuning):
 @savable(not_saved="reference")
 @dataclass
 class CameraMotion:
-    """Where the camera is and how it moves.
+    """Pose and motion of the camera.
 
     Attributes:
         T_world_camera: float64 [4, 4], the last known pose.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How noisy a depth camera is, measured on a frame it took."""
+"""Measures the noise of a depth camera on one frame."""
 
 from __future__ import annotations
 

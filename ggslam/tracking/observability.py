@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which directions of motion an alignment sees, and how well."""
+"""Which directions of motion an alignment determines, and how well."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Grey values as a second witness: what the photometric part of the alignment compares.
+"""Images and points for photometric alignment.
 
 Where geometry leaves a direction of motion open (a bare wall, a floor), the texture on it does not. The grey values of
 a frame's points are compared with a reference image, a keyframe's or a rendered one, at reduced resolution.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether to believe an alignment of a frame, and which of two: overlap, grey values, and features as witnesses."""
+"""Decides whether to accept an alignment of a frame, and which of two, by overlap, grey values and features."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tracking says of the depth camera's noise.
+"""Estimates the noise of the depth camera from tracking residuals.
 
 Errors that neighbouring pixels share are not seen in one image: depth of a phone is smooth, and wrong by a centimetre.
 They show where a frame is laid onto the surface that frames before have measured.
@@ -46,7 +46,7 @@ _MEDIAN_OF_NORMAL: Final = 0.6745
 @savable()
 @dataclass
 class ResidualNoise:
-    """Holds a noise model to the residuals of tracking, frame after frame.
+    """Compares a noise model with the residuals of tracking, frame by frame.
 
     Attributes:
         residuals: of the latest frames looked at: median depth, and robust standard deviation of the distances of the

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cameras of a rig aligned as one body: the points of all of them, in the first one's frame, in one alignment."""
+"""Aligns the cameras of a rig as one body: all their points, in the frame of the first one, in one alignment."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points of a laser scan as G-ICP wants them."""
+"""Converts laser scans into points for G-ICP."""
 
 from __future__ import annotations
 

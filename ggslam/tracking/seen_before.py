@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What part of a frame earlier views can have shown: more than that cannot match the map, however right the pose."""
+"""Estimates which part of a frame earlier views can have shown. No more than that can match the map, even at the right
+pose."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of the tracker, documented. One default serves all recordings: lengths follow the depth noise, the
-resolution and the distance of the scene."""
+"""Settings of the tracker. One default serves all recordings: lengths follow depth noise, resolution and distance of
+the scene."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class PointSettings(PointTuning):
 
 @tuning_class(frozen=True)
 class TargetSettings:
-    """Numbers of the surface that frames are aligned to."""
+    """The surface that frames are aligned to."""
 
     voxel: float = setting(0.03, 1e-3, 10, "m")
     """Edge of a fine voxel at a median depth of 1 to 4 m; it scales with the first frame's median depth beyond that
@@ -101,7 +101,7 @@ class TargetSettings:
 
 @tuning_class(frozen=True)
 class AlignSettings:
-    """Numbers of the alignment of points to a surface."""
+    """Alignment of points to a surface."""
 
     coarse_iterations: int = setting(6, 0, 1000)
     """Iterations at the coarse level; 0: fine level only."""

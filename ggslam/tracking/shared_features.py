@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Features that a frame shares with the last located ones: a witness of its pose that knows no wrong minimum.
+"""Features that a frame shares with the last located frames. They check a pose without local minima.
 
 Geometry has several: a frame half a step along a shelf overlaps as well as where it is. Grey values are compared
 within some pixels of the true place alone. Matched features lie where they have to, or they do not.
@@ -38,7 +38,7 @@ class SharedFeatureTuning(Tuning):
 
 
 class SharedFeatures:
-    """What a view shares with earlier ones. They are matched one by one, when the first have not told enough.
+    """Features shared with earlier views. A view is matched only when the ones before it did not suffice.
 
     Args:
         view: the frame.

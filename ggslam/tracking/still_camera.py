@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the camera stands still, told by the image itself.
+"""Detects from images that the camera stands still.
 
 On a tripod geometry is misled by whoever moves before the camera; most of the image, though, stays where it is to a
 hundredth of a pixel. Textured pixels of an anchor frame are compared with the same ones of a frame: their grey values,
@@ -78,7 +78,7 @@ class SmallFrame:
 @savable()
 @dataclass
 class StillCamera:
-    """Remembers the frame that the camera may have stood still since.
+    """Remembers the frame since which the camera may have stood still.
 
     Attributes:
         anchor: that frame; None: there is none.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surface that the tracker aligns to: the Gaussians of the keyframes as they were measured.
+"""The surface that the tracker aligns to: points of the keyframes as they were measured.
 
 G-ICP models each measured point as a Gaussian on its surface; a keyframe's points are such Gaussians. Trained for
 looks, a map's Gaussians wander: blended along the ray they give the right colour and depth, while each of them alone
@@ -24,6 +24,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.keyframe_poses import KeyframePoses
 from ggslam.scene.poses import transform_points
 from ggslam.system.array_forms import Form, PoseForm, check_arrays, check_indices
+from ggslam.system.plurals import counted
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import GicpTarget
@@ -55,7 +56,7 @@ def check_surface_arrays(arrays: Mapping[str, np.ndarray]) -> None:
     if np.abs(arrays["reach"]).max(initial=0) > PoseForm.FARTHEST_M:
         raise FormatError(f"surface: 'reach': expected points within {PoseForm.FARTHEST_M:g} m of their keyframes")
     if arrays["counts"].astype(np.int64).sum() != len(arrays["points"]):
-        raise FormatError("surface: points do not fit their numbers")
+        raise FormatError("surface: the counts do not add up to the number of points")
 
 
 @savable(fixed="_arrays", check="check")
@@ -152,7 +153,7 @@ class MeasuredSurface:
     def check(self) -> None:
         """Raises FormatError if it names keyframes that it does not have: it may come from a file."""
         if len(self.poses) != len(self):
-            raise FormatError(f"surface: {len(self.poses)} poses of {len(self)} keyframes")
+            raise FormatError(f"surface: {counted(len(self.poses), 'pose')} of {counted(len(self), 'keyframe')}")
         check_indices("keyframes of the surface", self.active, len(self))
         check_indices("keyframes of the surface", (number for group in self._joined for number in group), len(self))
 

@@ -74,16 +74,16 @@ def composed_target(
         ValueError: parts of other settings, or two of one rank; or `before` is of another kind or has another origin.
     """
     if any(part.settings != settings for part in parts):
-        raise ValueError("parts of other settings")
+        raise ValueError("the parts have other settings")
     if len({part.rank for part in parts}) < len(parts):
-        raise ValueError("two parts of one rank")
+        raise ValueError("two parts have the same rank")
     if before is not None and before.composed_with != settings:
-        raise ValueError("the target before was not composed with these settings")
+        raise ValueError("the previous target was composed with other settings")
     target = GicpTarget()
     if origin is not None:
         target.origin = np.array(origin, np.float64)
     if before is not None and (before.origin != target.origin).any():
-        raise ValueError("the target before has another origin")
+        raise ValueError("the previous target has another origin")
     target.voxel, target.composed_with = settings.voxel, settings
     handles = (ctypes.c_void_p * len(parts))(*(part.handle for part in parts))
     load_library().ggslam_gicp_target_compose(

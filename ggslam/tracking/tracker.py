@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every tracker promises: it locates frame after frame against a target that someone else keeps up to date."""
+"""The interface of trackers: they locate each frame against a target that the mapper keeps up to date."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import orthonormalize
+from ggslam.system.plurals import counted
 from ggslam.system.savable import savable
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.motion import CameraMotion
@@ -40,7 +41,7 @@ class TrackingStatus(enum.Enum):
 
 @dataclass(frozen=True)
 class TrackingResult:
-    """Where a frame is.
+    """The pose of a frame.
 
     Attributes:
         T_world_camera: float64 [4, 4]; when lost, the last known pose.
@@ -84,7 +85,7 @@ class TrackingResult:
 @savable(not_saved="camera context target")
 @dataclass
 class TrackerState:
-    """What trackers that work together share.
+    """State that cooperating trackers share.
 
     Attributes:
         camera: of all frames.
@@ -248,7 +249,7 @@ class Tracker(ABC):
         """Before the first keyframe: the pose is given, and all a frame needs is depth to begin with."""
         motion, needed = self.state.motion, self.settings.align.min_matches
         if len(points) < needed:
-            reason = f"only {len(points)} points have depth, {needed} needed"
+            reason = f"only {counted(len(points), 'point has', 'points have')} depth, {needed} needed"
             return TrackingResult(motion.T_world_camera.copy(), TrackingStatus.LOST, 0.0, 0.0, reason, points)
         motion.remember(view, points, self.settings)
         return TrackingResult(motion.T_world_camera.copy(), TrackingStatus.FIRST, 1.0, 0.0, "", points)

@@ -153,7 +153,7 @@ def run_at(folder: Path) -> str:
         return f"{kind} run of {frames} frame{'s' * (frames != 1)}"
     except (OSError, ValueError):
         states = list((folder / "checkpoints").glob("state-*.bin")) if folder.is_dir() else []
-        return f"{len(states)} checkpoints to resume from" if states else ""
+        return f"{len(states)} checkpoint{'s' * (len(states) != 1)} to resume from" if states else ""
 
 
 def run_elsewhere(text: str, folder: Path) -> str:

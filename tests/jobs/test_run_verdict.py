@@ -31,7 +31,7 @@ from ggslam.jobs.run.map_fit import MapFit, measure_fit
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
 from ggslam.jobs.run.run_verdict import judge_result, judge_scores, overall
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
-from ggslam.movers.found import FoundMover, MoverSight
+from ggslam.movers.mover_table import FoundMover, MoverSight
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.verdict import AspectRecord, RunVerdict

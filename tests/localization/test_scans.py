@@ -54,7 +54,7 @@ def test_poses_of_scans_may_stand_in_their_own_headers(tmp_path: Path) -> None:
     assert ScanSequence(tmp_path).ground_truth[3][2, 3] == 3
     (tmp_path / "trajectory.txt").unlink()
     (tmp_path / "2.pcd").write_bytes(data.replace(own + b"\n", b""))
-    with pytest.raises(SequenceError, match=r"2\.pcd: has no VIEWPOINT"):
+    with pytest.raises(SequenceError, match=r"2\.pcd: .*VIEWPOINT"):
         ScanSequence(tmp_path)
     (tmp_path / "2.pcd").write_bytes(data.replace(own, b"VIEWPOINT 0 0 0 0 0 0 0"))
     with pytest.raises(FormatError, match=r"2\.pcd: VIEWPOINT"):

@@ -81,17 +81,17 @@ def test_what_is_saved_finds_the_same(index: PlaceIndex) -> None:
 def test_damaged_arrays_are_told(index: PlaceIndex) -> None:
     arrays = index.to_arrays()
     for change, message in (
-        ({"points": arrays["points"][:-1]}, "'points': expected .* for landmarks, found"),
-        ({"codes": arrays["codes"][:, :-1]}, "'codes': expected uint8"),
-        ({"descriptors": arrays["descriptors"][:, 0]}, "'descriptors': expected uint8"),
-        ({"counts": -arrays["counts"]}, "'counts': expected 0 to"),
-        ({"numbers": 0 * arrays["numbers"]}, "a keyframe has two"),
-        ({"points": arrays["points"] * np.float32(np.inf)}, "'points': expected finite numbers"),
+        ({"points": arrays["points"][:-1]}, "'points': .*landmarks"),
+        ({"codes": arrays["codes"][:, :-1]}, "'codes': .*uint8"),
+        ({"descriptors": arrays["descriptors"][:, 0]}, "'descriptors': .*uint8"),
+        ({"counts": -arrays["counts"]}, "'counts': .*\\b0\\b"),
+        ({"numbers": 0 * arrays["numbers"]}, "keyframe"),
+        ({"points": arrays["points"] * np.float32(np.inf)}, "'points': .*finite"),
     ):
         with pytest.raises(FormatError, match=message):
             PlaceIndex.from_arrays(CAMERA, {**arrays, **change})
     del arrays["numbers"]
-    with pytest.raises(FormatError, match="no array 'numbers'"):
+    with pytest.raises(FormatError, match="'numbers'"):
         PlaceIndex.from_arrays(CAMERA, arrays)
 
 

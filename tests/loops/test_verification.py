@@ -83,8 +83,8 @@ def test_refinement_starts_from_the_features_and_is_what_counts() -> None:
     ("change", "reason"),
     [
         ({"status": Status.LOST}, "too few matches"),
-        ({"overlap": 0.31}, "31% of the points match the old surface, 50% needed"),
-        ({"rmse": 0.06}, r"60\.0 mm apart \(RMSE\), at most \d+\.\d mm"),
+        ({"overlap": 0.31}, "31%.*50%"),
+        ({"rmse": 0.06}, r"60\.0 mm.*\d+\.\d mm"),
         ({"T_world_camera": se3_exp(np.array([0.15, 0, 0, 0, 0, 0])) @ T_OLD_NEW}, "left .* of .* feature matches"),
     ],
 )

@@ -80,7 +80,7 @@ def test_no_pixel_counts() -> None:
 
 def test_wrong_input_is_refused() -> None:
     features, classifier, context = np.ones((3, 16), np.float32), make_classifier(2), NativeContext(1)
-    with pytest.raises(RenderError, match=r"features: expected shape \[2, 16\]"):
+    with pytest.raises(RenderError, match=r"features: .*\[2, 16\]"):
         cross_entropy(features, classifier, np.zeros(2, int), np.arange(2), context)
-    with pytest.raises(CoreInputError, match="classes: expected -1 to 1, found 2"):
+    with pytest.raises(CoreInputError, match=r"classes: .*-1.*\b1\b.*\b2\b"):
         cross_entropy(features, classifier, np.full(3, 5), np.arange(2), context)

@@ -203,9 +203,9 @@ def test_wrong_arrays_are_refused(cuda_library: CudaLibrary) -> None:
     insertion, s = CudaInsertion(device, cuda_library), InsertionSettings()
     color, depth, alpha = (torch.from_numpy(a).to(device) for a in (images.color, images.depth, images.alpha))
     camera = images.camera
-    with pytest.raises(RenderError, match="color: expected torch.uint8"):
+    with pytest.raises(RenderError, match="color: .*torch.uint8"):
         insertion.new_gaussians(color.float(), depth, 2e-4, None, None, camera, POSE, s)
-    with pytest.raises(RenderError, match="depth: expected torch.uint16"):
+    with pytest.raises(RenderError, match="depth: .*torch.uint16"):
         insertion.new_gaussians(color, depth[:-1], 2e-4, None, None, camera, POSE, s)
     with pytest.raises(RenderError, match="both or neither"):
         insertion.new_gaussians(color, depth, 2e-4, alpha, None, camera, POSE, s)

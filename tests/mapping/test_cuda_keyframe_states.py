@@ -211,20 +211,20 @@ def test_wrong_calls_are_refused(cuda_library: CudaLibrary) -> None:
     ones = torch.ones(15, dtype=torch.float64, device=states.device)
     for number in (-1, 1):
         for call in (states.pose, states.exposure, lambda i: states.step(i, ones[:6], ones)):
-            with pytest.raises(IndexError, match=f"keyframe {number} of 1"):
+            with pytest.raises(IndexError, match=rf"{number}\b.*\b1\b"):
                 call(number)
         with pytest.raises(IndexError):
             states.write_pose(number, np.eye(4))
-    with pytest.raises(RenderError, match=r"pose of a keyframe: expected \[4, 4\]"):
+    with pytest.raises(RenderError, match=r"pose.*\[4, 4\]"):
         states.append(np.eye(3), identity_exposure())
-    with pytest.raises(RenderError, match=r"exposure of a keyframe: expected \[3, 2\]"):
+    with pytest.raises(RenderError, match=r"exposure.*\[3, 2\]"):
         states.append(np.eye(4), np.ones((2, 3)))
-    with pytest.raises(RenderError, match="expected 1 poses, found 2"):
+    with pytest.raises(RenderError, match=r"\b1 poses.*\b2\b"):
         states.write_poses(np.zeros((2, 4, 4)))
     for arguments, message in (
-        ((ones[:6].float(), ones), "twist: expected torch.float64"), ((ones[:5], ones), "twist: expected"),
-        ((ones[:6], ones[:14]), "loss_results: expected"), ((ones[:12:2], ones), "twist: expected a contiguous"),
-        ((ones[:6], ones, ones[:1]), "skipped: expected torch.int32"),
+        ((ones[:6].float(), ones), "twist: .*torch.float64"), ((ones[:5], ones), r"twist: .*\[5\]"),
+        ((ones[:6], ones[:14]), "loss_results"), ((ones[:12:2], ones), "twist: .*contiguous"),
+        ((ones[:6], ones, ones[:1]), "skipped: .*torch.int32"),
     ):  # fmt: skip
         with pytest.raises(RenderError, match=message):
             states.step(0, *arguments)

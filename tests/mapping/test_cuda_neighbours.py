@@ -117,9 +117,9 @@ def test_the_order_of_threads_does_not_matter(cuda_library: CudaLibrary) -> None
 def test_wrong_arrays_are_refused(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
     points, rows = torch.zeros(9, 3, device=device), torch.zeros(2, dtype=torch.int64, device=device)
-    with pytest.raises(RenderError, match="points: expected torch.float32"):
+    with pytest.raises(RenderError, match="points: .*torch.float32"):
         cuda_neighbours(points.double(), rows, 2, cuda_library)
     with pytest.raises(RenderError, match="contiguous"):
         cuda_neighbours(torch.zeros(3, 9, device=device).T, rows, 2, cuda_library)
-    with pytest.raises(RenderError, match="rows: expected integers"):
+    with pytest.raises(RenderError, match="rows"):
         cuda_neighbours(points, rows.float(), 2, cuda_library)

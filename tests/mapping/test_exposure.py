@@ -66,5 +66,5 @@ def test_broken_gradient_changes_nothing() -> None:
 
 @pytest.mark.parametrize("shapes", [((2, 3), (3, 2)), ((3, 2), (6,))])
 def test_wrong_shape_is_refused(shapes: tuple) -> None:
-    with pytest.raises(RenderError, match=r"expected \[3, 2\]"):
+    with pytest.raises(RenderError, match=r"\[3, 2\]"):
         ExposureAdam(ExposureSettings()).step(np.zeros(shapes[0]), np.zeros(shapes[1]))

@@ -81,9 +81,9 @@ def test_features_only_on_request(room: Path) -> None:
 
 @pytest.mark.parametrize(
     ("loss", "message"),
-    [(lambda view, keyframe: view.image, "expected a scalar tensor, found \\[3, 60, 80\\]"),
-     (lambda view, keyframe: 1.0, "expected a scalar tensor, found float"),
-     (lambda view, keyframe: (view.depth - view.depth).sqrt().sum(), "by the rendered depth is not finite")],
+    [(lambda view, keyframe: view.image, r"\[3, 60, 80\]"),
+     (lambda view, keyframe: 1.0, "float"),
+     (lambda view, keyframe: (view.depth - view.depth).sqrt().sum(), "depth")],
 )  # fmt: skip
 def test_what_is_no_loss_is_refused(room: Path, loss: ExtraLoss, message: str) -> None:
     with pytest.raises(RenderError, match=message):

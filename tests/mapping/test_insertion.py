@@ -170,5 +170,5 @@ def test_depth_that_is_none_makes_nothing_and_spoils_nothing(bad: float) -> None
 def test_images_of_another_kind_are_refused() -> None:
     color, depth, where, camera = make_images(37, 53)
     for images in ((color[1:], depth, where), (color, depth.astype(float), where), (color, depth, where.astype(int))):
-        with pytest.raises(InputError, match="insertion: .*: expected .*, found "):
+        with pytest.raises(InputError, match="insertion"):
             new_gaussians(*images[:2], camera, POSE, images[2], InsertionSettings())

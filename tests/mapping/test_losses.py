@@ -176,7 +176,7 @@ def test_what_shows_nothing_counts_for_nothing(name: str, instruction_set: str) 
 def test_valid_pixels_of_another_size_are_refused() -> None:
     view, target = make_case(9, 9)
     for valid in (np.ones((9, 8), bool), np.ones((9, 9), np.uint8)):
-        with pytest.raises(RenderError, match="target valid: expected bool"):
+        with pytest.raises(RenderError, match="target valid: .*bool"):
             CpuImageLoss(NativeContext(1)).evaluate(view, replace(target, valid=valid), LossSettings())
 
 
@@ -257,7 +257,7 @@ def test_wrong_view_is_refused(name: str) -> None:
     view, target = make_case(8, 9)
     field, value = BAD_VIEWS[name]
     setattr(view, field, value)
-    with pytest.raises(RenderError, match=f"rendered {field}: expected"):
+    with pytest.raises(RenderError, match=f"rendered {field}"):
         CpuImageLoss(NativeContext(1)).evaluate(view, target, LossSettings())
 
 

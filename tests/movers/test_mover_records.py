@@ -15,7 +15,7 @@ from ggslam.errors import ConfigError, FormatError, RunFolderError
 from ggslam.formats.ply import read_ply
 from ggslam.jobs.export.export_run import export_run
 from ggslam.jobs.report.mover_pictures import draw_movers
-from ggslam.movers.found import FoundMover
+from ggslam.movers.mover_table import FoundMover
 from ggslam.movers.point_files import POINTS_FILE, points_from_arrays, points_to_arrays
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.movers import MoversRecord
@@ -67,13 +67,13 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda m: m.pop("kind"), "kind is missing"),
+        (lambda m: m.pop("kind"), "kind"),
         (lambda m: m.update(kind="soft"), "kind"),
-        (lambda m: m["frames"][2].update(T_world_mover=[[1, 0], [0, 1]]), "expected a 4x4 matrix"),
-        (lambda m: m["frames"][2].update(T_world_mover=[[None] * 4] * 4), "expected a 4x4 matrix of finite numbers"),
-        (lambda m: m["frames"][0].update(box_min=[0, 1]), "expected three finite numbers"),
-        (lambda m: m["frames"][0].update(box_max=[0, 0, 1e300]), r"expected three finite numbers up to 1e\+06"),
-        (lambda m: m["frames"][2].update(T_world_mover=[[1e7] * 4] * 4), r"4x4 matrix of finite numbers up to 1e\+06"),
+        (lambda m: m["frames"][2].update(T_world_mover=[[1, 0], [0, 1]]), "frames.*4x4"),
+        (lambda m: m["frames"][2].update(T_world_mover=[[None] * 4] * 4), "frames.*4x4"),
+        (lambda m: m["frames"][0].update(box_min=[0, 1]), "box_min"),
+        (lambda m: m["frames"][0].update(box_max=[0, 0, 1e300]), r"box_max.*1e\+06"),
+        (lambda m: m["frames"][2].update(T_world_mover=[[1e7] * 4] * 4), r"4x4.*1e\+06"),
         (lambda m: m.update(id=65536), "id"),
         (lambda m: m.update(id=-1), "id"),
         (lambda m: m["frames"][0].update(frame=2**31), "frame"),
@@ -109,7 +109,7 @@ def test_points_are_exported_in_the_frame_of_the_mover(busy: RunFolder, tmp_path
 
 
 def test_a_run_without_movers_is_refused(room_run: RunFolder, tmp_path: Path) -> None:
-    with pytest.raises(RunFolderError, match="nothing was found to move"):
+    with pytest.raises(RunFolderError, match=str(tmp_path)):
         export_run(room_run, tmp_path / "out", movers=True)
     done = ggslam("export", str(room_run.path), "--movers", "--out", str(tmp_path / "out"))
     assert done.returncode == 2 and "nothing was found to move" in done.stderr.replace("\n", " ")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from box_scene import box_pose, camera_pose, error, render, view_of
 
-from ggslam.movers.found import FoundMover, MoverSight
+from ggslam.movers.mover_table import FoundMover, MoverSight
 from ggslam.movers.tracks import MoverTracks
 from ggslam.scene.poses import inverse
 

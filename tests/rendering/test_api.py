@@ -69,7 +69,7 @@ def test_images_are_the_callers_own() -> None:
 
 def test_backends_by_name() -> None:
     assert {"cpu", "cuda", "reference", "gsplat"} <= set(backends())
-    with pytest.raises(RenderError, match="unknown rendering backend 'opengl'; available: cpu"):
+    with pytest.raises(RenderError, match="'opengl'.*cpu"):
         render(make_scene(1), CAMERA, T_world_camera=np.eye(4), backend="opengl")
     with pytest.raises(RenderError, match="4x4"):
         render(make_scene(1), CAMERA, T_world_camera=np.eye(3))

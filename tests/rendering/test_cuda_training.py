@@ -168,7 +168,7 @@ def test_wrong_images_are_refused() -> None:
         with pytest.raises(RenderError, match="expected"):
             loss.evaluate(view, replace(target, **wrong), LossSettings())
     for wrong in ({"image": view.image[:2]}, {"depth": view.depth.double()}, {"alpha": view.alpha.to("meta")}):
-        with pytest.raises(RenderError, match=f"rendered {next(iter(wrong))}: expected"):
+        with pytest.raises(RenderError, match=f"rendered {next(iter(wrong))}"):
             loss.evaluate(replace(view, **wrong), target, LossSettings())
     with pytest.raises(RenderError, match="contiguous"):
         loss.evaluate(replace(view, depth=torch.zeros(9, 8).T), target, LossSettings())
@@ -262,16 +262,16 @@ def test_wrong_steps_are_refused() -> None:
     rasterizer, gaussians = CudaRasterizer(library=emulated_library()), make_map(0, 0)
     gradient = torch.zeros(3, CAMERA.height, CAMERA.width)
     rasterizer.forward(gaussians, CAMERA, POSE)
-    with pytest.raises(RenderError, match="not those that were rendered"):
+    with pytest.raises(RenderError, match="rendered"):
         rasterizer.backward_step(make_map(0, 0), gradient, optimizer=ADAM)
-    with pytest.raises(RenderError, match="grad_image: expected shape"):
+    with pytest.raises(RenderError, match="grad_image"):
         rasterizer.backward_step(gaussians, gradient[:2], optimizer=ADAM)
     rasterizer.backward_step(gaussians, gradient, optimizer=ADAM)
-    with pytest.raises(RenderError, match="call forward first"):
+    with pytest.raises(RenderError, match="forward"):
         rasterizer.backward_step(gaussians, gradient, optimizer=ADAM)
     plain = GaussianMap(with_moments=False)
     rasterizer.forward(plain, CAMERA, POSE)
-    with pytest.raises(RenderError, match="without moments"):
+    with pytest.raises(RenderError, match="moments"):
         rasterizer.backward_step(plain, gradient, optimizer=ADAM)
 
 

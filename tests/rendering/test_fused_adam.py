@@ -153,14 +153,14 @@ def test_wrong_steps_are_refused() -> None:
     gaussians, rasterizer = make_map(0, 0), CpuRasterizer(1)
     gradient = torch.zeros(3, CAMERA.height, CAMERA.width)
     rasterizer.forward(gaussians, CAMERA, POSE)
-    with pytest.raises(RenderError, match="not those that were rendered"):
+    with pytest.raises(RenderError, match="rendered"):
         rasterizer.backward_step(make_map(0, 0), gradient, optimizer=SETTINGS)
     rasterizer.backward_step(gaussians, gradient, optimizer=SETTINGS)
-    with pytest.raises(RenderError, match="call forward first"):
+    with pytest.raises(RenderError, match="forward"):
         rasterizer.backward_step(gaussians, gradient, optimizer=SETTINGS)
     plain = GaussianMap(with_moments=False)
     rasterizer.forward(plain, CAMERA, POSE)
-    with pytest.raises(RenderError, match="without moments"):
+    with pytest.raises(RenderError, match="moments"):
         rasterizer.backward_step(plain, gradient, optimizer=SETTINGS)
     for wrong in (
         {"learning_rates": {"colour": 1.0}}, {"beta1": 1.0}, {"decay": 0.0}, {"falling_groups": ("means",)},

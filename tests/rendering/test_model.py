@@ -73,7 +73,7 @@ def test_both_directions_of_the_pose_are_one_view() -> None:
     one, other = render(model, CAMERA, POSE), render(model, CAMERA, T_world_camera=T_world_camera)
     assert torch.allclose(one.image, other.image, atol=1e-6)
     for wrong in ({}, {"T_camera_world": POSE, "T_world_camera": T_world_camera}):
-        with pytest.raises(RenderError, match="one of T_camera_world and T_world_camera"):
+        with pytest.raises(RenderError, match="T_camera_world.*T_world_camera"):
             render(model, CAMERA, **wrong)
 
 
@@ -151,14 +151,14 @@ def test_from_points() -> None:
     assert torch.allclose(model.to_map().rgb, torch.tensor(0.2), atol=1e-6)
     assert model.sh.shape == (64, 4, 3) and model.features.shape == (64, 2)
     assert torch.allclose(torch.sigmoid(model.opacity_logits), torch.tensor(0.5))
-    with pytest.raises(RenderError, match="points and colors"):
+    with pytest.raises(RenderError, match="points.*colors"):
         GaussianModel.from_points(points, colors[:5])
-    with pytest.raises(RenderError, match="scales above 0"):
+    with pytest.raises(RenderError, match=r"scales.*\b0\b"):
         GaussianModel.from_points(points, colors, scales=0.0)
 
 
 def test_unknown_learning_rate() -> None:
-    with pytest.raises(RenderError, match=r"unknown \['scales'\]"):
+    with pytest.raises(RenderError, match=r"'scales'"):
         model_of().parameter_groups(scales=0.1)
     names = [group["name"] for group in model_of(features=0).parameter_groups(quaternions=0)]
     assert names == ["means", "log_scales", "opacity_logits", "sh"]

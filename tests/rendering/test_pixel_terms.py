@@ -169,10 +169,10 @@ def test_the_label_of_a_pixel_is_the_one_with_the_largest_weight() -> None:
 
 def test_impossible_requests_are_refused() -> None:
     gaussians, rasterizer = make_map(), CpuRasterizer()
-    with pytest.raises(RenderError, match="call forward first"):
+    with pytest.raises(RenderError, match="forward"):
         rasterizer.pixel_terms(ALL)
     rasterizer.forward(gaussians, CAMERA, POSE)
-    with pytest.raises(RenderError, match="pixels must be 0 to"):
+    with pytest.raises(RenderError, match=r"pixels.*\b0\b"):
         rasterizer.pixel_terms(np.array([len(ALL)]))
     with pytest.raises(RenderError, match="capacity"):
         rasterizer.pixel_terms(ALL, 0)
@@ -181,5 +181,5 @@ def test_impossible_requests_are_refused() -> None:
         terms.step(gaussians, np.zeros((4, 16), np.float32), FeatureAdamSettings())
     with pytest.raises(RenderError, match="labels"):
         terms.vote(gaussians, np.zeros(4, np.uint16))
-    with pytest.raises(RenderError, match="label for every Gaussian"):
+    with pytest.raises(RenderError, match="label.*Gaussian"):
         rasterizer.pixel_terms(ALL).labels(np.zeros(3, np.uint16))

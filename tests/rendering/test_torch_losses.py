@@ -80,11 +80,11 @@ def test_nothing_measured_and_nothing_labelled() -> None:
 
 
 def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(RenderError, match="color_loss: expected two images of one shape"):
+    with pytest.raises(RenderError, match="color_loss"):
         color_loss(torch.zeros(3, 4, 5), torch.zeros(4, 5, 3))
     with pytest.raises(RenderError, match="depth_loss"):
         depth_loss(torch.zeros(4, 5), torch.zeros(5, 4))
-    with pytest.raises(RenderError, match="classes 0 to 1, found 2"):
+    with pytest.raises(RenderError, match=r"\b0 to 1\b.*\b2\b"):
         identity_loss(torch.zeros(3, 2), torch.tensor([0, 1, 2]))
     with pytest.raises(RenderError, match="neighbour_loss"):
         neighbour_loss(torch.zeros(3, 2), torch.zeros(4, 1, 2))

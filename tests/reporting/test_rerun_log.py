@@ -13,7 +13,7 @@ import pytest
 
 from ggslam.errors import ConfigError, MissingDependency
 from ggslam.jobs.watch.rerun_follower import LiveLog, RerunTuning
-from ggslam.movers.found import MoverSight
+from ggslam.movers.mover_table import MoverSight
 from ggslam.reporting.rerun_log import RerunLog
 from ggslam.scene.camera import Camera
 from ggslam.slam.result import StepReport, TrackedFrame

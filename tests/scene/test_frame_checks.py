@@ -24,28 +24,28 @@ def test_metres_pass() -> None:
 
 
 def test_millimetres_are_recognised() -> None:
-    with pytest.raises(SequenceError, match=r"frame 3: depth looks like millimetres \(median \d+\).*divide it by 1000"):
+    with pytest.raises(SequenceError, match=r"frame 3: .*median \d+\D.*\b1000\b"):
         check_frame(replace(FRAME, depth=1000 * METRES), CAMERA)
 
 
 def test_centimetres_are_not_called_millimetres_alone() -> None:
-    with pytest.raises(SequenceError, match="millimetres or centimetres .*millimetres by 1000, centimetres by 100"):
+    with pytest.raises(SequenceError, match=r"frame 3: .*\b1000\b.*\b100\b"):
         check_frame(replace(FRAME, depth=100 * METRES), CAMERA)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"depth": METRES[:-1]}, "depth is 40x29, expected 40x30"),
-     ({"depth": METRES.astype(np.float64)}, "depth is float64"),
-     ({"depth": METRES - 1}, "negative, infinite or NaN"), ({"depth": METRES + np.inf}, "negative, infinite or NaN"),
-     ({"color": np.zeros((30, 40, 4), np.uint8)}, "colour is uint8"),
-     ({"depth": (1000 * METRES).astype(np.uint16)}, "depth is uint16"),
-     ({"depth": None}, "depth is NoneType, expected a numpy array"),
-     ({"camera": Camera(40, 30, 60.0, 60.0, 19.5, 14.5)}, "frame 3: it is of .*fx=60.0.*expected .*fx=30.0"),
-     ({"camera": Camera(80, 60, 30.0, 30.0, 19.5, 14.5)}, "frame 3: it is of .*width=80"),
-     ({"timestamp": float("nan")}, "its time is nan"),
-     ({"T_world_camera": np.eye(4)[:3]}, r"T_world_camera has shape \[3, 4\], expected a finite 4x4"),
-     ({"T_world_camera": np.full((4, 4), np.nan)}, "T_world_camera has numbers that are not finite")],
+    [({"depth": METRES[:-1]}, "depth.*40x29.*40x30"),
+     ({"depth": METRES.astype(np.float64)}, "depth.*float64"),
+     ({"depth": METRES - 1}, "frame 3: .*depth.*NaN"), ({"depth": METRES + np.inf}, "frame 3: .*depth.*NaN"),
+     ({"color": np.zeros((30, 40, 4), np.uint8)}, r"colour.*uint8"),
+     ({"depth": (1000 * METRES).astype(np.uint16)}, "depth.*uint16"),
+     ({"depth": None}, "depth.*NoneType"),
+     ({"camera": Camera(40, 30, 60.0, 60.0, 19.5, 14.5)}, "frame 3: .*fx=60.0.*fx=30.0"),
+     ({"camera": Camera(80, 60, 30.0, 30.0, 19.5, 14.5)}, "frame 3: .*width=80"),
+     ({"timestamp": float("nan")}, "time.*nan"),
+     ({"T_world_camera": np.eye(4)[:3]}, r"T_world_camera.*\[3, 4\].*4x4"),
+     ({"T_world_camera": np.full((4, 4), np.nan)}, "T_world_camera.*finite")],
 )  # fmt: skip
 def test_wrong_images(change: dict[str, np.ndarray], message: str) -> None:
     with pytest.raises(SequenceError, match=message):

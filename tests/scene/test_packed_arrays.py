@@ -71,5 +71,5 @@ def test_many_large_arrays_are_not_unpacked() -> None:
     head = json.dumps([[f"a{k}", "|u1", [60_000_000], "plain", len(body)] for k in range(60)]).encode()
     data = b"ggslam-arrays-1\n" + len(head).to_bytes(4, "little") + head + 60 * body
     assert len(data) < 1_000_000
-    with pytest.raises(FormatError, match="an array of 60000000 bytes"):
+    with pytest.raises(FormatError, match=r"\b60000000\b"):
         unpack_arrays(data)

@@ -96,7 +96,7 @@ def test_arrays_that_do_not_fit_their_camera_are_refused() -> None:
     for array in ARRAYS:
         cut = replace(view, **{array: getattr(view, array)[:-1]})
         for one, other in ((view, cut), (cut, view)):
-            with pytest.raises(ValueError, match="places: expected 24 x 32"):
+            with pytest.raises(ValueError, match="places: .*24 x 32"):
                 compare(one, [other], MARGIN, context)
-    with pytest.raises(ValueError, match="places: expected 24 x 32"):
+    with pytest.raises(ValueError, match="places: .*24 x 32"):
         compare(view, [view], MARGIN, context, np.zeros((24, 31), bool))

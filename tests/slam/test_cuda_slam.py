@@ -20,7 +20,7 @@ from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
-from ggslam.mapping.pixel_grid import WHOLE
+from ggslam.mapping.pixel_grid import ALL_PIXELS
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.records.sequence import OpenRecord, SequenceRecord
@@ -60,7 +60,7 @@ def test_same_run_as_on_the_cpu(
 ) -> None:
     """Without identity nothing is drawn at random: map and trajectory are the CPU's up to rounding, if its steps draw
     all pixels and those to the end, too, the last ones get smaller, and what surfaces hide stays."""
-    monkeypatch.setattr(CpuMapper, "_choose_grid", lambda mapper, keyframe: WHOLE)
+    monkeypatch.setattr(CpuMapper, "_choose_grid", lambda mapper, keyframe: ALL_PIXELS)
     as_on_the_gpu = ["mapping.close_below=0", "mapping.average_last=0", "mapping.pruning.min_weight=0"]
     as_on_the_gpu.append("refine_iterations=10")
     settings = config("identity.enabled=false", "keyframes.max_gap=2", *as_on_the_gpu)
@@ -189,7 +189,7 @@ def test_a_closed_loop_moves_map_and_keyframes(frames: list[Frame], cuda_library
     moved = slam.map.means.cpu().numpy() - means
     assert np.allclose(moved[birth == len(before) - 1], (0.5, 0, 0), atol=1e-5) and not moved[birth == 0].any()
     count = slam.map.count
-    slam.mapper.mend([0], [len(before) - 1], 2)
+    slam.mapper.retrain_loop_ends([0], [len(before) - 1], 2)
     assert slam.map.count <= count
 
 
@@ -236,7 +236,7 @@ def full_memory(*_: object) -> None:
 
 def test_devices_that_cannot_be_had_are_said_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    with pytest.raises(ConfigError, match="device: cuda: .*NVIDIA GPU"):
+    with pytest.raises(ConfigError, match="device: cuda"):
         run_library(Config(device="cuda"))
     assert run_library(Config()) == (None, None)
     library, reason = run_library(Config(device="auto"))

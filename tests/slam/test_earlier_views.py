@@ -95,7 +95,7 @@ def test_counts_of_another_size_are_refused() -> None:
     view = next(iter(first.filters.get(EarlierViews).views.values()))
     view.through = view.through[:-1]
     tree, arrays = describe_state(first)
-    with pytest.raises(FormatError, match="EarlierView.through: expected int16"):
+    with pytest.raises(FormatError, match="EarlierView.through.*int16"):
         restore_state(again, tree, [array.copy() for array in arrays])
 
 

@@ -74,14 +74,14 @@ def test_the_state_itself_goes_on(saved: Saved) -> None:
 @pytest.mark.parametrize(
     ("attribute", "value", "message"),
     [
-        ("updates", -1, "updates of Gaussians: expected 0 to"),
-        ("updates", 2**31 - 1, "updates of Gaussians: expected 0 to"),
-        ("vote_ids", 65536, "vote_ids of Gaussians: expected 0 to 65535"),
-        ("birth_keyframe", 99, "birth_keyframe of Gaussians: expected -1 to"),
-        ("means", np.nan, "means of Gaussians: expected finite numbers"),
-        ("_class_of", 65000, "classes of objects: expected numbers"),
-        ("_cameras", np.inf, "_cameras: expected finite numbers"),
-        ("T_camera_world", 7.0, "T_camera_world: expected a rotation and a translation"),
+        ("updates", -1, r"\bupdates\b.*\b0\b"),
+        ("updates", 2**31 - 1, r"\bupdates\b.*\b0\b"),
+        ("vote_ids", 65536, "vote_ids.*65535"),
+        ("birth_keyframe", 99, "birth_keyframe.*-1"),
+        ("means", np.nan, "means"),
+        ("_class_of", 65000, "classes"),
+        ("_cameras", np.inf, "_cameras"),
+        ("T_camera_world", 7.0, "T_camera_world"),
     ],
 )
 def test_numbers_that_cannot_be_are_told(saved: Saved, attribute: str, value: float, message: str) -> None:

@@ -231,13 +231,13 @@ def test_a_saved_map_grows(room: Path, first_half: Path, tmp_path: Path) -> None
 
 
 def test_mistakes_with_maps_are_named(room: Path, first_half: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="`localize_only` needs `map`"):
+    with pytest.raises(ConfigError, match="`localize_only`.*`map`"):
         played(room, tmp_path / "a", localize_only=True)
-    with pytest.raises(RunFolderError, match="no such folder"):
+    with pytest.raises(RunFolderError, match="none"):
         played(room, tmp_path / "a", map=tmp_path / "none")
-    with pytest.raises(ConfigError, match="is the map to start in"):
+    with pytest.raises(ConfigError, match=str(first_half)):
         played(room, first_half, map=first_half, overwrite=True)
-    with pytest.raises(ConfigError, match="images of 160x120, these are 80x60; see `scale`"):
+    with pytest.raises(ConfigError, match="160x120.*80x60.*`scale`"):
         execute(RunRequest(SequenceRequest(room, scale=0.5), tmp_path / "a", map=first_half, evaluate=False))
     assert not (tmp_path / "a").exists()
 
@@ -262,7 +262,7 @@ def test_damaged_places_are_named(
         arrays[name] = arrays[name] + 1000 if isinstance(value, str) else value
     np.savez(tmp_path / "map" / "places.npz", **arrays)
     accept_files(tmp_path / "map")
-    with pytest.raises(RunFolderError, match="places.npz: not the places of this run"):
+    with pytest.raises(RunFolderError, match="places.npz"):
         played(room, tmp_path / "a", stop=2, map=tmp_path / "map", localize_only=True)
 
 
@@ -270,13 +270,13 @@ def test_damaged_places_are_named(
 def test_the_first_run_must_be_there_still(room: Path, first_half: Path, tmp_path: Path) -> None:
     shutil.copytree(first_half, tmp_path / "a")
     assert played(room, tmp_path / "b", start=12, stop=16, map=tmp_path / "a").error is None
-    with pytest.raises(ConfigError, match="or one that this comes from"):
+    with pytest.raises(ConfigError, match=str(tmp_path / "a")):
         played(room, tmp_path / "a", map=tmp_path / "b", overwrite=True)
     assert played(room, tmp_path / "a", stop=2, overwrite=True).error is None
-    with pytest.raises(RunFolderError, match="not the run any more"):
+    with pytest.raises(RunFolderError, match=str(tmp_path / "a")):
         played(room, tmp_path / "c", map=tmp_path / "b")
     shutil.rmtree(tmp_path / "a")
-    with pytest.raises(RunFolderError, match="began with the map of another run"):
+    with pytest.raises(RunFolderError, match=str(tmp_path / "a")):
         played(room, tmp_path / "c", map=tmp_path / "b")
     assert played(room, tmp_path / "c", start=12, stop=14, map=tmp_path / "b", localize_only=True).error is None
 
@@ -286,7 +286,7 @@ def test_a_grown_run_is_edited_and_then_no_map_to_start_in(room: Path, first_hal
     grown = RunFolder.open(tmp_path / "b")
     small = min((o for o in grown.object_table().objects if o.gaussians > 100), key=lambda o: o.gaussians).id
     edit_run(grown, [Edit("remove", str(small))], tmp_path / "edited", inpainting=True)
-    with pytest.raises(RunFolderError, match="its map was edited"):
+    with pytest.raises(RunFolderError, match=str(tmp_path / "edited")):
         played(room, tmp_path / "c", map=tmp_path / "edited")
 
 

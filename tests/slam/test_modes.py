@@ -40,7 +40,7 @@ def test_what_is_refused_names_its_setting() -> None:
 def test_a_rig_leaves_out_the_filters_that_the_table_says() -> None:
     left_out = [kind for kind in filter_classes() if kind.in_rigs is InRigs.LEFT_OUT]
     assert left_out == [CameraFixtures]
-    assert lack("finding what is fixed to the camera", Mode.RIG) is Lack.LEFT_OUT
+    assert lack("masking what is fixed to the camera", Mode.RIG) is Lack.LEFT_OUT
 
 
 def test_only_what_the_settings_ask_for_is_noted() -> None:
@@ -63,5 +63,5 @@ def test_a_run_says_once_and_first_what_it_leaves_out(tmp_path: Path) -> None:
     succeed("synth", tmp_path / "room", "--frames", 4, "--width", 64, "--height", 48)
     done = ggslam("run", tmp_path / "room", "--out", tmp_path / "run", "--set", "realtime_fps=200", "--refine", 0)
     said = " ".join((done.stdout + done.stderr).split())
-    assert done.returncode == 0 and said.count("real time leaves to the end") == 1
-    assert said.index("real time leaves to the end") < said.index("keyframe")
+    assert done.returncode == 0 and said.count("real time postpones to the end") == 1
+    assert said.index("real time postpones to the end") < said.index("keyframe")

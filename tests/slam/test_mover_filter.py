@@ -80,5 +80,5 @@ def test_masks_are_kept_with_the_run(with_search: Slam, tmp_path: Path) -> None:
     moving = read_moving(folder.path)
     assert moving is not None and moving.frames == with_search.movers.pixels.frames
     (folder.path / MOVERS_FILE).write_bytes(b"PK")
-    with pytest.raises(RunFolderError, match=r"movers.npz: cannot be read"):
+    with pytest.raises(RunFolderError, match=r"movers\.npz"):
         read_moving(folder.path)

@@ -111,7 +111,7 @@ def test_keyframes_of_an_earlier_map_may_be_of_a_rig(room: Path, camera_number: 
     if elsewhere:
         slam.mapper.keyframes[0].frame_index = ELSEWHERE
     if camera_number and not elsewhere:
-        with pytest.raises(FormatError, match="keyframe 0: not of this recording"):
+        with pytest.raises(FormatError, match="keyframe 0"):
             check_state(slam)
     else:
         check_state(slam)
@@ -159,15 +159,15 @@ def test_a_state_is_data_and_must_fit(room: Path) -> None:
             restore_state(fresh(), changed, given)
 
     refused({"o": ["os.system", {}]}, "KeyError")
-    refused({"o": [name, {**attributes, "camera": None}]}, "is not saved")
-    refused({"o": [name, {**attributes, "scale": {"x": 1}}]}, "unknown kind of value")
+    refused({"o": [name, {**attributes, "camera": None}]}, "camera")
+    refused({"o": [name, {**attributes, "scale": {"x": 1}}]}, "scale")
     refused({"o": [name, {**attributes, "poses": {"r": 10**6}}]}, "list index")
     refused(tree, "list index", [])
     wide = [np.zeros((2, 2, 3), np.uint8) if array.shape == (120, 160, 3) else array for array in arrays]
-    refused(tree, "expected .* for h, found", wide)
+    refused(tree, "color.*\\[2, 2, 3\\]", wide)
     short = [array[:-1] if len(array) == slam.map.count else array for array in arrays]
-    refused(tree, "Gaussians instead of", short)
-    with pytest.raises(ConfigError, match="memory is limited"):
+    refused(tree, f"{slam.map.count - 1}.*{slam.map.count}", short)
+    with pytest.raises(ConfigError, match="memory"):
         describe_state(fresh(dataclasses.replace(config, memory_limit_mb=4000.0)))
     assert reason_against_saving(config) is None
     assert "GPU" in str(reason_against_saving(dataclasses.replace(config, device="cuda")))

@@ -171,7 +171,7 @@ def test_each_number_has_a_range_that_holds(pair: tuple[type, Known]) -> None:
 @pytest.mark.parametrize("pair", [pair for pair in ALL if pair[1].choices or pair[1].kind is bool], ids=name)
 def test_each_choice_is_refused_by_its_path(pair: tuple[type, Known]) -> None:
     kind, one = pair
-    with pytest.raises(ConfigError, match=rf"{re.escape(one.path)}: expected .* found 'perhaps'"):
+    with pytest.raises(ConfigError, match=rf"{re.escape(one.path)}: .*'perhaps'"):
         build(kind, one.path, "perhaps")
 
 

@@ -168,7 +168,7 @@ def test_visits_list_what_they_changed(folder: Path) -> None:
 def test_one_writer_at_a_time_and_readers_beside_it(folder: Path) -> None:
     code = f"from ggslam.submaps.grid import GridStore; GridStore.open({str(folder)!r}, write=True)"
     with GridStore.create(folder, SETTINGS) as store:
-        with pytest.raises(RunFolderError, match=f"written to by process {os.getpid()}"):
+        with pytest.raises(RunFolderError, match=rf"\b{os.getpid()}\b"):
             GridStore.open(folder, write=True)
         other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert other.returncode == 1 and "is being written to" in other.stderr
@@ -176,7 +176,7 @@ def test_one_writer_at_a_time_and_readers_beside_it(folder: Path) -> None:
             store.put((0, 0, 0), {"points.pcd": b"new"})
             assert reader.get((0, 0, 0), "points.pcd") == b"new"
             for write in (lambda: reader.put((0, 0, 0), {}), lambda: reader.remove((0, 0, 0))):
-                with pytest.raises(RunFolderError, match="reading only"):
+                with pytest.raises(RunFolderError, match="reading"):
                     write()
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
@@ -204,7 +204,7 @@ def test_readers_never_see_a_mixture(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "reason"), [("flip", "checksum"), ("cut", "3 bytes, the index says 5"), ("gone", "No such file")]
+    ("damage", "reason"), [("flip", "checksum"), ("cut", r"3 bytes.*\b5\b"), ("gone", "No such file")]
 )
 def test_a_damaged_part_harms_no_other(folder: Path, damage: str, reason: str) -> None:
     with GridStore.create(folder, SETTINGS) as store:
@@ -286,11 +286,11 @@ def test_files_are_on_the_disk_before_the_index_speaks_of_them(folder: Path, mon
 
 
 def test_folders_that_are_no_store(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match=r"no grid store.*index\.sqlite"):
+    with pytest.raises(FormatError, match=r"index\.sqlite"):
         GridStore.open(folder)
     folder.mkdir()
     (folder / "notes.txt").write_text("mine")
-    with pytest.raises(RunFolderError, match=r"not empty.*notes\.txt"):
+    with pytest.raises(RunFolderError, match=r"notes\.txt"):
         GridStore.create(folder)
     (tmp_path / "file").write_text("")
     with pytest.raises(RunFolderError, match="file"):
@@ -307,17 +307,17 @@ def test_other_versions_and_grids(folder: Path) -> None:
     with GridStore.open(folder, settings=SubmapSettings(spacing=2.0, refresh=7.0)) as store:
         assert store.settings.refresh == 7.0
     for other in (SubmapSettings(spacing=3.0), SubmapSettings(axes="xy")):
-        with pytest.raises(ConfigError, match="2 m along xyz"):
+        with pytest.raises(ConfigError, match="2 m.*xyz"):
             GridStore.open(folder, settings=other)
     connection = sqlite3.connect(folder / "index.sqlite")
     connection.execute("UPDATE store SET settings = '{\"spacing\": -1}'")
     connection.commit()
-    with pytest.raises(FormatError, match="damaged settings"):
+    with pytest.raises(FormatError, match="settings"):
         GridStore.open(folder)
     connection.execute("PRAGMA user_version = 3")
     connection.commit()
     connection.close()
-    with pytest.raises(FormatError, match="format version 3, this program reads versions up to 2"):
+    with pytest.raises(FormatError, match=r"\b3\b.*\b2\b"):
         GridStore.open(folder)
 
 
@@ -362,7 +362,7 @@ def test_a_folder_that_cannot_be_written(folder: Path) -> None:
             assert store.get((0, 0, 0), "points.pcd") == b"p"
         with pytest.raises(RunFolderError, match="lock: Permission denied"):
             GridStore.open(folder, write=True)
-        with pytest.raises(RunFolderError, match="other: cannot be made: Permission denied"):
+        with pytest.raises(RunFolderError, match="other: .*Permission denied"):
             GridStore.create(folder / "other")
         folder.chmod(0o755)
         (folder / "lock").chmod(0o644)

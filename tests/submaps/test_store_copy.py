@@ -59,7 +59,7 @@ def test_a_part_of_another_size_is_copied_without_its_content(store: Path, tmp_p
     assert size_of(tmp_path / "copy.grid") < 200_000 and part(tmp_path / "copy.grid", 1).stat().st_size == 0
     with GridStore.open(tmp_path / "copy.grid") as copy:
         assert copy.get((2, 0, 0), "points.pcd") == b"\2" * 100 and copy.get((1, 0, 0), "gaussians.npz") == b"g"
-        with pytest.raises(FormatError, match="damaged: 0 bytes, the index says 100"):
+        with pytest.raises(FormatError, match=r"\b0 bytes.*\b100\b"):
             copy.get((1, 0, 0), "points.pcd")
 
 
@@ -76,7 +76,7 @@ def test_a_huge_file_beside_the_cells_is_refused(store: Path, tmp_path: Path, na
     path = visit_file(store, "first") if name == VISITS else store / name
     path.touch()
     os.truncate(path, HUGE)
-    with pytest.raises(FormatError, match=rf"{path.name}: too large for what it is: 53,687,091,200 bytes"):
+    with pytest.raises(FormatError, match=rf"{path.name}: .*53,687,091,200 bytes"):
         copy_store(store, tmp_path / "copy.grid")
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["map.grid"]
 
@@ -84,5 +84,5 @@ def test_a_huge_file_beside_the_cells_is_refused(store: Path, tmp_path: Path, na
 def test_a_part_of_another_size_is_not_read(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     os.truncate(part(store, 1), HUGE)
     monkeypatch.setattr("ggslam.submaps.cell_files.read_untrusted", lambda *_: pytest.fail("was read"))
-    with GridStore.open(store) as opened, pytest.raises(FormatError, match=f"damaged: {HUGE} bytes, the index says"):
+    with GridStore.open(store) as opened, pytest.raises(FormatError, match=f"{HUGE} bytes"):
         opened.get((1, 0, 0), "points.pcd")

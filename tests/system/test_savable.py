@@ -6,7 +6,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -55,6 +55,16 @@ def test_an_object_comes_back_as_its_class_declares() -> None:
     there = Held(handle)
     assert restore(tree, rules(), arrays, None, into=there) is there
     assert there == Held(handle, [1, 2], (3, None), 4)
+
+
+def test_a_class_is_made_from_the_name_that_it_had() -> None:
+    tree, arrays = describe(Held(None, [1, 2]), rules(), None)
+    known = {Held: replace(rules()[Held], formerly="ggslam.before.Held")}
+    assert tree["o"][0] == describe(Held(), known, None)[0]["o"][0]
+    tree["o"][0] = "ggslam.before.Held"
+    assert restore(tree, known, arrays, None, into=Held()).numbers == [1, 2]
+    with pytest.raises(FormatError):
+        restore(tree, rules(), arrays, None, into=Held())
 
 
 def test_a_check_that_fails_refuses_the_state() -> None:

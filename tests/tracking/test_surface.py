@@ -143,5 +143,5 @@ def test_a_surface_comes_back_from_its_arrays() -> None:
     points = extract_points(corner_depth(truth), CAMERA, settings.points, DepthNoise(), context)
     found = align(points, again.target, truth, settings.align, DepthNoise(), context)
     assert np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]) < 1e-3 and found.overlap > 0.8
-    with pytest.raises(FormatError, match=r"'normals': expected int8 \[points, 3\]"):
+    with pytest.raises(FormatError, match=r"'normals': .*int8 \[points, 3\]"):
         again.load({**surface.to_arrays(), "normals": np.zeros((3, 3), np.int8)})

@@ -147,8 +147,8 @@ def test_parts_that_do_not_belong_together_are_refused(context: NativeContext) -
     twin = TargetPart(*arrays[1], ALONE, context, one.rank)
     foreign = TargetPart(*arrays[1], WITH_NEIGHBOURS, context, other.rank)
     assert one.nbytes > 88 * len(composed_target([one], ALONE, context))
-    for parts in ([one, twin], [one, foreign]):
-        with pytest.raises(ValueError, match="parts of"):
+    for parts, reason in (([one, twin], "rank"), ([one, foreign], "settings")):
+        with pytest.raises(ValueError, match=reason):
             composed_target(parts, ALONE, context)
     built = GicpTarget.from_arrays(*arrays[0], ALONE, context)
     with pytest.raises(ValueError, match="composed"):

@@ -11,7 +11,7 @@ import numpy as np
 from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.merge.unseen_gaussians import UnseenGaussians
 from ggslam.jobs.progress import Observer
-from ggslam.mapping.finished import adopt_finished, train_by_turns
+from ggslam.mapping.finished import load_finished, train_by_turns
 from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
 from ggslam.merging.coverage import PlacedRun
 from ggslam.merging.objects import UnitedObjects
@@ -63,7 +63,7 @@ def train_seams(
     sigma = max(source.known.noise.sigma(depth) for source in sources)
     config = replace(sources[0].folder.config(), sh_degree=gaussians.sh_degree)
     mapper = make_mapper(replace(config, device="cpu"), with_masks, context, None)
-    adopt_finished(mapper, gaussians, keyframes)
+    load_finished(mapper, gaussians, keyframes)
     mapper.depth_sigma = sigma
     if mapper.identity is not None:
         mapper.identity.resume(objects.classifier)

@@ -12,7 +12,7 @@ import torch
 from ggslam.mapping.cpu.losses import CpuLossResult
 from ggslam.mapping.finished import StillMapper
 from ggslam.mapping.keyframe import Keyframe
-from ggslam.mapping.pixel_grid import WHOLE, PixelGrid
+from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.types import RenderBuffers
@@ -123,7 +123,7 @@ class CellMapper(StillMapper):
             getattr(self.map, name)[self._own :] = values
         self._box.clamp(self.map.means[: self._own])
 
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CpuLossResult:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> CpuLossResult:
         shown = torch.from_numpy(self._views[keyframe.index].shown)
         gain, offset = torch.from_numpy(keyframe.exposure.astype(np.float32)).T[:, :, None, None]
         measured = torch.tensor(keyframe.color).permute(2, 0, 1) / 255.0

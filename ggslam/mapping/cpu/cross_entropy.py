@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cross-entropy of what pixels are classified as, in one call to the compiled core."""
+"""Cross-entropy of the classes of pixels, in one call to the compiled core."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New Gaussians where the map does not yet explain a frame."""
+"""Inserts Gaussians where the map does not explain a frame yet."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposures of the keyframes against the map's, and keyframes whose colours tell nothing."""
+"""Exposures of the keyframes relative to the map, and keyframes whose colours are not used."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from ggslam.rendering.exposure import (
     typical_gain,
     without_exposure,
 )
+from ggslam.system.plurals import counted
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 
@@ -40,7 +41,7 @@ class KeyframeExposureTuning(Tuning):
 
 @savable()
 class KeyframeExposures:
-    """What is known of the exposure of each keyframe of one mapper, by number.
+    """Exposures of the keyframes of one mapper, by number.
 
     Args:
         settings: see there.
@@ -70,9 +71,9 @@ class KeyframeExposures:
         """Raises FormatError if these are not of so many keyframes: they may come from a file."""
         counts = [len(self.optimizers), len(self.known), len(self.blind)]
         if counts != [count] * 3:
-            raise FormatError(f"exposures: expected those of {count} keyframes, found {counts}")
+            raise FormatError(f"exposures: expected those of {counted(count, 'keyframe')}, found {counts}")
 
-    def adopt(self, count: int) -> None:
+    def load(self, count: int) -> None:
         """Starts with so many keyframes of an earlier run, whose exposures are what they are."""
         self.optimizers = [ExposureAdam(self.settings) for _ in range(count)]
         self.known, self.blind, self.found_lit = [True] * count, [False] * count, count > 0

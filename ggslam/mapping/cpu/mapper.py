@@ -20,7 +20,7 @@ from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
-from ggslam.mapping.pixel_grid import WHOLE, PixelGrid, grid_of_turn
+from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
@@ -70,7 +70,7 @@ class CpuMapper(Mapper):
         if self.identity is not None:
             self.identity.check(self.keyframes)
         if not self._mean.fits(self.map):
-            raise FormatError("the mean of the map: not of its Gaussians")
+            raise FormatError("the mean of the map does not match its Gaussians")
         self.map.check(count)
 
     def __init__(
@@ -97,10 +97,10 @@ class CpuMapper(Mapper):
     def last_psnr(self) -> float:
         return self._last_psnr
 
-    def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
-        super().adopt(gaussians, keyframes)
+    def load_map(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
+        super().load_map(gaussians, keyframes)
         self._pose_optimizers = [PoseAdam() for _ in keyframes]
-        self._exposures.adopt(len(keyframes))
+        self._exposures.load(len(keyframes))
 
     def render_view(self, camera: Camera, T_camera_world: np.ndarray) -> RenderBuffers:
         """The map as a camera sees it from a pose [4, 4], without identities; not beside `run`."""
@@ -202,7 +202,7 @@ class CpuMapper(Mapper):
         stays = ~np.isin(born, [k.index for k in own if k.index not in untrained])
         for keyframe in own:
             grid = (
-                WHOLE
+                ALL_PIXELS
                 if len(own) < HiddenGaussianTuning.few_keyframes
                 else grid_of_turn(keyframe.index, keyframe.camera)
             )
@@ -214,7 +214,7 @@ class CpuMapper(Mapper):
         self.map.keep(torch.from_numpy(stays))
 
     def _render(
-        self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE, close_below: float = 0.0
+        self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
     ) -> RenderBuffers:
         camera, pose = grid.camera(keyframe.camera), keyframe.T_camera_world
         low_pass = grid.low_pass(self._rasterizer.low_pass)
@@ -222,7 +222,7 @@ class CpuMapper(Mapper):
             self.map, camera, pose, features=features, low_pass=low_pass, close_below=close_below
         )
 
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CpuLossResult:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> CpuLossResult:
         exposure = keyframe.exposure if self._exposures.is_exposed(keyframe) else None
         valid, compared = self.valid_of(keyframe), self._exposures.usable_pixels(keyframe)
         if compared is not None:

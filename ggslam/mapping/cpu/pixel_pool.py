@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels of a keyframe's mask identity learning looks at."""
+"""Draws the pixels of a keyframe's mask that identity learning uses."""
 
 from __future__ import annotations
 

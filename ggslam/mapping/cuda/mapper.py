@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mapper on an NVIDIA GPU: map, keyframes, losses, optimizers and identity learning are there, and the host only
-starts work.
+"""The mapper on an NVIDIA GPU: map, keyframes, losses, optimizers and identity learning are on the device, and the host
+only starts work.
 
 It waits at a new keyframe (once, for the number of Gaussians to insert and for what the map shows of objects), and when
 poses are read. The losses it reports are those that have arrived without waiting.
@@ -27,7 +27,7 @@ from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper, MapperTuning
-from ggslam.mapping.pixel_grid import WHOLE, PixelGrid
+from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
@@ -85,9 +85,9 @@ class CudaMapper(Mapper):
     def in_turn(self) -> AbstractContextManager[object]:
         return self._states.in_turn()
 
-    def adopt(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
+    def load_map(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         ours: list[Keyframe] = [CudaKeyframe(keyframe, self._states, self._images) for keyframe in keyframes]
-        super().adopt(gaussians.to(self.device), ours)
+        super().load_map(gaussians.to(self.device), ours)
 
     def move_keyframes(self, T_new_old: np.ndarray) -> None:
         old = self._states.read_poses()
@@ -177,19 +177,19 @@ class CudaMapper(Mapper):
     # --- optimisation ------------------------------------------------------------------------------------------------
 
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
-        return WHOLE
+        return ALL_PIXELS
 
     def last_iterations(self, before: int) -> int:
         return round(MapperTuning.all_pixels_end_share * before)
 
     def _render(
-        self, keyframe: Keyframe, features: bool, grid: PixelGrid = WHOLE, close_below: float = 0.0
+        self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
     ) -> RenderBuffers:
         return self._rasterizer.forward(
             self.map, keyframe.camera, self._states.pose(keyframe.index), features=features
         )
 
-    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = WHOLE) -> CudaLossResult:
+    def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> CudaLossResult:
         assert isinstance(keyframe, CudaKeyframe)
         images, s = keyframe.device_images, self.settings
         exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 import pydantic
 
-from ggslam.movers.found import FoundMover, MoverSight
+from ggslam.movers.mover_table import FoundMover, MoverSight
 from ggslam.movers.point_files import POINTS_FILE
 from ggslam.objects.colors import id_palette
 from ggslam.runs.records.record import Array, Number, Record, RecordFile

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds out what is fixed to the camera (a tool, a bonnet) and takes it out of frames: it would be mapped
-again at every keyframe, in front of everything else."""
+"""Detects what is fixed to the camera (a tool, a bonnet) and masks it. Otherwise every keyframe would map it in front
+of everything else."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class FixtureTuning(Tuning):
 @savable()
 @dataclass
 class CameraFixtures(FrameFilter):
-    """Looks at the first located frames that are apart from one another.
+    """Detects fixtures in the first located frames that are apart from one another.
 
     Attributes:
         mask: bool [H, W], what is fixed to the camera; None: nothing, as far as is known.

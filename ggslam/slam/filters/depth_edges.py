@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth of cameras that smooth their images is not used where it hangs between two surfaces."""
+"""Removes depth between two surfaces, which cameras that smooth their depth images produce."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class DepthEdgeTuning(Tuning):
 @savable()
 @dataclass
 class DepthEdges(FrameFilter):
-    """Finds out in the first frames whether outlines of depth are sharp, and drops slopes where they are not.
+    """Decides on the first frames whether outlines of depth are sharp. If they are not, slopes are removed.
 
     Attributes:
         soft: whether they are slopes; None: not known yet.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The views of the map that a run began with, held against the run's own keyframes: what was carried away goes.
+"""Compares the views of the map that a run started from with the run's own keyframes, and removes what is gone.
 
 A run in another one's map trains on that one's keyframes, too. Where they show what is not there any more they bring
 it back again and again, and the tracker is aligned to it.

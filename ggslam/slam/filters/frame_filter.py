@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every filter of frames has."""
+"""The interface of filters of frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FilterContext:
-    """What filters are made of.
+    """What filters are constructed with.
 
     Attributes:
         config: all settings of the run.
@@ -33,7 +33,7 @@ class FilterContext:
 
 
 class InRigs(Enum):
-    """What a rig of cameras does with a filter."""
+    """How a rig of cameras uses a filter."""
 
     PER_CAMERA = "one for each camera"
     SHARED = "one for all cameras"
@@ -41,7 +41,7 @@ class InRigs(Enum):
 
 
 class FrameFilter:
-    """Looks at every frame of one camera, and corrects it where it is wrong. Every hook does nothing by default.
+    """Inspects every frame of one camera and corrects it. By default, each hook does nothing.
 
     The hooks are called in this order. For every frame: `clean`, `expect`, `judge`. For every keyframe, in the
     mapper's thread: `before_insertion`, `after_insertion`. When a loop was closed: `loop_closed` in the mapper's

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds what moves in the frames of a run and keeps it out of tracking, map and places."""
+"""Detects moving things in the frames of a run and keeps them out of tracking, map and places."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 
 @savable(not_saved="_reads_masks _margin context")
 class MoverFilter(FrameFilter):
-    """Finds movers in each located frame, if the settings want it; else frames and results stay as they are.
+    """Detects movers in each located frame, if the settings ask for it.
 
     Args:
         settings: see there.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth that was taken a little before or after colour is brought to the time of colour, along the camera's motion."""
+"""Moves depth that was taken before or after colour to the time of colour, along the camera's motion."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class ShutterTuning(Tuning):
 @savable()
 @dataclass
 class ShutterTimes(FrameFilter):
-    """Knows where the depth camera was when it took the last images: its motion is taken to go on.
+    """Predicts the pose of the depth camera from its motion between the last images.
 
     Attributes:
         motion: [4, 4], from one of its poses to the next; None: not known.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tracker's work on an NVIDIA GPU: what `CpuTrackingEngine` does, by kernels, with one wait per alignment.
+"""Tracking on an NVIDIA GPU: the work of `CpuTrackingEngine` by kernels, with one wait per alignment.
 
 A frame's depth is sent once. Points, their number, the whole optimisation from the coarse voxels to the fine ones and
 its result stay on the device; the host gets the result in one copy, and waits for that alone. Sums have a fixed order:
@@ -115,7 +115,7 @@ class CudaTrackingEngine:
         self.library.call("align", ctypes.byref(job))
         source.send()  # some hundred kilobytes, so that a keyframe has them without another wait
         found = self._results.wait()
-        source.settle(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
+        source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
         return cuda_alignment(found, matched, settings)
 
     def _aligning_memory(self, job: AlignJob) -> torch.Tensor:

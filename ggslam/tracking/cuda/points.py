@@ -47,7 +47,7 @@ class CudaPoints:
             copy = torch.empty(self._block.shape, dtype=self._block.dtype, pin_memory=True)
             self._copy = copy.copy_(self._block, non_blocking=True)
 
-    def settle(self, count: int, median_depth: float) -> None:
+    def set_header(self, count: int, median_depth: float) -> None:
         """Takes what the device says of the points, once it is known; what was sent has arrived then."""
         self._header = count, median_depth
 
@@ -79,7 +79,7 @@ class CudaPoints:
 
     def _known_header(self) -> tuple[int, float]:
         if self._header is None:
-            self.settle(*self._header_of(self._block[: sizeof(PointsHeader) // 4].cpu().numpy()))
+            self.set_header(*self._header_of(self._block[: sizeof(PointsHeader) // 4].cpu().numpy()))
         assert self._header is not None
         return self._header
 

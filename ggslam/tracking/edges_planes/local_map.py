@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The edges and planes around the sensor, which scans are aligned to."""
+"""The local map of edges and planes that scans are aligned to."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of the edge/plane front-end, documented.
+"""Settings of the tracker of edges and planes.
 
 The defaults are for depth cameras indoors; `LIDAR` are those for a spinning LiDAR outdoors.
 """
@@ -59,7 +59,7 @@ class ExtractionSettings(ExtractionTuning):
 
 @tuning_class(frozen=True)
 class FeatureMapSettings:
-    """Numbers of the local map, a hash table of plane and edge voxels."""
+    """The local map, a hash table of plane and edge voxels."""
 
     plane_voxel: float = setting(0.08, 1e-3, 100, "m")
     """Edge of a plane voxel."""
@@ -158,7 +158,7 @@ class FeatureTrackerTuning:
 
 @settings_class(frozen=True)
 class FeatureTrackerSettings(FeatureTrackerTuning):
-    """The tracker of edges and planes (`tracker` = features)."""
+    """The tracker of edges and planes (`tracker` = edges_planes)."""
 
     gicp_fallback: bool = True
     """Locate a frame by G-ICP where edges and planes fail or leave a direction of motion open. Takes time beyond

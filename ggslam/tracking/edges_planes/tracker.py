@@ -31,7 +31,7 @@ from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, Track
 @savable()
 @dataclass(frozen=True)
 class FeatureCounts:
-    """What a frame had.
+    """Numbers of features of a frame.
 
     Attributes:
         planes, edges: number of features.

@@ -35,7 +35,7 @@ _MULTIPLIER: Final = -7046029254386353131
 
 @dataclass(frozen=True)
 class VoxelMatches:
-    """What points were matched to; of points without match the rest means nothing.
+    """Matches of points. Where a point has no match, its other values mean nothing.
 
     Attributes:
         found: bool [n].

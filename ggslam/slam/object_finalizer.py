@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The objects that a run has learned, settled once at its end."""
+"""The objects that a run has learned. They are finalized once, at its end."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ggslam.slam.result import LearnedObjects
 from ggslam.system.savable import savable
 
 
-@savable(not_saved="_masks")
-class RunObjects:
+@savable(not_saved="_masks", formerly="ggslam.slam.run_objects.RunObjects")
+class ObjectFinalizer:
     """Objects of a run.
 
     Args:
@@ -26,10 +26,10 @@ class RunObjects:
     def __init__(self, masks: ObjectMasks) -> None:
         self._masks = masks
         self.learned = None
-        """Of the map that the run began with; after `settle` of the run."""
+        """Those of the map that the run started from until `finalize`, then those of this run."""
         self._settled = False
 
-    def settle(self, mapper: Mapper, pager: MapPager | None) -> LearnedObjects | None:
+    def finalize(self, mapper: Mapper, pager: MapPager | None) -> LearnedObjects | None:
         """The last identity steps, and every Gaussian's object; only the first call does anything. None if nothing was
         learned.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run knows of its movers at the end."""
+"""The movers that a run found: when and where each of them was seen."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ggslam.system.savable import savable
 Kind = Literal["rigid", "not rigid", "unknown"]
 
 
-@savable()
+@savable(formerly="ggslam.movers.found.MoverSight")
 @dataclass(frozen=True)
 class MoverSight:
     """A mover in a frame.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the keyframes of a map see: how deep, which Gaussians' cells, and when they saw them last."""
+"""The visible space of each keyframe: how deep it sees, which cells it sees, and when a cell was last seen."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ class VisibilityTuning(Tuning):
 
 
 @dataclass(frozen=True)
-class SightedPose:
+class ViewReach:
     """A pose T_world_camera [4, 4], and how deep each tile of the image sees from there, metres [rows, columns]."""
 
     T_world_camera: np.ndarray
     reach: np.ndarray
 
 
-class KeyframeSights:
-    """What keyframes see.
+class KeyframeVisibility:
+    """The visible space of each keyframe.
 
     Args:
         camera: of all keyframes.
@@ -47,7 +47,7 @@ class KeyframeSights:
         """Those of the map; the mapper's own list."""
         self._reach: list[np.ndarray] = []
 
-    def add(self, T_world_camera: np.ndarray, depth: np.ndarray) -> SightedPose:
+    def add(self, T_world_camera: np.ndarray, depth: np.ndarray) -> ViewReach:
         """The next keyframe is about to be inserted at a pose [4, 4].
 
         Args:
@@ -57,20 +57,20 @@ class KeyframeSights:
         s = self._settings
         deep = s.view_margin * depth_reach(depth, *VisibilityTuning.tiles) + s.view_spare
         self._reach.append(np.minimum(deep, s.view_range))
-        return SightedPose(T_world_camera, self._reach[-1])
+        return ViewReach(T_world_camera, self._reach[-1])
 
-    def of(self, numbers: Iterable[int]) -> list[SightedPose]:
+    def of(self, numbers: Iterable[int]) -> list[ViewReach]:
         """What these keyframes see from where they are now."""
-        return [SightedPose(self.keyframes[number].T_world_camera, self._reach[number]) for number in numbers]
+        return [ViewReach(self.keyframes[number].T_world_camera, self._reach[number]) for number in numbers]
 
-    def newest(self) -> SightedPose:
+    def newest(self) -> ViewReach:
         """Of the newest keyframe."""
         return self.of([len(self._reach) - 1])[0]
 
-    def frustums(self, sights: Sequence[SightedPose]) -> Frustums:
+    def frustums(self, views: Sequence[ViewReach]) -> Frustums:
         """The visible spaces."""
-        poses = np.stack([inverse(sight.T_world_camera) for sight in sights])
-        return Frustums.of(self._camera, poses, np.stack([sight.reach for sight in sights]))
+        poses = np.stack([inverse(view.T_world_camera) for view in views])
+        return Frustums.of(self._camera, poses, np.stack([view.reach for view in views]))
 
     def batches(self, numbers: Sequence[int]) -> Iterable[tuple[Sequence[int], Frustums]]:
         """So many keyframes at a time as may be asked together, and their visible spaces."""
