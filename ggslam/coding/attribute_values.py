@@ -302,7 +302,7 @@ def _describe(name: str, values: AttributeSummary, own: AttributeSettings) -> At
         raise ConfigError(f"attribute {name!r}: values {values.low} to {values.high} do not fit in {depth} bits")
     label = own.label or ("color" if components == 3 else "reflectance")
     if label not in KNOWN_LABELS:
-        raise ConfigError(f"attribute {name!r}: label {label!r} is none of {', '.join(KNOWN_LABELS)}")
+        raise ConfigError(f"attribute {name!r}: label {label!r} is not one of {', '.join(KNOWN_LABELS)}")
     matrix = {"ycbcr": MATRIX_BT709, "identity": MATRIX_IDENTITY}.get(space)
     if matrix is not None and (own.scale, own.offset) != (1, 0):
         raise ConfigError(f"attribute {name!r}: colour space {space} goes without scale and offset")

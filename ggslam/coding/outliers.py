@@ -15,7 +15,7 @@ import numpy as np
 
 from ggslam.coding.geometry_syntax import MAX_DEPTH
 from ggslam.coding.settings import CodecSettings
-from ggslam.system.plurals import plural, quantity
+from ggslam.system.plurals import quantity, word_for
 from ggslam.system.tuning import Tuning
 
 
@@ -82,7 +82,7 @@ class Reach:
                 "the grid does not reach so far"
             )
         if self.far > self.left_out:
-            lie = plural(self.far - self.left_out, "lies", "lie")
+            lie = word_for(self.far - self.left_out, "lies", "lie")
             few = quantity(self.far - self.left_out, what)
             notes.append(f"{few} {lie} far outside the others ({at}); the voxels are those that suit the others")
         return notes

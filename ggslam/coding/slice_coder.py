@@ -29,7 +29,7 @@ from ggslam.native.loader import NativeContext, load_library
 
 _REASONS = {
     Status.TRUNCATED: "the payload ends early or is damaged",
-    Status.COUNT_MISMATCH: "the payload holds another number of points than its unit says",
+    Status.COUNT_MISMATCH: "the payload has another number of points than its unit states",
     Status.TOO_LARGE: "the octree has more nodes than the decoder is willing to hold",
 }
 MAX_SLICE_POINTS: Final = 1 << 24

@@ -62,7 +62,7 @@ def write_compressed_ply(path: str | Path, gaussians: GaussianMap) -> int:
         RunFolderError: the file cannot be written.
     """
     if not len(gaussians):
-        raise FormatError(f"{path}: a compressed PLY holds at least one Gaussian, found none")
+        raise FormatError(f"{path}: a compressed PLY needs at least one Gaussian")
     columns = SplatColumns.of(path, gaussians)
     order = morton_order(columns.means)
     chunks, vertices = _pack(columns, order)

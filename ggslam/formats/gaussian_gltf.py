@@ -81,7 +81,7 @@ def write_gaussian_gltf(
         RunFolderError: the file cannot be written.
     """
     if not count:
-        raise FormatError(f"{path}: glTF holds at least one Gaussian, found none")
+        raise FormatError(f"{path}: glTF needs at least one Gaussian")
     attributes, size = _layout(count, sh_degree, objects is not None)
     room = len(_text(attributes, count, size, objects, _WIDEST_CORNER))
     total = 28 + room + size
@@ -154,7 +154,7 @@ def _columns(path: str | Path, gaussians: GaussianMap, with_objects: bool) -> di
     opacity = 0.5 + 0.5 * np.tanh(0.5 * columns.logits.astype(np.float64))
     scales = np.exp(columns.log_scales.astype(np.float64))
     if scales.max() > np.finfo(np.float32).max:
-        raise FormatError(f"{path}: a Gaussian is larger than float32 can say")
+        raise FormatError(f"{path}: a Gaussian is too large for float32")
     rgb = (0.5 + SH_C0 * columns.sh[:, 0].astype(np.float64)).clip(0, 1)
     out = {
         "POSITION": columns.means, "COLOR_0": vertex_colors(rgb, opacity),

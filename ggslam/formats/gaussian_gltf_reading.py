@@ -95,7 +95,7 @@ def read_gaussian_gltf(path: Path) -> tuple[SplatColumns, dict[int, str] | None]
             parts.append(columns)
             names |= {int(k): str(v) for k, v in mesh.get("extras", {}).get("objects", {}).items()}
         if not parts:
-            raise ValueError(f"it holds no Gaussians ({EXTENSION}); a mesh is no map")
+            raise ValueError(f"it holds no Gaussians ({EXTENSION}); meshes are not read as maps")
         if len({part.sh.shape[1] for part in parts}) > 1:
             parts = [_with_coefficients(part, max(p.sh.shape[1] for p in parts)) for part in parts]
         columns = SplatColumns.join(parts)

@@ -65,17 +65,17 @@ def write_gaussian_usd(path: str | Path, gaussians: GaussianMap, objects: Mappin
     """
     path, pxr = Path(path), usd_package(path)
     if not len(gaussians):
-        raise FormatError(f"{path}: a splat of OpenUSD holds at least one Gaussian, found none")
+        raise FormatError(f"{path}: a splat in OpenUSD needs at least one Gaussian")
     columns = SplatColumns.of(path, gaussians)
     columns.turn_upright()
     if columns.log_scales.max() > np.log(np.finfo(np.float32).max):
-        raise FormatError(f"{path}: a Gaussian is larger than float32 can say")
+        raise FormatError(f"{path}: a Gaussian is too large for float32")
     stage = _stage(pxr, columns, gaussians.sh_degree, objects)
     with atomic_write(path) as temporary:
         if path.suffix.lower() == ".usdz":
             _package(pxr, stage, path, temporary)
         elif not stage.GetRootLayer().Export(str(temporary)):
-            raise RunFolderError(f"cannot write {path}: usd-core says no more")
+            raise RunFolderError(f"cannot write {path}: usd-core gave no reason")
 
 
 def _package(pxr: ModuleType, stage: Any, path: Path, temporary: Path) -> None:
@@ -85,7 +85,7 @@ def _package(pxr: ModuleType, stage: Any, path: Path, temporary: Path) -> None:
         layer = str(folder / f"{path.stem}.usdc")
         done = stage.GetRootLayer().Export(layer)
         if not done or not pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(layer), str(temporary)):
-            raise RunFolderError(f"cannot write {path}: usd-core says no more")
+            raise RunFolderError(f"cannot write {path}: usd-core gave no reason")
 
 
 def _stage(pxr: ModuleType, columns: SplatColumns, sh_degree: int, objects: Mapping[int, str] | None) -> Any:

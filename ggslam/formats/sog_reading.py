@@ -101,7 +101,7 @@ def _decode(read: Files) -> tuple[SplatColumns, dict[int, str] | None]:
         raise ValueError(f"version {meta.get('version', 1)}, expected 2")
     count = int(meta["count"])
     if not 0 < count <= LARGEST_COUNT:
-        raise ValueError(f"it says that it has {count} Gaussians")
+        raise ValueError(f"it claims {count} Gaussians")
     # Positions hardly pack; the other images may be of one colour.
     check_count(count, 8 * sum(len(read(str(name), FileTuning.max_image_bytes)) for name in meta["means"]["files"][:2]))
 
@@ -110,7 +110,7 @@ def _decode(read: Files) -> tuple[SplatColumns, dict[int, str] | None]:
 
     quats = pixels("quats")
     if quats[:, 3].min(initial=255) < 252:
-        raise ValueError("quaternions do not say which number is left out")
+        raise ValueError("quaternions do not mark the number that is left out")
     three = (quats[:, :3] / 255 - 0.5) * math.sqrt(2)
     base, table = pixels("sh0"), _table(meta, "sh0")
     sh = [table[base[:, :3]][:, None]]

@@ -69,7 +69,7 @@ def read_splat(path: Path) -> SplatColumns:
     """
     data = read_untrusted(path)
     if not data or len(data) % SPLAT_ROW.itemsize:
-        raise FormatError(f"{path}: {len(data)} bytes are no whole number of Gaussians of {SPLAT_ROW.itemsize} bytes")
+        raise FormatError(f"{path}: {len(data)} bytes, expected a multiple of {SPLAT_ROW.itemsize} bytes")
     rows = np.frombuffer(data, SPLAT_ROW)
     rgba = rows["rgba"] / 255
     sh = ((rgba[:, None, :3] - 0.5) / SH_C0).astype(np.float32)

@@ -29,7 +29,7 @@ class RepairTuning(Tuning):
 _POSITION, _SIZE, _TURN = "position is no number", "size is infinite or zero", "quaternion is zero or no number"
 _OPACITY, _COLOR = "opacity is no number", "colour is no number"
 _FLAT, _ENDLESS = "thickness of zero, now a thousandth of the width", "infinite logit of opacity, now +-13.8"
-_STRANGE = "colour coefficients that are no numbers, now 0"
+_STRANGE = "colour coefficients that were not finite set to 0"
 
 
 class SplatFaults:

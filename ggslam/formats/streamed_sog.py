@@ -86,7 +86,7 @@ def write_streamed_sog(
     writer = _Writer(folder, levels, objects, done)
     tree = writer.tree_of_parts(list(parts))
     if tree is None:
-        raise FormatError(f"{folder}: streamed SOG holds at least one Gaussian, found none")
+        raise FormatError(f"{folder}: streamed SOG needs at least one Gaussian")
     writer.finish()
     counts = [level.count for level in writer.levels]
     index: dict[str, Any] = {

@@ -192,7 +192,7 @@ def read_g2o(path: str | Path) -> Trajectory:
         numbers = _numbers(where, words[1:])
         _check_finite(where, numbers)
         if not numbers[0].is_integer() or int(numbers[0]) in found:
-            raise FormatError(f"{where}: {words[1]} is no number of a pose, or there are two of it")
+            raise FormatError(f"{where}: {words[1]} is not a valid pose number, or it appears twice")
         found[int(numbers[0])] = _pose(where, numbers[1:4], numbers[4:])
     if not found:
         raise FormatError(f"{path}: no poses in it (lines {_VERTEX})")

@@ -345,7 +345,7 @@ class RunFolder:
             FormatError: objects.json is damaged.
         """
         if not self.has_objects():
-            raise RunFolderError(f"{self.path}: this run has no objects: it learned none, its map is not segmented")
+            raise RunFolderError(f"{self.path}: this run has no objects: its map is not segmented")
         return ObjectTable.load(self.path / "objects.json")
 
     def classifier(self) -> IdentityClassifier:

@@ -115,7 +115,7 @@ def sum_problems(folder: Path, files: Files) -> list[Problem]:
     seen = {problem.name for problem in problems}
     for name, record in files.items():
         if name not in seen and sum_of(folder / name) != record.sha256:
-            problems.append(Problem(name, "not the content that was written", True))
+            problems.append(Problem(name, "checksum mismatch (changed or damaged)", True))
     return problems
 
 
@@ -130,8 +130,8 @@ def refuse_mixed(folder: Path, mark: RunRecord) -> list[Problem]:
     if serious:
         more = f" (and {len(serious) - 1} more)" if serious[1:] else ""
         raise RunFolderError(
-            f"{folder / serious[0].name}: {serious[0].text}{more}: not what the run wrote; `ggslam verify` tells more, "
-            "and with `accept` takes the files as they are"
+            f"{folder / serious[0].name}: {serious[0].text}{more}: changed or damaged; `ggslam verify` lists all, and "
+            "with `accept` it accepts the files as they are"
         )
     return problems
 

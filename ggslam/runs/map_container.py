@@ -269,7 +269,7 @@ def open_container(path: Path) -> Container:
     for name, content in members.items():
         told = head.files.get(name)
         if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
-            raise FormatError(f"{path}: {name} is damaged: not the content that {_HEAD} tells the checksum of")
+            raise FormatError(f"{path}: {name} is damaged: its checksum is not that in {_HEAD}")
     left = max(ArrayLimits.max_bytes, ArrayLimits.max_ratio * sum(sizes.values()))
     expanded = dict[str, bytes]()
     for member, content in members.items():

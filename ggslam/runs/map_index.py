@@ -119,7 +119,7 @@ class MapInParts:
         """Whether there is an index."""
         self.index = MapIndex.of_whole(len(self.rows)) if index is None else index
         if len(self.rows) != int(self.index.counts.sum()):
-            found = f"has {len(self.rows)} Gaussians, {MAP_INDEX} beside it speaks of others"
+            found = f"has {len(self.rows)} Gaussians, {MAP_INDEX} beside it is of another map"
             raise FormatError(f"{self.rows.path}: {found}")
         self._cached: OrderedDict[int, GaussianMap] = OrderedDict()
         self._room = cache_bytes // max(1, self.rows.like.bytes_per_gaussian)

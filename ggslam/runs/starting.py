@@ -149,7 +149,7 @@ def _with_images(
             with this one's).
     """
     if folder.path.resolve() in later:
-        raise RunFolderError(f"{folder.path}: says that it began with its own map")
+        raise RunFolderError(f"{folder.path}: states that it started from its own map")
     if folder.sequence().map is not None:
         earlier = parent(folder)
         first = len(earlier.keyframes().keyframes)

@@ -121,5 +121,6 @@ def _other_size(camera: Camera, stated: Size | None, told: str) -> str:
     width, height = np.rint(ratio * np.array(said)).astype(int)
     words = f"the principal point is the middle of images of {width}x{height}, not of {said[0]}x{said[1]}"
     if stated is not None and stated != (camera.width, camera.height):
-        words += f", the size that they are said to be for (the images are {camera.width}x{camera.height})"
-    return f"intrinsics{told} are of another size: {words}; give width, height, fx, fy, cx and cy of the same images"
+        words += f", the size that they are given for (the images are {camera.width}x{camera.height})"
+    remedy = "give width, height, fx, fy, cx and cy of the same images"
+    return f"intrinsics{told} are for another image size: {words}; {remedy}"

@@ -149,9 +149,9 @@ class DepthDoubts:
     def _unrelated_verdict(self, strength: float) -> Verdict:
         text = (
             f"colour and depth do not belong together: outlines of depth lie on edges of colour no more often than by "
-            f"chance (strength {strength:.2f}, of sound recordings 0.5 and more); look whether both folders are of one "
-            "recording, whether one of the two is cropped or has another field of view, whether depth comes several "
-            "frames later (`depth_delay`), and whether it was compressed with losses (JPEG)"
+            f"chance (strength {strength:.2f}, of sound recordings 0.5 and more); check whether both folders are of "
+            "one recording, whether one of the two is cropped or has another field of view, whether depth comes "
+            "several frames later (`depth_delay`), and whether it was compressed with losses (JPEG)"
         )
         return Verdict("unrelated", "doubtful", text)
 
@@ -268,12 +268,12 @@ class DepthDoubts:
             remedy = f"; try `stride` {runs}" if runs > 1 and abs(share - (1 - 1 / runs)) < 0.08 else ""
             text = (
                 f"{same} images repeat: {count} of {found.pairs} neighbouring frames that were compared hold the same "
-                f"{same} beside other {other}, so most {same} is of another time{remedy}"
+                f"{same} with different {other}, so most {same} is from another time{remedy}"
             )
             if code == "color_repeats" and found.blank:
                 text = (
-                    f"colour images are blank: in {count} of {found.pairs} pairs of neighbours both hold one and the "
-                    f"same colour and nothing else; take the cover off the lens, or look how the images were written"
+                    f"colour images are blank: in {count} of {found.pairs} pairs of neighbours both show one and the "
+                    f"same colour and nothing else; take the cover off the lens, or check how the images were written"
                 )
             verdicts.append(Verdict(code, "doubtful", text))
         return verdicts
@@ -284,8 +284,8 @@ class DepthDoubts:
             return []
         remedy = self._kind.with_words(f"none:{found.code:g}")
         text = (
-            f"depth {found.code:g} stands in {found.share:.1%} of the pixels with depth and hardly any is near it: it "
-            f"seems to mean that nothing was measured; try `depth_kind` {remedy}"
+            f"depth {found.code:g} stands in {found.share:.1%} of the pixels with depth and almost no depth is near "
+            f'it: it seems to mean "not measured"; try `depth_kind` {remedy}'
         )
         return [Verdict("depth_codes", "doubtful", text)]
 

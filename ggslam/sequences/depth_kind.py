@@ -109,5 +109,5 @@ def _positive(text: str | None, number: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
-        raise SequenceError(f"`depth_kind`: expected a positive number behind the colon, found '{str(text)[:60]}'")
+        raise SequenceError(f"`depth_kind`: expected a positive number after the colon, found '{str(text)[:60]}'")
     return value

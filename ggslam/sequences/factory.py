@@ -177,7 +177,9 @@ def _open_rig(
     """A rig; `of_cameras` are arguments that hold for one camera alone."""
     given = [name for name, value in of_cameras.items() if value is not None]
     if given:
-        raise SequenceError(f"{file}: `{given[0]}` is of one camera; say it in the rig's file, as `{given[0]}` there")
+        raise SequenceError(
+            f"{file}: `{given[0]}` holds for one camera; set it in the rig's file, as `{given[0]}` there"
+        )
     start, stop, stride = selected
     read = partial(open_sequence, truth=truth)
     sequence = open_rig(file, read, start=start, stop=stop, stride=stride, scale=scale, on_bad_frame=on_bad_frame)
@@ -217,7 +219,7 @@ def _read_recording(
         if recording.poses is not None:
             recording.poses = convert_poses(recording.poses, pose_convention)
         elif options.truth and not recording.pose_problem:
-            raise SequenceError(f"{folder}: tells no poses, so there are none to convert from {pose_convention}")
+            raise SequenceError(f"{folder}: has no poses to convert from {pose_convention}")
     recording.depth_kind, recording.upright = stored.depth_kind, stored.upright
     recording.void_id = stored.void_id
     if stored.depth_delay is not None:

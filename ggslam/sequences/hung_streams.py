@@ -73,7 +73,7 @@ def _judge(sequence: Sequence, thumbnails: list[Thumbnail], kind: str, spans: Sp
     told = f"{frames} of {len(sequence)} frames, {where},"
     if all(one.blank for one in found):
         text = f"colour images are blank: {told} show one and the same colour while depth moves on; take the cover off"
-        return [Verdict("color_repeats", "doubtful", f"{text} the lens, or look how the images were written")]
+        return [Verdict("color_repeats", "doubtful", f"{text} the lens, or check how the images were written")]
     text = f"{same} images hang: {told} hold the {same} image of the first of them while {other} moves on"
     return [Verdict(f"{kind}_repeats", "doubtful", f"{text}; {remedy_for(sequence, found)}")]
 

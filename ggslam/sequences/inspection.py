@@ -42,8 +42,7 @@ class InspectionTuning(Tuning):
 
 
 VOID_TEXT = (
-    "id 255 stands in most masks and is far from all other ids: it seems to mean that nobody decided what is there; "
-    "`void_id` 255 leaves it out"
+    "id 255 stands in most masks and is far from all other ids: it seems to mean no label; `void_id` 255 leaves it out"
 )
 
 OTHER_SCENES = {"unrelated", "color_noise", "depth_noise", "color_repeats", "depth_repeats"}
@@ -280,7 +279,7 @@ def _check_camera(report: SequenceReport, sequence: Sequence, frames: list[Frame
         text = (
             f"intrinsics are suspicious: with fx {report.native_camera.fx * doubt.likely:.0f} instead of "
             f"{report.native_camera.fx:.0f} distances of points seen twice agree to {doubt.best:.2%}, so only to "
-            f"{doubt.error:.2%}; check fx and fy, and whether they are of this size of images"
+            f"{doubt.error:.2%}; check fx and fy, and whether they are for this image size"
         )
         report.judge([Verdict("intrinsics", "wrong", text)])
 

@@ -30,7 +30,7 @@ class NoiseTuning(Tuning):
     """Fewest frames of a recording for its tracking to be judged."""
 
 
-REMEDY = "look how the images were written: order of bytes, 8 or 16 bits, compression, a loose cable"
+REMEDY = "check how the images were written: order of bytes, 8 or 16 bits, compression, a loose cable"
 
 
 def judge_noise(thumbnails: list[Thumbnail], numbers: range) -> list[Verdict]:

@@ -85,7 +85,7 @@ def _take_scale(recording: Recording, source: str, scale: float) -> None:
     told = recording.depth_scale
     if not np.isclose(told, scale, rtol=1e-3):
         recording.warnings.append(
-            f"{source} says {scale:g} depth units a metre, the recording ({recording.format}) {told:g}: {scale:g} is "
-            "used; `depth_scale` decides"
+            f"{source} gives {scale:g} depth units per metre, the recording ({recording.format}) {told:g}: {scale:g} "
+            "is used; `depth_scale` decides"
         )
     recording.depth_scale = scale

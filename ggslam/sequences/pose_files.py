@@ -34,7 +34,7 @@ def invalid_pose_reason(T: np.ndarray) -> str | None:
     with np.errstate(over="ignore", invalid="ignore"):  # numbers that no pose holds
         valid = is_valid_pose(T)
     if not valid:
-        return "pose is not a rigid transform (its 3x3 part is no rotation)"
+        return "pose is not a rigid transform (its 3x3 part is not a rotation)"
     return None
 
 
@@ -223,7 +223,7 @@ def take_rows_by_time(recording: Recording, rows: PoseRows) -> None:
             f"{span(stamps[known])}, images {span(images)}"
         )
     if unit != "s":
-        recording.warnings.append(f"{name}: its times are read as {unit}, which goes with the times of the images")
+        recording.warnings.append(f"{name}: its times are read as {unit}, which agrees with the times of the images")
     recording.take_poses(poses, name, rows.problems)
 
 

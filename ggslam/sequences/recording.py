@@ -15,7 +15,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.depth_kind import PLAIN, DepthKind
-from ggslam.system.plurals import plural
+from ggslam.system.plurals import word_for
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted_text
 
@@ -166,7 +166,7 @@ class ReadOptions:
         """
         if self.own_camera is not None:
             return None
-        return _read_with_hint(read, "`camera` or `intrinsics` tell the camera instead")
+        return _read_with_hint(read, "give them with `camera` or `intrinsics`")
 
     def recorded_scale(self, read: Callable[[], float]) -> float:
         """Units of depth images per metre: what a user tells as such, else what `read` finds, else what a camera file
@@ -284,7 +284,7 @@ class Recording:
         self.poses, self.pose_source = poses, source
         without = len(poses) - known
         if without or reasons:
-            have = plural(without, "has", "have")
+            have = word_for(without, "has", "have")
             self.warnings.append(
                 f"{source}: {without} of {len(poses)} frames {have} no true pose; scores are over the other "
                 f"{known}{first}"

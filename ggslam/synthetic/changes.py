@@ -98,7 +98,7 @@ def room_at_two_visits(seed: int, count: int) -> tuple[Scene, Scene, list[MadeCh
             _move(second, instance, T)
             made.append(MadeChange("moved", instance, names[instance], middle, T))
     if len(made) < count:
-        raise SequenceError(f"changes: no more than {len(made)} of {count} things found a free place")
+        raise SequenceError(f"changes: no more than {len(made)} of {count} objects found a free place")
     return first, second, made
 
 

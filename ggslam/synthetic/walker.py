@@ -138,7 +138,7 @@ def _find_way(setting: Setting, rng: np.random.Generator) -> _Way:
         if most >= WalkerTuning.enough:
             break
     if best is None:
-        raise SequenceError("movers: nobody can walk through what the camera sees")
+        raise SequenceError("movers: there is no way for a person through what the camera sees")
     return best
 
 

@@ -87,7 +87,7 @@ def decode_image(
     """
     size = claimed_size(content)
     if size is None:
-        raise error(f"{place}: cannot be decoded as an image: its header tells no size ({len(content)} bytes)")
+        raise error(f"{place}: cannot be decoded as an image: its header gives no size ({len(content)} bytes)")
     width, height = size
     most = min(most_pixels, PictureLimits.max_pixels)
     if width * height > most:

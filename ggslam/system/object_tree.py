@@ -285,7 +285,7 @@ class _Restorer:
         value = there if fill else object.__new__(kind)
         self._known.append(value)
         if not fill and rule.not_saved - attributes.keys() - set(_class_defaults(kind)):
-            raise ValueError(f"{name}: there is none to fill")
+            raise ValueError(f"{name}: no object to fill")
         if fill and rule.save is None and (missing := sorted(vars(value).keys() - rule.not_saved - attributes.keys())):
             raise ValueError(f"{kind.__name__}: {missing[0]} is missing")
         self._filled.append((value, {name: Example.of(old) for name, old in vars(value).items()} if fill else {}))

@@ -5,6 +5,7 @@ what cannot be used is refused by name."""
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -338,12 +339,12 @@ def test_a_depth_scale_that_contradicts_the_recording_is_said(make: Callable[[st
     other = make("scannet")
     sequence = open_sequence(other, camera=path)
     assert sequence.depth_scale == 5000
-    assert any("orb.yaml says 5000 depth units a metre, the recording (scannet) 1000: 5000 is used" in text
+    assert any(re.search(r"orb\.yaml .*\b5000 .*\(scannet\) 1000: 5000\b", text)
                for text in sequence.warnings)  # fmt: skip
     told = open_sequence(other, camera=path, depth_scale=1000)
-    assert told.depth_scale == 1000 and not any("units a metre" in text for text in told.warnings)
+    assert told.depth_scale == 1000 and not any("depth units" in text for text in told.warnings)
     (same / "camera.yaml").write_text((same / "camera.yaml").read_text().replace("5000", "1000"))
-    assert "says 5000 depth units a metre, the recording (folder) 1000" in open_sequence(same, camera=path).warnings[0]
+    assert re.search(r"\b5000 depth units .*\(folder\) 1000\b", open_sequence(same, camera=path).warnings[0])
 
 
 @pytest.mark.parametrize("name", ["orb-slam2", "ros plumb_bob", "open3d", "colmap opencv"])

@@ -61,7 +61,7 @@ def test_headers_without_times(tmp_path: Path, storage: str) -> None:
     np.testing.assert_allclose(np.diff(sequence.timestamps), 1 / 30, atol=1e-6)
     assert largest_error_mm(path) == pytest.approx(0, abs=1e-3)
     told = succeed("inspect", path)
-    assert "at 30.0 Hz (when messages were recorded: their headers tell no time)" in told and "nan" not in told
+    assert "at 30.0 Hz (when messages were recorded: their headers have no time)" in told and "nan" not in told
 
 
 def test_one_frame_has_no_rate(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ SHIFTED = "1 0 0 {x} 0 1 0 2 0 0 1 3"
 
 
 @pytest.mark.parametrize(
-    ("wrong", "reason"), [("2 0 0 0 0 2 0 0 0 0 2 0", "no rotation"), ("1 0 0 nan 0 1 0 0 0 0 1 0", "NaN")]
+    ("wrong", "reason"), [("2 0 0 0 0 2 0 0 0 0 2 0", "rotation"), ("1 0 0 nan 0 1 0 0 0 0 1 0", "NaN")]
 )
 def test_a_row_that_is_no_pose_is_not_a_number(tmp_path: Path, wrong: str, reason: str) -> None:
     path = tmp_path / "poses.txt"

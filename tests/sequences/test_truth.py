@@ -66,7 +66,7 @@ def test_units_of_time(make: Make, unit: str) -> None:
     sequence = open_sequence(folder)
     np.testing.assert_allclose(truth_of(sequence), ALL, atol=1e-4)
     assert sequence.warnings == ([] if unit == "s" else [
-        f"poses.txt: its times are read as {unit}, which goes with the times of the images"
+        f"poses.txt: its times are read as {unit}, which agrees with the times of the images"
     ])  # fmt: skip
 
 

@@ -81,7 +81,7 @@ def test_markers_without_a_length_do_not_hide_the_size(hidden: bytes) -> None:
                                      PNG_SIGNATURE + bytes(40), b"\xff\xd8" + bytes(40), encoded(".bmp")])  # fmt: skip
 def test_what_tells_no_size_is_not_decoded(content: bytes) -> None:
     assert claimed_size(content) is None
-    with pytest.raises(FormatError, match="tells no size"):
+    with pytest.raises(FormatError, match="no size"):
         decode_image("x", content, cv2.IMREAD_COLOR)
 
 

@@ -29,5 +29,5 @@ def find_camera_file(folder: Path) -> Path | None:
     found = [folder / name for name in USUAL_NAMES if (folder / name).is_file()]
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
-        raise SequenceError(f"{folder}: holds {names}; which is the colour camera's is told by `camera`")
+        raise SequenceError(f"{folder}: holds {names}; choose the colour camera's with `camera`")
     return found[0] if found else None

@@ -63,7 +63,7 @@ def _description(words: list[str]) -> str:
 def _of_colmap(place: object, rows: list[list[str]]) -> Entries:
     """The camera of cameras.txt: rows CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS; several that differ are refused."""
     if len({tuple(row[1:]) for row in rows}) > 1:
-        raise SequenceError(f"{place}: holds {len(rows)} cameras; leave only the one that is meant in the file")
+        raise SequenceError(f"{place}: holds {len(rows)} cameras; keep only the right one in the file")
     _, model, *words = rows[0]
     if model not in COLMAP_MODELS:
         raise SequenceError(f"{place}: COLMAP's model {model} is not supported; known are {', '.join(COLMAP_MODELS)}")

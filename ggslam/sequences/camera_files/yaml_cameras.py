@@ -43,7 +43,7 @@ def from_yaml(place: object, settings: Entries) -> Entries | None:
     chain = {key: value for key, value in settings.items() if re.fullmatch(r"cam\d+", str(key))}
     if chain:
         if len(chain) > 1:
-            raise SequenceError(f"{place}: holds {', '.join(chain)}; leave only the camera that is meant in the file")
+            raise SequenceError(f"{place}: holds {', '.join(chain)}; keep only the right camera in the file")
         [(name, camera)] = chain.items()
         return _of_kalibr(f"{place}, {name}", camera if isinstance(camera, dict) else {})
     if isinstance(settings.get("intrinsics"), list):
@@ -107,7 +107,7 @@ def _refuse_part(place: object, settings: Entries) -> None:
     cut = isinstance(roi, dict) and any(roi.get(key) for key in ("x_offset", "y_offset", "width", "height"))
     binned = any(isinstance(settings.get(key), int) and settings[key] > 1 for key in ("binning_x", "binning_y"))
     if cut or binned:
-        raise SequenceError(f"{place}: is of images that are cut out or binned (roi, binning_x): not supported")
+        raise SequenceError(f"{place}: is for cropped or binned images (roi, binning_x), which is not supported")
 
 
 def _of_kalibr(place: str, camera: Entries) -> Entries:

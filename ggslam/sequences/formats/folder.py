@@ -193,7 +193,7 @@ def _add_poses(recording: Recording, path: Path) -> None:
         take_rows_by_number(recording, rows, rows.stamps)
     elif nominal:
         raise SequenceError(
-            f"{path}: expected {count} poses, one a frame, found {len(rows.poses)} (and the images tell no time to "
+            f"{path}: expected {count} poses, one a frame, found {len(rows.poses)} (and the images have no times to "
             "pair them by)"
         )
     else:

@@ -94,7 +94,8 @@ def _depth_size(archive: Archive, metadata: dict[str, Any], place: str, colors: 
         rows = round((count * height / width) ** 0.5) if width > 0 and height > 0 else 0
         if not 0 < 4 * count <= Record3dTuning.max_image_bytes or rows < 1 or rows * (count // rows) != count:
             reason = (
-                f"the {count} numbers of {name} are no image of the shape of the colour image, {width:g}x{height:g}"
+                f"the {count} numbers of {name} do not make an image with the aspect of the colour image, "
+                f"{width:g}x{height:g}"
             )
             break
         return rows, count // rows
@@ -150,7 +151,7 @@ def _decompress(place: str, content: bytes, most: int) -> bytes:
     decompress = lzfse_decompress()
     # The decompressor grows its memory without end for streams that do not end, and for as much as the others hold.
     if not content.endswith(END):
-        raise SequenceError(f"{place}: LZFSE stream is truncated or none ({len(content)} bytes)")
+        raise SequenceError(f"{place}: not an LZFSE stream, or a truncated one ({len(content)} bytes)")
     try:
         claimed = claimed_bytes(content)
         if claimed > most:

@@ -128,7 +128,7 @@ def _times(bag: Bag, topics: Topics) -> tuple[np.ndarray, np.ndarray, str]:
             raise SequenceError(f"{bag.path}: topic {topic} holds no messages")
     if color.any() and depth.any():
         return color, depth, f"headers of {topics.color}"
-    source = "when messages were recorded: their headers tell no time"
+    source = "when messages were recorded: their headers have no time"
     return bag.log_times(topics.color), bag.log_times(topics.depth), source
 
 

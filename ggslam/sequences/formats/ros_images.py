@@ -78,7 +78,9 @@ def color_image(place: str, message: Any) -> np.ndarray:
         return decode_color(place, content)
     encoding = message.encoding.lower()
     if encoding not in COLOR:
-        raise SequenceError(f"{place}: encoding {message.encoding} is no colour that is known ({', '.join(COLOR)})")
+        raise SequenceError(
+            f"{place}: encoding {message.encoding} is not a supported colour encoding ({', '.join(COLOR)})"
+        )
     if COLOR[encoding][0] == 2 and message.width % 2:
         raise SequenceError(f"{place}: {message.encoding} needs images of even width, found {message.width}")
     channels, conversion = COLOR[encoding]
@@ -98,7 +100,9 @@ def depth_image(place: str, message: Any) -> np.ndarray:
         return _compressed_depth(place, message)
     encoding = message.encoding.lower()
     if encoding not in DEPTH:
-        raise SequenceError(f"{place}: encoding {message.encoding} is no depth that is known ({', '.join(DEPTH)})")
+        raise SequenceError(
+            f"{place}: encoding {message.encoding} is not a supported depth encoding ({', '.join(DEPTH)})"
+        )
     dtype = DEPTH[encoding].newbyteorder(">" if message.is_bigendian else "<")
     return np.ascontiguousarray(_rows(place, message, dtype, 1)[..., 0]).astype(dtype.newbyteorder("="), copy=False)
 

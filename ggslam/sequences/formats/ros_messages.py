@@ -61,7 +61,7 @@ class Bag:
             first = next(iter(self._reader.messages()), None)
         if first is not None and bytes(first[2][:4]) == ZSTD_START:
             raise SequenceError(
-                f"{self.path}: its messages are compressed, which metadata.yaml has to tell: open the bag's folder"
+                f"{self.path}: its messages are compressed, as metadata.yaml must say: open the bag's folder"
             )
 
     def stamps(self, topic: str) -> np.ndarray:

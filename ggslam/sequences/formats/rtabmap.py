@@ -128,8 +128,8 @@ def _add_poses(recording: Recording, path: Path, calib: Path, first: Path) -> No
     elif rows.stamps is None or recording.time_source != OF_NAMES:
         if rows.stamps is not None and len(rows.poses) != len(recording.files):
             raise SequenceError(
-                f"{path}: expected {len(recording.files)} poses, one an image, found {len(rows.poses)}; their ids tell "
-                "which is whose (format 11 of rtabmap-export)"
+                f"{path}: expected {len(recording.files)} poses, one an image, found {len(rows.poses)}; format 11 "
+                "of rtabmap-export names the image of each pose"
             )
         take_rows(recording, rows)
     else:
@@ -143,7 +143,7 @@ def _of_camera(rows: PoseRows, value: Any) -> PoseRows:
         raise SequenceError(f"{rows.path}: expected 12 numbers of 'local_transform', found {numbers.size}")
     T_robot_camera[: numbers.size // 4] = numbers.reshape(-1, 4)
     if not is_valid_pose(T_robot_camera):
-        raise SequenceError(f"{rows.path}: 'local_transform' of the camera is no rigid transform")
+        raise SequenceError(f"{rows.path}: 'local_transform' of the camera is not a rigid transform")
     return replace(rows, poses=rows.poses @ T_robot_camera)
 
 

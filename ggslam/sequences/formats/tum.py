@@ -101,12 +101,12 @@ class TumFormat:
                 "525 525 319.5 239.5 of 640x480 images without distortion are used; `intrinsics` or `camera` tell "
                 "others"
             )
-            return DEFAULT_CALIBRATION, None, "default: the folder's name tells no camera"
+            return DEFAULT_CALIBRATION, None, "default: the folder's name names no camera"
         name, number = named[0]
         source = f"freiburg{number}, by the name '{name}'"
         if named[-1][1] != number:
             source += f" (the folder it leads to says freiburg{named[-1][1]})"
-            warnings.append(f"intrinsics are of {source}; `intrinsics` or `camera` tell others")
+            warnings.append(f"intrinsics are of {source}; give others with `intrinsics` or `camera`")
         calibration, distortion = CALIBRATIONS[number]
         return calibration, None if distortion is None else np.array(distortion), source
 
