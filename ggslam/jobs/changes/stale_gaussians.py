@@ -15,7 +15,7 @@ import torch
 
 from ggslam.errors import GgslamError
 from ggslam.jobs.merge.sources import MergeSource
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.merging.coverage import PlacedRun
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.gaussian_map import GaussianMap
@@ -39,7 +39,7 @@ class StaleGaussianTuning(Tuning):
 def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
     """Numbers of the keyframes of a run's own recording. A run that began in another's map has that one's, too: they
     saw what was there before. All of them if none is its own."""
-    own = [number for number, keyframe in enumerate(record.keyframes) if keyframe.frame != ELSEWHERE]
+    own = [number for number, keyframe in enumerate(record.keyframes) if keyframe.frame != FROM_EARLIER_RUN]
     return own or range(len(record.keyframes))
 
 

@@ -15,7 +15,7 @@ from ggslam.jobs.edit.edit import KINDS, Edit
 from ggslam.jobs.edit.edited_file import edit_file
 from ggslam.jobs.edit.edited_run import save_edited
 from ggslam.jobs.edit.pictures import before_and_after
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
     Change,
@@ -190,7 +190,7 @@ class _Source:
             raise RunFolderError(f"{folder.path / record.FILE}: it lists no keyframes or no tracked frames")
         # Keyframes of the map that the run began with have no images here.
         views = [
-            CameraView(recording.camera, inverse(k.T_world_camera), None) if k.frame == ELSEWHERE
+            CameraView(recording.camera, inverse(k.T_world_camera), None) if k.frame == FROM_EARLIER_RUN
             else CameraView(recording.camera_of(k.frame), inverse(k.T_world_camera), k.frame)
             for k in record.keyframes
         ]  # fmt: skip

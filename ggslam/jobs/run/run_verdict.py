@@ -19,7 +19,7 @@ from ggslam.jobs.run.grades import (
     grade_tracked,
 )
 from ggslam.jobs.run.map_fit import MapFit
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.objects.table import ObjectTable
 from ggslam.rendering.exposure import change_of
 from ggslam.runs.records.metrics import MetricsRecord
@@ -183,7 +183,7 @@ def _slower(result: SlamResult, look: str) -> str:
 
 def _start_later(result: SlamResult) -> str:
     """To begin where the exposure is that of most keyframes; "" if that does not help."""
-    ours = [k for k in result.keyframes if k.frame_index != ELSEWHERE]
+    ours = [k for k in result.keyframes if k.frame_index != FROM_EARLIER_RUN]
     gains = np.array([change_of(k.exposure) for k in ours])
     if not len(gains):
         return ""
