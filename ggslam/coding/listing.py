@@ -21,7 +21,7 @@ from ggslam.coding.sequence_parameters import (
 )
 from ggslam.coding.user_data import read_user_data
 from ggslam.errors import FormatError
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 
 _MATRICES = {MATRIX_IDENTITY: " as G, B, R", MATRIX_BT709: " as Y, Cb, Cr (BT.709)", MATRIX_YCGCO: " as Y, Cg, Co"}
 _ENCODINGS = {RAHT: "RAHT", PREDICTING: "predicting transform", LIFTING: "lifting transform", RAW: "raw values"}
@@ -147,7 +147,7 @@ class _Lister:
         self.listing.slices += 1
         corner = " ".join(str(v) for v in header.grid_origin)
         where = "" if not header.axes else f" in a cube of 2^{header.depth} voxels"
-        return f"slice {header.slice_id}: {counted(header.points, 'point')}{where} at {corner}", header.points
+        return f"slice {header.slice_id}: {quantity(header.points, 'point')}{where} at {corner}", header.points
 
     def _attribute_unit(self, unit: Unit) -> tuple[str, str]:
         if self._sequence is None:

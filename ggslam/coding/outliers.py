@@ -15,7 +15,7 @@ import numpy as np
 
 from ggslam.coding.geometry_syntax import MAX_DEPTH
 from ggslam.coding.settings import CodecSettings
-from ggslam.system.plurals import agreeing, counted
+from ggslam.system.plurals import plural, quantity
 from ggslam.system.tuning import Tuning
 
 
@@ -78,12 +78,12 @@ class Reach:
         notes = []
         if self.left_out:
             notes.append(
-                f"left out {counted(self.left_out, what)} far outside the others ({at}; the others span {side:.4g}): "
+                f"left out {quantity(self.left_out, what)} far outside the others ({at}; the others span {side:.4g}): "
                 "the grid does not reach so far"
             )
         if self.far > self.left_out:
-            lie = agreeing(self.far - self.left_out, "lies", "lie")
-            few = counted(self.far - self.left_out, what)
+            lie = plural(self.far - self.left_out, "lies", "lie")
+            few = quantity(self.far - self.left_out, what)
             notes.append(f"{few} {lie} far outside the others ({at}); the voxels are those that suit the others")
         return notes
 

@@ -18,7 +18,7 @@ from ggslam.formats.writer import PosedViews, Takes, Writer
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, matrix_to_quaternion
 from ggslam.system.atomic import make_empty_folder, make_folder, write_bytes, write_text
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 
 MODEL = "sparse/0"
 _PINHOLE: Final = 1
@@ -86,7 +86,7 @@ def _write(folder: Path, posed: PosedViews) -> str:
         posed.cloud.points, posed.cloud.colors,
     )  # fmt: skip
     write_text(folder / MODEL / "test.txt", "".join(f"{v.name}\n" for v in views if v.held_out))
-    return f"wrote {folder}: {posed.text(views)}, {counted(len(posed.cloud), 'point')}, COLMAP"
+    return f"wrote {folder}: {posed.text(views)}, {quantity(len(posed.cloud), 'point')}, COLMAP"
 
 
 WRITER = Writer("colmap", (), Takes.VIEWS, "images, poses and points, a COLMAP folder", _write)

@@ -23,7 +23,7 @@ from ggslam.formats.splat_columns import MAX_FLOAT_ID
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import write_bytes
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 EXTRAS = ("object_id", "identity")
@@ -221,7 +221,7 @@ def _write(path: Path, splats: Splats) -> str:
         classifier = path.with_name(f"{path.stem}_classifier.npz")
         write_bytes(classifier, splats.classifier().to_bytes())
         beside = f" with object ids and identities, and {classifier.name}"
-    return f"wrote {path}: {counted(splats.count, 'Gaussian')}{splats.note or beside}"
+    return f"wrote {path}: {quantity(splats.count, 'Gaussian')}{splats.note or beside}"
 
 
 WRITER = Writer(

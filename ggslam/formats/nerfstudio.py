@@ -20,7 +20,7 @@ from ggslam.formats.point_ply import write_metric_points
 from ggslam.formats.writer import PosedViews, Takes, Writer
 from ggslam.scene.camera import Camera
 from ggslam.system.atomic import make_empty_folder, write_text
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MOST_DEPTH: Final = 65.535
@@ -89,7 +89,7 @@ def _write(folder: Path, posed: PosedViews) -> str:
         TransformsFrame(f"images/{v.name}", f"depth/{v.name}", v.T_world_camera, v.held_out, v.camera) for v in views
     ]
     write_transforms(folder / "transforms.json", frames, "points.ply")
-    return f"wrote {folder}: {posed.text(views)} with depth, {counted(len(posed.cloud), 'point')}, nerfstudio"
+    return f"wrote {folder}: {posed.text(views)} with depth, {quantity(len(posed.cloud), 'point')}, nerfstudio"
 
 
 WRITER = Writer("nerfstudio", (), Takes.VIEWS, "images, depth, poses and points, a nerfstudio folder", _write)

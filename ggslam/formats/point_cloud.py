@@ -23,7 +23,7 @@ from ggslam.formats.positions import placed_rows
 from ggslam.formats.voxel_cloud import join_clouds
 from ggslam.formats.writer import SurfacePoints, Takes, Writer
 from ggslam.scene.gaussian_map import SH_C0
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.untrusted_files import open_untrusted
 
 COLORS = ("red", "green", "blue")
@@ -249,7 +249,7 @@ def _write_pcd(path: Path, points: SurfacePoints) -> str:
     if cloud.object_id is not None:
         attributes["object_id"] = cloud.object_id
     write_point_cloud(path, cloud.points.astype("f4"), attributes)
-    return f"wrote {path}: {counted(len(cloud), 'point')} on a {points.voxel_size:g} m grid"
+    return f"wrote {path}: {quantity(len(cloud), 'point')} on a {points.voxel_size:g} m grid"
 
 
 WRITER = Writer("pcd", (".pcd",), Takes.POINTS, "coloured points with object ids", _write_pcd)

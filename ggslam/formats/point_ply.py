@@ -22,7 +22,7 @@ from ggslam.formats.point_sampling import sample_points
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.formats.writer import SurfacePoints, Takes, Writer
 from ggslam.system.atomic import make_folder, write_failure
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 __all__ = ["GRID_FILE", "METRIC_FILE", "VoxelCloud", "grid_positions", "read_points", "sample_points",
@@ -205,7 +205,7 @@ def _write(folder: Path, points: SurfacePoints) -> str:
     make_folder(folder)
     count = write_points_in_parts(folder, points.clouds)
     names = f"{METRIC_FILE} and {GRID_FILE}"
-    return f"wrote {folder}/{names}: {counted(count, 'point')} on a {points.voxel_size:g} m grid"
+    return f"wrote {folder}/{names}: {quantity(count, 'point')} on a {points.voxel_size:g} m grid"
 
 
 WRITER = Writer("points", (), Takes.POINTS, "coloured points, PLY in metres and in cells of a grid", _write)

@@ -26,7 +26,7 @@ from ggslam.formats.splat_levels import coarser
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.atomic import make_empty_folder, write_text
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 INDEX = "lod-meta.json"
@@ -238,7 +238,7 @@ def _write(path: Path, splats: Splats) -> str:
         folder, cells, splats.count, splats.names, lambda done: splats.done(done, len(cells))
     )  # fmt: skip
     levels = " + ".join(map(str, size.counts))
-    return f"wrote {folder / INDEX}: {levels} Gaussians in {counted(size.chunks, 'SOG')}, {size.bytes / 1e6:.1f} MB"
+    return f"wrote {folder / INDEX}: {levels} Gaussians in {quantity(size.chunks, 'SOG')}, {size.bytes / 1e6:.1f} MB"
 
 
 WRITER = Writer(

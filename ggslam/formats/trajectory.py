@@ -23,7 +23,7 @@ from ggslam.formats.writer import Takes, Writer
 from ggslam.scene.poses import is_valid_pose, matrix_to_quaternion, orthonormalize, quaternion_to_matrix
 from ggslam.system.atomic import write_text
 from ggslam.system.clock_units import EPOCH_DIGITS, UNITS
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.untrusted_files import read_untrusted_text
 
 _G2O_TAGS = ("VERTEX_", "EDGE_", "PARAMS_", "FIX")
@@ -249,7 +249,7 @@ def _pose(where: str, position: np.ndarray, quaternion: np.ndarray) -> np.ndarra
 
 def _write(path: Path, trajectory: Trajectory) -> str:
     written = write_tum(path, trajectory.timestamps, trajectory.T_world_camera)
-    return f"wrote {path}: {counted(written, 'pose')}"
+    return f"wrote {path}: {quantity(written, 'pose')}"
 
 
 WRITER = Writer("trajectory", (".txt",), Takes.TRAJECTORY, "the camera's poses, TUM", _write, any_name=True)

@@ -24,7 +24,7 @@ from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 
 
 class Takes(Enum):
@@ -75,8 +75,8 @@ class Splats:
     def text(self, path: Path, with_ids: bool = False, size: int | None = None) -> str:
         """What was written into a file, for people; `size` is in bytes, None: the file's."""
         size = path.stat().st_size if size is None else size
-        ids = "" if self.names is None or not with_ids else f" with the ids of {counted(len(self.names), 'object')}"
-        return f"wrote {path}: {counted(self.count, 'Gaussian')}{self.note}{ids}, {size / 1e6:.1f} MB"
+        ids = "" if self.names is None or not with_ids else f" with the ids of {quantity(len(self.names), 'object')}"
+        return f"wrote {path}: {quantity(self.count, 'Gaussian')}{self.note}{ids}, {size / 1e6:.1f} MB"
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ class SurfaceMesh:
 
     def text(self, path: Path) -> str:
         """What was written into a file, for people."""
-        size = f"{counted(len(self.vertices), 'vertex', 'vertices')}, {counted(len(self.triangles), 'triangle')}"
-        return f"wrote {path}: {size}, {counted(self.objects, 'object')}, from {self.origin}"
+        size = f"{quantity(len(self.vertices), 'vertex', 'vertices')}, {quantity(len(self.triangles), 'triangle')}"
+        return f"wrote {path}: {size}, {quantity(self.objects, 'object')}, from {self.origin}"
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class PosedViews:
         """What was written, for people."""
         held_out = sum(view.held_out for view in views)
         sizes = dict.fromkeys(f"{view.camera.width}x{view.camera.height}" for view in views)
-        return f"{counted(len(views), 'image')} of {', '.join(sizes)} ({held_out} held out)"
+        return f"{quantity(len(views), 'image')} of {', '.join(sizes)} ({held_out} held out)"
 
 
 @dataclass(frozen=True)

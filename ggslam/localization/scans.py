@@ -19,7 +19,7 @@ from ggslam.errors import NoPointsError, SequenceError
 from ggslam.formats.cloud_files import NOT_READ, read_cloud_file
 from ggslam.formats.pcd import read_viewpoint
 from ggslam.formats.trajectory import read_trajectory
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 _SUFFIXES = (".bin", ".npy", ".pcd")
@@ -132,7 +132,7 @@ def _poses(folder: Path, files: list[Path]) -> tuple[np.ndarray, np.ndarray | No
         if (folder / name).is_file():
             found = read_trajectory(folder / name)
             if len(found) != count:
-                raise SequenceError(f"{folder / name}: {counted(len(found), 'pose')} for {counted(count, 'scan')}")
+                raise SequenceError(f"{folder / name}: {quantity(len(found), 'pose')} for {quantity(count, 'scan')}")
             by_row = np.array_equal(found.timestamps, np.arange(count))
             return found.timestamps / (ScanTuning.rate if by_row else 1.0), found.T_world_camera
     return np.arange(count) / ScanTuning.rate, _viewpoints(files)

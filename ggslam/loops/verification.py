@@ -139,7 +139,7 @@ def _judge(
     old: LocalMap, new: LocalMap, registration: Registration, refined: Refinement, agreeing: int,
     sigma: Callable[[float], float], settings: VerificationSettings,
 ) -> Verification:  # fmt: skip
-    """What the geometry says, `agreeing` of the inliers being where the refined pose has them."""
+    """What the geometry says, `plural` of the inliers being where the refined pose has them."""
     depth = float(np.median(new.points[:, 2])) if len(new.points) else 0.0
     noise = sigma(depth)
     overlap = voxel_overlap(

@@ -11,7 +11,7 @@ from ggslam.runs.checkpoints import has_checkpoints
 from ggslam.runs.manifest import Problem, files_in, names_in, sum_problems
 from ggslam.runs.records.run_json import RunRecord
 from ggslam.system.folder_lock import folder_lock, writer_of
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.staging import finish_saving
 
 
@@ -45,7 +45,7 @@ class Verification:
             lines = [f"{self.path}: no manifest: it was made before there were any; its files cannot be checked"]
         else:
             total = sum(record.bytes for record in files.values()) / 1e6
-            lines = [f"{self.path}: {counted(len(files), 'file')}, {total:.1f} MB"]
+            lines = [f"{self.path}: {quantity(len(files), 'file')}, {total:.1f} MB"]
         lines += [f"  {problem}" for problem in self.problems]
         lines += [f"  {name}: not in the manifest" for name in self.others]
         lines += [f"  incomplete: {note}" for note in mark.notes() if not mark.complete and "edited" not in note]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.poses import se3_exp, so3_log
-from ggslam.system.plurals import agreeing
+from ggslam.system.plurals import plural
 from ggslam.system.tuning import Tuning
 
 
@@ -89,7 +89,7 @@ def _left_out(images: int, used: int, names: tuple[str, str], few: float) -> lis
     count = images - used
     if count <= few * images:
         return []
-    have, are = agreeing(count, "has", "have"), agreeing(count, "is", "are")
+    have, are = plural(count, "has", "have"), plural(count, "is", "are")
     return [
         f"{count} of {images} colour images ({names[0]}) {have} no depth image of the same time ({names[1]}) within "
         f"{PairingTuning.tolerance_s:g} s and {are} left out"

@@ -13,7 +13,7 @@ from ggslam.sequences.recording import ImageFile
 from ggslam.sequences.sequence import Sequence
 from ggslam.sequences.thumbnails import Thumbnail, thumbnail_of
 from ggslam.sequences.verdicts import Verdict
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import FileTuning, read_untrusted
 
@@ -68,7 +68,7 @@ def _judge(sequence: Sequence, thumbnails: list[Thumbnail], kind: str, spans: Sp
     frames = sum(one.last - one.first + 1 for one in found)
     where = numbers_of(sequence, found)
     more = len(found) - HungTuning.max_named
-    where += f" and in {counted(more, 'more place')}" if more > 0 else ""
+    where += f" and in {quantity(more, 'more place')}" if more > 0 else ""
     same, other = ("colour", "depth") if kind == "color" else ("depth", "colour")
     told = f"{frames} of {len(sequence)} frames, {where},"
     if all(one.blank for one in found):

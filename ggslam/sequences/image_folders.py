@@ -12,7 +12,7 @@ from ggslam.errors import SequenceError
 from ggslam.sequences.association import pair_images
 from ggslam.sequences.recording import image_files, last_number
 from ggslam.sequences.stamps import times_of_names
-from ggslam.system.plurals import agreeing, counted
+from ggslam.system.plurals import plural, quantity
 
 OF_NAMES = "names of the images"
 """Where times come from, for reports."""
@@ -92,8 +92,8 @@ def _without_color(folder: Path, depths: list[Path], used: list[Path]) -> list[s
     unused = [path.name for path in depths if path not in taken]
     if not unused:
         return []
-    have, are = agreeing(len(unused), "has", "have"), agreeing(len(unused), "is", "are")
-    what = counted(len(unused), "image")
+    have, are = plural(len(unused), "has", "have"), plural(len(unused), "is", "are")
+    what = quantity(len(unused), "image")
     return [f"{folder}: {what} {have} no colour image and {are} left out; the first: {unused[0]}"]
 
 

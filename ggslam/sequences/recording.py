@@ -15,7 +15,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.sequences.depth_kind import PLAIN, DepthKind
-from ggslam.system.plurals import agreeing
+from ggslam.system.plurals import plural
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted_text
 
@@ -284,7 +284,7 @@ class Recording:
         self.poses, self.pose_source = poses, source
         without = len(poses) - known
         if without or reasons:
-            have = agreeing(without, "has", "have")
+            have = plural(without, "has", "have")
             self.warnings.append(
                 f"{source}: {without} of {len(poses)} frames {have} no true pose; scores are over the other "
                 f"{known}{first}"

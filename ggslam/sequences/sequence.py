@@ -30,7 +30,7 @@ from ggslam.sequences.recording import FrameFiles, Recording
 from ggslam.sequences.stream import ReadAhead
 from ggslam.sequences.valid_pixels import common_fill, fill_of
 from ggslam.system.opencv import opencv_errors
-from ggslam.system.plurals import agreeing, counted
+from ggslam.system.plurals import plural, quantity
 from ggslam.system.tuning import Tuning
 
 OnBadFrame = Literal["error", "skip"]
@@ -140,10 +140,10 @@ class Sequence:
         masked = self._select(selection)
         if masked < len(self) and any(entry.mask is not None for entry in recording.files):
             without = len(self) - masked
-            self.warnings.append(f"{without} of {len(self)} frames {agreeing(without, 'has', 'have')} no mask")
+            self.warnings.append(f"{without} of {len(self)} frames {plural(without, 'has', 'have')} no mask")
         known = [i for i in selection if i in recording.problems]
         if on_bad_frame == "error" and known:
-            more = f" (and {counted(len(known) - 1, 'more damaged frame')})" if len(known) > 1 else ""
+            more = f" (and {quantity(len(known) - 1, 'more damaged frame')})" if len(known) > 1 else ""
             raise SequenceError(recording.problems[known[0]] + more)
         self._geometry = self._measure(scale)
         self._masks = self._mask_reader()

@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ggslam.system.plurals import agreeing, counted
+from ggslam.system.plurals import plural, quantity
 from ggslam.system.tuning import Tuning
 
 Severity = Literal["doubtful", "wrong"]
@@ -195,10 +195,10 @@ def judge_times(timestamps: np.ndarray, nominal: bool = False) -> list[Verdict]:
         ):
             place = "numbers of the images" if nominal else "timestamps"
             length = (
-                counted(round(intervals[longest] / usual) - 1, "frame") if nominal else f"{intervals[longest]:.2f} s"
+                quantity(round(intervals[longest] / usual) - 1, "frame") if nominal else f"{intervals[longest]:.2f} s"
             )
-            are = agreeing(missing, "is", "are")
-            text = f"about {counted(missing, 'frame')} {are} missing in {counted(len(gaps), 'gap')} of the {place}"
+            are = plural(missing, "is", "are")
+            text = f"about {quantity(missing, 'frame')} {are} missing in {quantity(len(gaps), 'gap')} of the {place}"
             text += f" (the longest: {length} before frame {longest + 1})"
             verdicts.append(Verdict("frames_missing", "doubtful", f"{text}; record to a faster disk, or fewer pixels"))
     return verdicts

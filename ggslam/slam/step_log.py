@@ -15,7 +15,7 @@ from ggslam.errors import FormatError
 from ggslam.mapping.mapper import LossSums, Mapper, MapperTimes
 from ggslam.slam.result import SlamTimes, StepReport, TrackedFrame
 from ggslam.system.array_forms import Form
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.process_memory import resident_bytes
 from ggslam.system.savable import savable
 from ggslam.system.untrusted_files import read_untrusted_text
@@ -110,7 +110,7 @@ def read_table(path: Path) -> dict[str, np.ndarray]:
     rows = [line.split(",") for line in lines[1:]]
     for number, row in enumerate(rows, start=2):
         if len(row) != len(names):
-            raise FormatError(f"{path}, line {number}: expected {counted(len(names), 'column')}, found {len(row)}")
+            raise FormatError(f"{path}, line {number}: expected {quantity(len(names), 'column')}, found {len(row)}")
     return {name: _column([row[k] for row in rows]) for k, name in enumerate(names)}
 
 

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 
-def agreeing(count: int, one: str, many: str = "") -> str:
+def plural(count: int, one: str, many: str = "") -> str:
     """The form of a word that goes with a number: `one` with 1, otherwise `many` ("": `one` with an s)."""
     return one if count == 1 else many or f"{one}s"
 
 
-def counted(count: int, one: str, many: str = "") -> str:
-    """A number with its noun: "1 frame", "2 frames"; forms as in `agreeing`."""
-    return f"{count} {agreeing(count, one, many)}"
+def quantity(count: int, one: str, many: str = "") -> str:
+    """A number with its noun: "1 frame", "2 frames"; forms as in `plural`."""
+    return f"{count} {plural(count, one, many)}"

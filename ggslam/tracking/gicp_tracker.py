@@ -13,7 +13,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import orthonormalize
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
@@ -270,6 +270,6 @@ class GicpTracker(Tracker):
             )
         if len(points) < self.settings.align.min_matches:
             needed = self.settings.align.min_matches
-            reason = f"only {counted(len(points), 'point has', 'points have')} depth, {needed} needed"
+            reason = f"only {quantity(len(points), 'point has', 'points have')} depth, {needed} needed"
         pose = self.state.motion.T_world_camera.copy()
         return TrackingResult.by_gicp(pose, TrackingStatus.LOST, reason, points, found)

@@ -24,7 +24,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.keyframe_poses import KeyframePoses
 from ggslam.scene.poses import transform_points
 from ggslam.system.array_forms import Form, PoseForm, check_arrays, check_indices
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import GicpTarget
@@ -153,7 +153,7 @@ class MeasuredSurface:
     def check(self) -> None:
         """Raises FormatError if it names keyframes that it does not have: it may come from a file."""
         if len(self.poses) != len(self):
-            raise FormatError(f"surface: {counted(len(self.poses), 'pose')} of {counted(len(self), 'keyframe')}")
+            raise FormatError(f"surface: {quantity(len(self.poses), 'pose')} of {quantity(len(self), 'keyframe')}")
         check_indices("keyframes of the surface", self.active, len(self))
         check_indices("keyframes of the surface", (number for group in self._joined for number in group), len(self))
 

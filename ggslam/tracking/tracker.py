@@ -14,7 +14,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import orthonormalize
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.savable import savable
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.motion import CameraMotion
@@ -249,7 +249,7 @@ class Tracker(ABC):
         """Before the first keyframe: the pose is given, and all a frame needs is depth to begin with."""
         motion, needed = self.state.motion, self.settings.align.min_matches
         if len(points) < needed:
-            reason = f"only {counted(len(points), 'point has', 'points have')} depth, {needed} needed"
+            reason = f"only {quantity(len(points), 'point has', 'points have')} depth, {needed} needed"
             return TrackingResult(motion.T_world_camera.copy(), TrackingStatus.LOST, 0.0, 0.0, reason, points)
         motion.remember(view, points, self.settings)
         return TrackingResult(motion.T_world_camera.copy(), TrackingStatus.FIRST, 1.0, 0.0, "", points)

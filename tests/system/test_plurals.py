@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from ggslam.system.plurals import agreeing, counted
+from ggslam.system.plurals import plural, quantity
 
 
 def test_words_agree_with_their_number() -> None:
-    assert [counted(n, "frame") for n in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
-    assert [counted(n, "vertex", "vertices") for n in (1, 3)] == ["1 vertex", "3 vertices"]
-    assert [agreeing(n, "has", "have") for n in (0, 1, 2)] == ["have", "has", "have"]
+    assert [quantity(n, "frame") for n in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
+    assert [quantity(n, "vertex", "vertices") for n in (1, 3)] == ["1 vertex", "3 vertices"]
+    assert [plural(n, "has", "have") for n in (0, 1, 2)] == ["have", "has", "have"]

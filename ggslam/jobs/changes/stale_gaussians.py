@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a visit that began in an earlier map still shows of it, although its own depth looked through it.
+"""Removes Gaussians of an earlier map that a visit's own depth looks through.
 
-A visit trains the earlier map further, and things that were carried away fade, but slowly: behind their last haze
-nothing would be seen to have changed.
+A visit that starts in an earlier map trains it further. Objects that were carried away fade slowly, and their haze
+would hide what changed behind them.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def without_stale_gaussians(source: MergeSource, placed: PlacedRun, notes: list[
 
 @dataclass(frozen=True)
 class _Seen:
-    """What keyframes say of n Gaussians.
+    """What a visit's keyframes show of n Gaussians.
 
     Attributes:
         counts: how many look through one, and how many see a surface there...

@@ -23,7 +23,7 @@ from ggslam.slam.parts import make_mapper
 
 @dataclass(frozen=True)
 class TrainedSeams:
-    """What came of it.
+    """Result of training at the seams.
 
     Attributes:
         keyframes: of all runs, as training left their poses.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run whose map is trained further on its keyframes: what `ggslam refine RUN` does."""
+"""Trains the map of a finished run further on its keyframes. `ggslam refine RUN` calls this."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _STAY = ("trajectory.txt", "config.yaml", "sequence.json", "loops.json", STEPS_F
 
 @dataclass
 class RunRefinement:
-    """What came of refining a run.
+    """Result of refining a run.
 
     Attributes:
         folder: the refined run.

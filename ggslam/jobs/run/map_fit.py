@@ -56,7 +56,7 @@ _MEDIAN_OF_NORMAL: Final = 0.6745
 
 @dataclass(frozen=True)
 class MapFit:
-    """Medians over keyframes; `agreeing` and `covered` are means.
+    """Medians over keyframes; `plural` and `covered` are means.
 
     Attributes:
         views: keyframes that were compared.

@@ -23,7 +23,7 @@ from ggslam.rendering.exposure import (
     typical_gain,
     without_exposure,
 )
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 
@@ -71,7 +71,7 @@ class KeyframeExposures:
         """Raises FormatError if these are not of so many keyframes: they may come from a file."""
         counts = [len(self.optimizers), len(self.known), len(self.blind)]
         if counts != [count] * 3:
-            raise FormatError(f"exposures: expected those of {counted(count, 'keyframe')}, found {counts}")
+            raise FormatError(f"exposures: expected those of {quantity(count, 'keyframe')}, found {counts}")
 
     def load(self, count: int) -> None:
         """Starts with so many keyframes of an earlier run, whose exposures are what they are."""

@@ -20,7 +20,7 @@ from ggslam.cuda.streams import let_go
 from ggslam.errors import RenderError
 from ggslam.mapping.losses import LossValues
 from ggslam.mapping.settings import ExposureSettings
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 _RESULTS = torch.Size([len(LossValues.__dataclass_fields__) + 6])
@@ -164,7 +164,7 @@ class KeyframeStates:
     def write_poses(self, T_camera_world: np.ndarray) -> None:
         """Sets the poses of all keyframes [K, 4, 4], as `write_pose`."""
         if len(T_camera_world) != self._count:
-            raise RenderError(f"T_camera_world: expected {counted(self._count, 'pose')}, found {len(T_camera_world)}")
+            raise RenderError(f"T_camera_world: expected {quantity(self._count, 'pose')}, found {len(T_camera_world)}")
         for i, pose in enumerate(T_camera_world):
             self.write_pose(i, pose)
 

@@ -12,7 +12,7 @@ from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.rendering.exposure import frame_weights, identity_exposure, typical_gain
 from ggslam.runs.records.record import Array, NumberOrNone, Record, RecordFile
 from ggslam.slam.result import SlamResult
-from ggslam.system.plurals import agreeing, counted
+from ggslam.system.plurals import plural, quantity
 
 
 class KeyframeRecord(Record):
@@ -93,7 +93,7 @@ class KeyframesRecord(RecordFile):
     def notes(self) -> list[str]:
         """What a user should know, a line each."""
         recovered = sum(f.status == "recovered" for f in self.frames)
-        were = f"{counted(recovered, 'frame')} {agreeing(recovered, 'was', 'were')}"
+        were = f"{quantity(recovered, 'frame')} {plural(recovered, 'was', 'were')}"
         return [f"{were} located only after another start was tried (recovered)"] if recovered else []
 
     def poses(self) -> dict[int, np.ndarray]:

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from ggslam.runs.records.record import Number, Record, RecordFile
 from ggslam.slam.result import SlamResult
-from ggslam.system.plurals import counted
+from ggslam.system.plurals import quantity
 
 
 class LoopEventRecord(Record):
@@ -62,7 +62,7 @@ class LoopsRecord(RecordFile):
             elif stretch.after is not None:
                 reason = reasons.get(stretch.after)
                 ending = f", found again at frame {stretch.after}" + (f": {reason}" if reason else "")
-            length = f"{counted(stretch.frames, 'frame')} ({stretch.seconds:.2f} s)"
+            length = f"{quantity(stretch.frames, 'frame')} ({stretch.seconds:.2f} s)"
             notes.append(f"lost for {length} from frame {stretch.first}{ending}")
         return notes
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from ggslam.runs.records.record import Number, NumberOrNone, Record, RecordFile
 from ggslam.slam.result import SlamResult
-from ggslam.system.plurals import agreeing, counted
+from ggslam.system.plurals import plural, quantity
 from ggslam.system.process_memory import peak_memory_mb
 
 
@@ -70,5 +70,5 @@ class TimingRecord(RecordFile):
         if not self.dropped_frames:
             return []
         first, count = self.dropped_frames[0], len(self.dropped_frames)
-        were = f"{counted(count, 'frame')} {agreeing(count, 'was', 'were')}"
+        were = f"{quantity(count, 'frame')} {plural(count, 'was', 'were')}"
         return [f"{were} dropped because the run fell behind (the first: {first})"]
