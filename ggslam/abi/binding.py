@@ -10,14 +10,14 @@ import ctypes
 import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from ggslam.abi import core, cuda
 from ggslam.abi.headers import Declarations
 from ggslam.errors import CoreInputError, CoreMemoryError, NativeCoreError
 
 _FAULTS = {core.CoreFault.BAD_INPUT: CoreInputError, core.CoreFault.MEMORY_RAN_OUT: CoreMemoryError}
-_LONGEST_MESSAGE = 512
+_LONGEST_MESSAGE: Final = 512
 
 
 def core_hash() -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well motions bring a thing upon what it may be in the other visit."""
+"""Scores how well a motion aligns a candidate with its counterpart in the other visit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class AlignmentScoreTuning(Tuning):
 
 @dataclass(frozen=True)
 class Fit:
-    """A thing before, moved onto a thing after.
+    """A candidate of the older visit, moved onto one of the newer.
 
     Attributes:
         T_new_old: float64 [4, 4], world.
@@ -81,7 +81,7 @@ class Fit:
 
 
 class Judge:
-    """Tells how well motions bring a thing upon what it may be in the other visit."""
+    """Scores motions of a candidate onto its counterpart in the other visit."""
 
     def __init__(
         self, old: Shape, new: Shape, sights_old: Sightings, sights_new: Sightings, settings: ChangeSettings

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What may have changed: objects of a visit's map, or what is gone of it where nobody knows objects."""
+"""Candidates for changes: objects of a visit's map, or parts of it that are gone where objects are unknown."""
 
 from __future__ import annotations
 

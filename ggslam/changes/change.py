@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is told of things between two visits."""
+"""Changes between two visits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ UNCLEAR = "changed, and how cannot be told"
 
 @dataclass(frozen=True)
 class Change:
-    """What became of a thing.
+    """A change of one object.
 
     Attributes:
         kind: see `Kind`; "unseen": of the older visit, and the newer one did not look there, or saw too little to tell.
@@ -42,7 +42,7 @@ class Change:
 
 @dataclass
 class Detection:
-    """What was found.
+    """Result of change detection.
 
     Attributes:
         changes: of all kinds but "unseen", the surest first.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes as they are written: with names, boxes and evidence."""
+"""Changes with names, boxes and evidence, as changes.json holds them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Names = Mapping[int, str | None]
 
 
 class ChangeTable:
-    """What was found, for files and people.
+    """Detected changes, for files and people.
 
     Args:
         found: the changes.

@@ -13,7 +13,7 @@ from ggslam.changes.alignment_score import Fit, Judge
 from ggslam.changes.candidate_views import CandidateViews
 from ggslam.changes.candidates import UNNAMED, Candidate, JudgedSurface, candidates_by_id, candidates_by_surface
 from ggslam.changes.change import HARDLY_SEEN, UNCLEAR, Change, Detection
-from ggslam.changes.motions import MotionTuning
+from ggslam.changes.motions import CandidateMotionTuning
 from ggslam.changes.pose_refinement import PoseRefinement
 from ggslam.changes.rotation_ambiguity import hidden_sector, with_rotation_ambiguity
 from ggslam.changes.settings import ChangeSettings
@@ -187,7 +187,7 @@ class ChangeDetector:
         if not self._has_moved(old, T) or not self._has_moved(old, T := self._place(old, new, T)):
             return None
         placed, fit = turning_angle(T, fit.T_new_old), self._with_turn(old, new, fit)
-        if placed > MotionTuning.same_rotation_rad and fit.turn_known:  # surfaces and pictures tell two turns
+        if placed > CandidateMotionTuning.same_rotation_rad and fit.turn_known:  # surfaces and pictures tell two turns
             fit = replace(fit, as_good_deg=round(float(np.degrees(placed))))
         fit = replace(fit, T_new_old=T)
         return Change("moved", old, new, T, fit, fit.share * min(1.0, max(0.0, 1 - fit.color_apart)))

@@ -52,7 +52,7 @@ class Fate:
 
 
 class MapUpdate:
-    """Tells what two visits' maps have to hold of the state at the newer one.
+    """Decides what the two visits' maps contribute to the latest state.
 
     Args:
         detector: which compared the visits.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The likeliest motions of a thing, by places and colours together, from starts all around."""
+"""Finds the likeliest motions of a candidate by positions and colours, from starts all around."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ggslam.scene.poses import fit_similarity, rotation_about, turning_angle
 from ggslam.system.tuning import Tuning
 
 
-class MotionTuning(Tuning):
+class CandidateMotionTuning(Tuning):
     """How the likeliest motions are searched."""
 
     coarse_points = 150
@@ -48,8 +48,8 @@ def likeliest_motions(old: Shape, new: Shape, up: np.ndarray) -> list[np.ndarray
     level[:, :3, 3] -= float(up @ (new.points.mean(0) - old.points.mean(0))) * up
     motions = np.concatenate([motions, level])
     for count, kept, steps in (
-        (MotionTuning.coarse_points, MotionTuning.coarse_kept, MotionTuning.coarse_steps),
-        (MotionTuning.fine_points, MotionTuning.fine_kept, MotionTuning.fine_steps),
+        (CandidateMotionTuning.coarse_points, CandidateMotionTuning.coarse_kept, CandidateMotionTuning.coarse_steps),
+        (CandidateMotionTuning.fine_points, CandidateMotionTuning.fine_kept, CandidateMotionTuning.fine_steps),
     ):
         one, other = (shape.sample(count, rng) for shape in (old, new))
         tree = cKDTree(other.joint())
@@ -63,7 +63,9 @@ def _unlike(motions: list[np.ndarray], most: int) -> list[np.ndarray]:
     """The first ones that turn otherwise than those before them."""
     chosen: list[np.ndarray] = []
     for T in motions:
-        if len(chosen) < most and all(turning_angle(T, other) > MotionTuning.same_rotation_rad for other in chosen):
+        if len(chosen) < most and all(
+            turning_angle(T, other) > CandidateMotionTuning.same_rotation_rad for other in chosen
+        ):
             chosen.append(T)
     return chosen
 
@@ -74,7 +76,7 @@ def _step(a: Shape, b: Shape, tree: cKDTree, motions: np.ndarray) -> tuple[np.nd
     moved = a.points @ np.swapaxes(motions[:, :3, :3], 1, 2) + motions[:, None, :3, 3]
     shades = np.broadcast_to(ShapeTuning.color_scale_m * a.colors, moved.shape)
     apart, nearest = tree.query(np.concatenate([moved, shades], 2), workers=-1)
-    kept = np.argsort(apart, 1)[:, : max(3, round(MotionTuning.kept_pairs * len(a.points)))]
+    kept = np.argsort(apart, 1)[:, : max(3, round(CandidateMotionTuning.kept_pairs * len(a.points)))]
     partners = np.take_along_axis(nearest, kept, 1)
     found, _ = fit_similarity(a.points[kept], b.points[partners])
     return found, np.take_along_axis(apart, kept, 1).mean(1)

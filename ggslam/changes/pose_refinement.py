@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where exactly a thing lies that moved: each visit's surface is brought to agree with the pictures of the other visit.
+"""Refines the pose of a moved object: the surface of each visit is aligned with the pictures of the other visit.
 
 Surfaces laid upon each other do not tell: of a board one visit saw the front and the other the back, and they are not
 one. Faces, backs and outlines in pictures tell it of every thing, also where visits saw no face in common.

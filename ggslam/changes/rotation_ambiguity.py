@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the turn of a thing that moved is known: round things and plain ones look alike from many sides."""
+"""Whether the rotation of a moved object is known: round and plain objects look alike from many sides."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.changes.alignment_score import Fit, Judge
-from ggslam.changes.motions import MotionTuning
+from ggslam.changes.motions import CandidateMotionTuning
 from ggslam.changes.shape import Shape, Target
 from ggslam.changes.upright import UprightTuning, tilt, turned_about, upright
 from ggslam.scene.poses import transform_points, translation, turning_angle
@@ -122,7 +122,7 @@ def _others(
     for start in starts:
         shifted = target.refine(old, start, judge.settings.fit_m, _SHIFTS)
         for T in (shifted, target.refine(old, shifted, judge.settings.fit_m, upright(up))):
-            if turning_angle(T, fit.T_new_old) > MotionTuning.same_rotation_rad:
+            if turning_angle(T, fit.T_new_old) > CandidateMotionTuning.same_rotation_rad:
                 yield judge.fit(T)
 
 

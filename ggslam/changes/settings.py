@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of change detection, documented."""
+"""Settings of change detection."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surface of a thing, and such a surface as others are brought upon it."""
+"""The surface of an object, and the alignment of other surfaces with it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ShapeTuning(Tuning):
 
 @dataclass(frozen=True)
 class Shape(ColoredSurface):
-    """The surface of a thing, in the world."""
+    """The surface of an object, in the world."""
 
     @staticmethod
     def from_views(points: np.ndarray, colors: np.ndarray, toward: np.ndarray) -> Shape:
@@ -57,7 +57,7 @@ class Shape(ColoredSurface):
 
 
 class Target:
-    """A surface that others are brought upon: point-to-plane, and along the surface by colours.
+    """A surface that others are aligned with: point-to-plane, and along the surface by colours.
 
     Args:
         shape: the surface.

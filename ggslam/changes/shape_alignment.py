@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a thing lay before and after: its surface brought upon itself, by shape and colour."""
+"""Aligns an object's surface before and after its motion, by shape and colour."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ggslam.changes.alignment_score import Fit, Judge
-from ggslam.changes.motions import MotionTuning, likeliest_motions
+from ggslam.changes.motions import CandidateMotionTuning, likeliest_motions
 from ggslam.changes.rotation_ambiguity import upright_starts
 from ggslam.changes.settings import ChangeSettings
 from ggslam.changes.shape import Shape, Target
@@ -75,7 +75,9 @@ def _unlike_fits(fits: list[Fit]) -> list[Fit]:
     """The best fit of each turn."""
     chosen: list[Fit] = []
     for fit in sorted(fits, key=lambda fit: -fit.quality()):
-        if all(turning_angle(fit.T_new_old, other.T_new_old) > MotionTuning.same_rotation_rad for other in chosen):
+        if all(
+            turning_angle(fit.T_new_old, other.T_new_old) > CandidateMotionTuning.same_rotation_rad for other in chosen
+        ):
             chosen.append(fit)
     return chosen
 
@@ -85,7 +87,7 @@ def _stand_up(chosen: Fit, fits: list[Fit], up: np.ndarray) -> Fit:
     upright_ones = [
         fit for fit in fits
         if tilt(fit.T_new_old, up) < UprightTuning.max_tilt_rad
-        and turning_angle(fit.T_new_old, chosen.T_new_old) < MotionTuning.same_rotation_rad
+        and turning_angle(fit.T_new_old, chosen.T_new_old) < CandidateMotionTuning.same_rotation_rad
         and fit.quality() >= chosen.quality() - ShapeAlignmentTuning.upright_gain
     ]  # fmt: skip
     return max(upright_ones, key=Fit.quality, default=chosen)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a visit saw where: pictures of its map from its keyframes, and points looked up in them."""
+"""What a visit saw: its map rendered from its keyframes, and points looked up in these pictures."""
 
 from __future__ import annotations
 

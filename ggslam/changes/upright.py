@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions about the vertical: most things stand, and stay at their height."""
+"""Motions about the vertical: most objects stand and stay at their height."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ import typer
 
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
+from ggslam.system.plurals import quantity
 
 if TYPE_CHECKING:
     from ggslam.changes.change import Change
@@ -63,7 +64,7 @@ def changes(
     console.print(f"took {outcome.seconds:.1f} s", highlight=False)
     if out is not None:
         written = write_changes(outcome, out, old, new)
-        console.print(f"wrote {out}: {len(written)} files", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"wrote {out}: {quantity(len(written), 'file')}", highlight=False, markup=False, soft_wrap=True)
 
 
 def choice_of_ids(ids: IdsName) -> bool | None:

@@ -14,6 +14,7 @@ from ggslam.cli.changes_command import print_changes
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ def _numbers(text: str) -> list[float]:
 
 def _print(c: Comparison, max_distance: float) -> None:
     for name, side in (("A", c.a), ("B", c.b)):
-        console.print(f"{name}: {side.path}, {len(side.points)} points", highlight=False, markup=False)
+        console.print(f"{name}: {side.path}, {quantity(len(side.points), 'point')}", highlight=False, markup=False)
     if c.align != "none":
         console.print(f"A is moved into the frame of B: {_ALIGNED[c.align]}", highlight=False)
     console.print(table(f"overlap within {100 * max_distance:g} cm", _COLUMNS, _overlaps(c)))
@@ -184,7 +185,11 @@ def _trajectory_line(c: Comparison) -> str:
     t = c.trajectory
     if t is None:
         both = c.a.trajectory is not None and c.b.trajectory is not None
-        return f"trajectories: {c.common_poses} poses at common times, too few" if both else "trajectories: not of both"
+        return (
+            f"trajectories: {quantity(c.common_poses, 'pose')} at common times, too few"
+            if both
+            else "trajectories: not of both"
+        )
     return (
         f"trajectories over {t.frames_compared} common frames: RMSE {100 * t.ate_rmse_m:.2f} cm, max "
         f"{100 * t.ate_max_m:.2f} cm (aligned), raw {100 * t.ate_raw_rmse_m:.2f} cm; RPE {100 * t.rpe_trans_m:.2f} cm, "

@@ -11,6 +11,7 @@ import typer
 from ggslam.cli import options
 from ggslam.cli.console import console
 from ggslam.errors import ConfigError
+from ggslam.system.plurals import quantity
 
 EPILOG = """
 [bold]Examples[/]
@@ -69,7 +70,11 @@ def _unpack(source: Path, out: Path, in_part: bool, threads: int | None) -> None
     if in_part:
         raise ConfigError("--slice and --box are for streams; a .ggz is decoded as a whole")
     folder = read_container(source, out, threads=threads)
-    console.print(f"wrote {folder.path}: a run of {folder.timing().gaussians} Gaussians", highlight=False, markup=False)
+    console.print(
+        f"wrote {folder.path}: a run of {quantity(folder.timing().gaussians or 0, 'Gaussian')}",
+        highlight=False,
+        markup=False,
+    )
 
 
 def _unpack_cells(source: Path, out: Path, in_part: bool, threads: int | None) -> None:
@@ -79,7 +84,7 @@ def _unpack_cells(source: Path, out: Path, in_part: bool, threads: int | None) -
     if in_part:
         raise ConfigError("--slice and --box are for streams; a .ggc is decoded as a whole")
     count = decode_store(source, out, threads)
-    console.print(f"wrote {out}: a grid store of {count} Gaussians", highlight=False, markup=False)
+    console.print(f"wrote {out}: a grid store of {quantity(count, 'Gaussian')}", highlight=False, markup=False)
 
 
 def _corners(text: str) -> tuple[list[float], list[float]]:

@@ -15,6 +15,7 @@ from typer.core import TyperCommand
 from ggslam.cli import options
 from ggslam.cli.console import console
 from ggslam.errors import ConfigError
+from ggslam.system.plurals import quantity
 
 if TYPE_CHECKING:
     from ggslam.jobs.edit.edits import Edit
@@ -120,8 +121,11 @@ def edit(
     )  # fmt: skip
     lines = list(outcome.changes)
     if outcome.filling is not None:
-        added = f"inpainted: {outcome.filling.added} Gaussians added, " if outcome.inpainted else ""
-        lines.append(f"{added}{outcome.filling.dropped} Gaussians dropped that were traces of what left its place")
+        added = f"inpainted: {quantity(outcome.filling.added, 'Gaussian')} added, " if outcome.inpainted else ""
+        lines.append(
+            f"{added}{quantity(outcome.filling.dropped, 'Gaussian')} dropped that were left over from moved or "
+            "removed objects"
+        )
     lines += [f"note: {note}" for note in outcome.notes]
     if outcome.folder.path.is_dir():
         lines.append(f"wrote {outcome.folder.path}, {len(outcome.pictures)} pictures of before and after in renders/")

@@ -12,6 +12,7 @@ import typer
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.errors import ConfigError
+from ggslam.system.plurals import quantity
 
 if TYPE_CHECKING:
     from ggslam.coding import CodecSettings, CodingReport
@@ -162,7 +163,8 @@ def _encode_store(
         done = encode_store(source, out, rate.value, settings, engine, ProgressObserver(bar))
     total = out.stat().st_size
     console.print(
-        f"{done.gaussians} Gaussians in {len(done.sizes)} cells: {total} bytes, {total / max(1, done.gaussians):.1f} "
+        f"{quantity(done.gaussians, 'Gaussian')} in {quantity(len(done.sizes), 'cell')}: {quantity(total, 'byte')}, "
+        f"{total / max(1, done.gaussians):.1f} "
         f"a Gaussian; in the store {done.store_bytes}, {done.store_bytes / max(1, total):.1f} times as many; "
         f"{done.seconds:.1f} s", highlight=False,
     )  # fmt: skip
@@ -184,7 +186,7 @@ def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> No
     rows.append(["the file", str(total), f"{total / max(1, done.gaussians):.1f}"])
     console.print(table("contained", ["member", "bytes", "bytes a Gaussian"], rows))
     console.print(
-        f"{done.gaussians} Gaussians; the same files of the run take {done.run_bytes} bytes, "
+        f"{quantity(done.gaussians, 'Gaussian')}; the same files of the run take {quantity(done.run_bytes, 'byte')}, "
         f"{done.run_bytes / max(1, total):.1f} times as many", highlight=False,
     )  # fmt: skip
     _print_loss(rate)
@@ -231,7 +233,7 @@ def _print_report(report: CodingReport, rate: Rate | None) -> None:
     merged = "" if report.points == report.input_points else f", {report.points} after those in one voxel were merged"
     speed = report.input_points / max(report.seconds, 1e-9) / 1e6
     console.print(
-        f"{report.input_points} points{merged}; slices: {len(report.slices)}; {report.seconds:.2f} s, "
+        f"{quantity(report.input_points, 'point')}{merged}; slices: {len(report.slices)}; {report.seconds:.2f} s, "
         f"{speed:.2f} million points/s", highlight=False,
     )  # fmt: skip
     if rate is not None:
@@ -257,11 +259,12 @@ def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], p
 
         study = write_study(cloud, steps, settings, out, plots, show)
     columns = ["step", "points", "bits", "Y dB", "D1 dB", "D2 dB", "enc. s", "dec. s", "J"]
-    title = f"{len(cloud.grid)} points; bits per point of these"
+    title = f"{quantity(len(cloud.grid), 'point')}; bits per point of these"
     console.print(table(title, columns, [_study_cells(row) for row in study.rows]))
     for note in study.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
-    console.print(f"wrote {len(study.files)} files and the pictures to {out}", highlight=False, markup=False)
+    files = quantity(len(study.files), "file")
+    console.print(f"wrote {files} and the pictures to {out}", highlight=False, markup=False)
 
 
 def _study_cells(row: StudyRow) -> list[str]:

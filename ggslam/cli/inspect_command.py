@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from ggslam.cli import options
 from ggslam.cli.console import console, table
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ EPILOG = """
 """
 
 
-class ClockTuning(Tuning):
+class ClockReportTuning(Tuning):
     """When depth and colour are of the same time."""
 
     max_offset_s = 0.005
@@ -131,7 +132,7 @@ def _print_rig(report: RigReport) -> None:
     for camera in report.cameras:
         console.print()
         place, turned = camera.T_first_camera[:3, 3], degrees(turning_angle(camera.T_first_camera, np.eye(4)))
-        words = f"{camera.frames} frames, {camera.together} of them with another camera's"
+        words = f"{quantity(camera.frames, 'frame')}, {camera.together} of them with another camera's"
         if camera is not report.cameras[0]:
             words += f", {1e3 * camera.gap_s[0]:+.1f} ms after it (median; most {1e3 * camera.gap_s[1]:.1f} ms)"
         at = f"at {place[0]:.3f}, {place[1]:.3f}, {place[2]:.3f} m, turned by {turned:.1f} degrees"
@@ -183,7 +184,9 @@ def _print_stream(path: Path) -> None:
         [name, str(size), f"{8 * size / points:.3f}" if points else "-"]
         for name, size in [*listing.parts.items(), ("total", total)]
     ]
-    console.print(table(f"{points} points, slices: {listing.slices}", ["part", "bytes", "bits a point"], rows))
+    console.print(
+        table(f"{quantity(points, 'point')}, slices: {listing.slices}", ["part", "bytes", "bits a point"], rows)
+    )
     for problem in listing.problems:
         console.print(f"[red]damaged or not supported:[/] {escape(problem)}", highlight=False)
 
@@ -217,21 +220,24 @@ def _lines(r: SequenceReport) -> list[tuple[str, str]]:
         ("depth", f"{r.depth_m[0]:.2f} to {r.depth_m[2]:.2f} m, median {r.depth_m[1]:.2f} m; {r.valid_share:.0%} of "
                   f"pixels; {r.depth_scale:g} units a metre"),
         ("images", _images(r)),
-        ("poses", f"{r.posed_frames} frames ({r.pose_source})" if r.posed_frames else "none"),
+        ("poses", f"{quantity(r.posed_frames, 'frame')} ({r.pose_source})" if r.posed_frames else "none"),
     ]  # fmt: skip
     if r.native_camera != r.camera:
         lines.insert(3, ("stored as", _camera(r.native_camera)))
-    if r.clocks is not None and abs(r.clocks.seconds) > max(ClockTuning.max_offset_s, 2 * r.clocks.error):
+    if r.clocks is not None and abs(r.clocks.seconds) > max(ClockReportTuning.max_offset_s, 2 * r.clocks.error):
         side = "after" if r.clocks.seconds > 0 else "before"
         apart, error = 1e3 * abs(r.clocks.seconds), 1e3 * r.clocks.error
-        words = f"depth {apart:.1f} ms {side} colour (to {error:.1f} ms, by the motion in {r.clocks.frames} frames)"
+        frames = quantity(r.clocks.frames, "frame")
+        words = f"depth {apart:.1f} ms {side} colour (to {error:.1f} ms, by the motion in {frames})"
         lines.append(("clocks", words))
     elif r.clocks is not None and not r.verdicts:
-        lines.append(("clocks", f"depth and colour are of the same time, to {1e3 * ClockTuning.max_offset_s:.0f} ms"))
+        lines.append(
+            ("clocks", f"depth and colour are of the same time, to {1e3 * ClockReportTuning.max_offset_s:.0f} ms")
+        )
     if r.motion is not None:
         step, turn = r.motion.step_m, r.motion.turn_deg
-        lines.append(("motion", f"path {r.motion.path_m:.2f} m; a frame: {step[0] * 100:.1f} cm and {turn[0]:.1f} deg "
-                                f"(median), {step[2] * 100:.1f} cm and {turn[2]:.1f} deg (most)"))  # fmt: skip
+        lines.append(("motion", f"path {r.motion.path_m:.2f} m; a frame: {step[0] * 100:.1f} cm and {turn[0]:.1f} "
+                                f"deg (median), {step[2] * 100:.1f} cm and {turn[2]:.1f} deg (most)"))  # fmt: skip
     if r.pose_depth_error is not None:
         lines.append(("consistency", f"depth agrees with the poses to {r.pose_depth_error:.1%}"))
     if r.alignment is not None and r.alignment.doubtful:

@@ -10,6 +10,7 @@ import typer
 
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
+from ggslam.system.plurals import quantity
 
 if TYPE_CHECKING:
     from ggslam.jobs.merge.merge import MergeOutcome
@@ -62,11 +63,11 @@ def _lines(outcome: MergeOutcome, names: list[str]) -> list[str]:
         own = [link for link in outcome.poses.links if link.runs == pair]
         believed = sum(link.believed for link in own)
         lines.append(f"{names[pair[0]]} and {names[pair[1]]}: {believed} of {len(own)} links believed")
-    lines.append(f"{outcome.gaussians} Gaussians, {sum(outcome.doubles)} double ones left out")
+    lines.append(f"{quantity(outcome.gaussians, 'Gaussian')}, {sum(outcome.doubles)} double ones left out")
     if outcome.united:
-        lines.append(f"{outcome.shared_objects} objects were seen in more than one run and have one id now")
+        lines.append(f"gave one id to {quantity(outcome.shared_objects, 'object')} seen in more than one run")
     if outcome.trained:
-        lines.append(f"{outcome.steps} steps on {outcome.trained} keyframes at the seams")
+        lines.append(f"{quantity(outcome.steps, 'step')} on {quantity(outcome.trained, 'keyframe')} at the seams")
     lines += [f"note: {note}" for note in outcome.notes]
     took = ", ".join(f"{part} {seconds:.1f}" for part, seconds in outcome.seconds.items())
     return [*lines, f"wrote {outcome.folder.path} in {sum(outcome.seconds.values()):.1f} s ({took})"]

@@ -13,6 +13,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
+from ggslam.system.plurals import quantity
 
 if TYPE_CHECKING:
     from ggslam.jobs.refine.refine_store import StoreRefinement
@@ -77,18 +78,18 @@ def refine(
         _show_store(outcome)
         return
     _print([
-        f"{done.steps} steps on {done.keyframes} keyframes{_gain(done.before, done.after)}",
+        f"{quantity(done.steps, 'step')} on {quantity(done.keyframes, 'keyframe')}{_gain(done.before, done.after)}",
         *(f"note: {note}" for note in done.notes), f"wrote {done.folder.path} in {done.seconds:.1f} s",
     ])  # fmt: skip
 
 
 def _show_store(outcome: StoreRefinement) -> None:
     gain = _gain(outcome.before, outcome.after)
-    lines = [f"{outcome.trained} of {outcome.cells} cells trained, {outcome.steps} steps{gain}"]
+    lines = [f"{outcome.trained} of {quantity(outcome.cells, 'cell')} trained, {quantity(outcome.steps, 'step')}{gain}"]
     if outcome.resumed:
-        lines.append(f"{outcome.resumed} cells were done by an earlier call")
+        lines.append(f"an earlier call had finished {quantity(outcome.resumed, 'cell')}")
     if outcome.unseen:
-        lines.append(f"{outcome.unseen} cells are as they were: no keyframe shows enough of them")
+        lines.append(f"left {quantity(outcome.unseen, 'cell')} unchanged that no keyframe shows well enough")
     lines += [f"note: {note}" for note in outcome.notes]
     _print([*lines, f"wrote {outcome.path} in {outcome.seconds:.1f} s"])
     if outcome.failures:  # of the store: those of ggslam or the machine are raised

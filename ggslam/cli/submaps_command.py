@@ -14,6 +14,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.system.json_files import json_ready
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
@@ -145,7 +146,8 @@ def _make(request: SubmapsRequest) -> None:
 def _print(listing: StoreListing) -> None:
     s = listing.settings
     console.print(
-        f"{listing.path}: {listing.cells} cells of {s.spacing:g} m along {s.axes}, {listing.bytes / 1e6:.1f} MB; "
+        f"{listing.path}: {quantity(listing.cells, 'cell')} of {s.spacing:g} m along {s.axes}, "
+        f"{listing.bytes / 1e6:.1f} MB; "
         f"R {s.radius:g} m, T {s.refresh:g} s, R' {s.partial_radius:g} m, voxels {100 * s.voxel:g} cm", highlight=False,
         markup=False,
     )  # fmt: skip
@@ -159,7 +161,7 @@ def _print(listing: StoreListing) -> None:
             [str(c.key), "yes" if c.added else "", "-" if c.changed is None else f"{100 * c.changed:.1f} %"]
             for c in listing.changes
         ]
-        console.print(table(f"{len(rows)} cells since {listing.since}", ["cell", "new", "changed"], rows))
+        console.print(table(f"{quantity(len(rows), 'cell')} since {listing.since}", ["cell", "new", "changed"], rows))
     _print_objects(listing)
     for problem in listing.problems[:ListingTuning.problems]:
         console.print(problem, highlight=False, markup=False, soft_wrap=True)
@@ -169,12 +171,12 @@ def _print(listing: StoreListing) -> None:
 
 def _print_objects(listing: StoreListing) -> None:
     if listing.events is not None:
-        title = f"{len(listing.events)} objects since {listing.since}"
+        title = f"{quantity(len(listing.events), 'object')} since {listing.since}"
         rows = [_event_row(event) for event in listing.events]
         console.print(table(title, ["", "object", "moved", "turned", "cells"], rows))
     elif listing.objects is not None:
         present = listing.objects.present()
-        title = f"{len(present)} objects, {len(listing.objects.objects) - len(present)} gone"
+        title = f"{quantity(len(present), 'object')}, {len(listing.objects.objects) - len(present)} gone"
         rows = [
             [o.label(), str(o.gaussians), str(len(o.cells)), o.first_seen, o.last_seen]
             for o in present[: ListingTuning.objects]

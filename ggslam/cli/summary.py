@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 
 from ggslam.cli.console import console, table
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ def _trajectory_line(t: TrajectoryScoresRecord | None) -> str:
     lengths = (t.ate_rmse_m, t.ate_mean_m, t.ate_raw_rmse_m, t.rpe_trans_m)
     ate, mean, raw, rpe = (f"{_text(length, 100, '.2f')} cm" for length in lengths)
     turn = _text(t.rpe_rot_deg, 1, ".3f")
-    frames = "1 frame" if t.frames_compared == 1 else f"{t.frames_compared} frames"
+    frames = quantity(t.frames_compared or 0, "frame")
     return f"trajectory: ATE RMSE {ate}, mean {mean} (aligned), raw {raw}; RPE {rpe}, {turn} deg; over {frames}"
 
 

@@ -13,6 +13,7 @@ import typer
 
 from ggslam.cli.console import console, progress_bar
 from ggslam.errors import SequenceError
+from ggslam.system.plurals import quantity
 
 if TYPE_CHECKING:
     from ggslam.synthetic import Shutter
@@ -149,7 +150,9 @@ def synth(
             depth_distortion=depth_distortion, trajectory=None if path is None else path.value,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
-    console.print(f"wrote {folder}: {frames} frames of {width}x{height}{cameras}", highlight=False, markup=False)
+    console.print(
+        f"wrote {folder}: {quantity(frames, 'frame')} of {width}x{height}{cameras}", highlight=False, markup=False
+    )
 
 
 def _writer(

@@ -11,6 +11,7 @@ import typer
 from ggslam.cli.changes_command import IdsName, choice_of_ids, print_changes
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
+from ggslam.system.plurals import quantity
 
 if TYPE_CHECKING:
     from ggslam.jobs.update.update import UpdateOutcome
@@ -68,11 +69,11 @@ def _lines(outcome: UpdateOutcome) -> list[str]:
     """What came of it, for people; notes of the comparison were printed with it."""
     old, new = outcome.kept
     lines = [
-        f"{outcome.gaussians} Gaussians: {old} of the older map, {new} of the newer one; {outcome.gone} showed what is "
-        "gone"
+        f"{quantity(outcome.gaussians, 'Gaussian')}: {old} of the older map, {new} of the newer one; {outcome.gone} "
+        "showed what is gone"
     ]  # fmt: skip
     if outcome.trained:
-        lines.append(f"{outcome.steps} steps on {outcome.trained} keyframes")
+        lines.append(f"{quantity(outcome.steps, 'step')} on {quantity(outcome.trained, 'keyframe')}")
     lines += [f"note: {note}" for note in outcome.notes if note not in outcome.changes.table.found.notes]
     took = ", ".join(f"{part} {seconds:.1f}" for part, seconds in outcome.seconds.items())
     return [*lines, f"wrote {outcome.folder.path} in {sum(outcome.seconds.values()):.1f} s ({took})"]

@@ -12,6 +12,7 @@ from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
 from ggslam.errors import ConfigError
+from ggslam.system.plurals import quantity
 from ggslam.volumes.output_frame import OutputFrame
 
 if TYPE_CHECKING:
@@ -204,7 +205,8 @@ def _make_of_store(
         )  # fmt: skip
     took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.seconds.items())
     for line in (
-        f"{outcome.cells} cells, {outcome.blocks} blocks of 8^3 voxels, {outcome.triangles} triangles ({took})",
+        f"{quantity(outcome.cells, 'cell')}, {quantity(outcome.blocks, 'block')} of 8^3 voxels, "
+        f"{quantity(outcome.triangles, 'triangle')} ({took})",
         f"wrote {outcome.out}", *(f"not made: {line}" for line in outcome.failures.values()),
     ):  # fmt: skip
         console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -254,7 +256,7 @@ def _print(outcome: VolumesOutcome) -> None:
     console.print(table("ms a frame", ["", "mean", "95 %", "largest", f"by {outcome.window} frames"], rows))
     for line in outcome.lines:
         console.print(line, highlight=False, markup=False)
-    console.print(f"wrote {len(outcome.files)} files to {outcome.out}", highlight=False, markup=False)
+    console.print(f"wrote {quantity(len(outcome.files), 'file')} to {outcome.out}", highlight=False, markup=False)
 
 
 def _print_safety(outcome: VolumesOutcome, braking: Braking, speeds: list[float]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long work reports its progress."""
+"""Progress reports of long work."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Observer(Protocol):
 
 
 class SilentObserver:
-    """Listens to nothing."""
+    """Ignores all progress."""
 
     def begin(self, stage: str, total: int) -> None:
         """Ignored."""

@@ -17,7 +17,7 @@ from ggslam.system.array_forms import ColorImage, Form, IdImage, Mask, MaybeNan,
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 
-ELSEWHERE: Final = -1
+FROM_EARLIER_RUN: Final = -1
 """Frame index of keyframes that belong to another recording: to the map that the run started from."""
 DEPTH_UNIT: Final = 1 / 5000.0
 """Unit of a keyframe's depth in metres: uint16 steps of 0.2 mm (range 13.1 m), the resolution of TUM recordings.
@@ -46,7 +46,7 @@ class Keyframe:
 
     Attributes:
         index: number of the keyframe (0, 1, 2, ...).
-        frame_index: index of the frame it was made from, or `ELSEWHERE`.
+        frame_index: index of the frame it was made from, or `FROM_EARLIER_RUN`.
         color: uint8 [H, W, 3].
         depth: uint16 [H, W], units of `depth_unit`, 0 = none.
         T_camera_world: float64 [4, 4], the pose as refined so far.

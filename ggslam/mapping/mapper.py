@@ -17,7 +17,7 @@ from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
 from ggslam.mapping.identity import IdentityLearner, MaskOnGrid
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
 from ggslam.mapping.mean_map import MeanMap
@@ -331,7 +331,7 @@ class Mapper(ABC):
 
     def valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
         """Where a keyframe shows something, bool [H, W]; None: everywhere, or it is of another recording."""
-        valid = self._valid.get(keyframe.camera_number) if keyframe.frame_index != ELSEWHERE else None
+        valid = self._valid.get(keyframe.camera_number) if keyframe.frame_index != FROM_EARLIER_RUN else None
         if valid is not None and valid.shape != keyframe.color.shape[:2]:
             valid = None
         if keyframe.moving is None:
@@ -366,7 +366,7 @@ class Mapper(ABC):
             return round(MapperTuning.all_pixels_end_share * before)
         if self.is_live or not before:
             return round(MapperTuning.live_end_share * before)
-        own = sum(self.keyframes[k].frame_index != ELSEWHERE for k in self._all_numbers)
+        own = sum(self.keyframes[k].frame_index != FROM_EARLIER_RUN for k in self._all_numbers)
         return max(round(MapperTuning.end_share * before), MapperTuning.min_visits * own)
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:

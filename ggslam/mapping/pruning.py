@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ggslam.geometry.image_parts import is_in_image_part
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.settings import PruningSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import transform_points
@@ -113,7 +113,7 @@ def drop_pixels(gaussians: GaussianMap, keyframes: Sequence[Keyframe], part: np.
     stays = np.ones(len(gaussians), bool)
     for keyframe in keyframes:
         camera = keyframe.camera
-        if keyframe.frame_index == ELSEWHERE or (camera.height, camera.width) != part.shape:
+        if keyframe.frame_index == FROM_EARLIER_RUN or (camera.height, camera.width) != part.shape:
             continue
         rows = np.flatnonzero(birth == keyframe.index)
         seen = transform_points(means[rows], keyframe.T_camera_world)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where two runs saw the same: keyframes that look alike, verified by features, surfaces and voxels."""
+"""Finds where two runs saw the same place: similar keyframes, verified by features, surfaces and voxels."""
 
 from __future__ import annotations
 

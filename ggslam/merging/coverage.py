@@ -18,7 +18,7 @@ from ggslam.sight.view import Sight, View
 from ggslam.system.tuning import Tuning
 
 
-class CoverageTuning(Tuning):
+class SeamViewTuning(Tuning):
     """How seams are looked for."""
 
     width = 160
@@ -58,7 +58,7 @@ class Coverage:
         shares = []
         for T, whole in zip(run.T_world_camera, run.cameras, strict=True):
             camera = whole.resize(
-                CoverageTuning.width, max(1, round(whole.height * CoverageTuning.width / whole.width))
+                SeamViewTuning.width, max(1, round(whole.height * SeamViewTuning.width / whole.width))
             )
             view = View.of(self._show(base, camera, T), camera, T, self._margin, self._context)
             shares.append(float((view.classify_depth(self._show(run.gaussians, camera, T)) == Sight.SAME).mean()))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps of several runs in one world, with the same channels, behind one another."""
+"""Joins maps of several runs: moves them into one world, equalises channels, appends them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What merging knows of a run: where its keyframes were, what they measured, and what they looked like."""
+"""A run as merging sees it: poses, measurements and looks of its keyframes."""
 
 from __future__ import annotations
 

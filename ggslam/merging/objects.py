@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The objects of several maps as one set: one id for one thing, one classifier, all names and votes."""
+"""Merges the objects of several maps: one id for each object, one classifier, all names and votes."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whose map a place is taken from where several runs mapped it: that of the run which measured it best.
+"""Chooses the run whose map is kept at a place that several runs mapped: the one that measured it best.
 
 A map is right where its keyframes looked. At the border of what they saw it is not: Gaussians that fit the few views
 there are wrong from elsewhere. So each place belongs to one run as a whole, and the border between two runs' places

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of merging, documented."""
+"""Settings of merging."""
 
 from __future__ import annotations
 

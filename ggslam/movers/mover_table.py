@@ -14,7 +14,7 @@ from ggslam.system.savable import savable
 Kind = Literal["rigid", "not rigid", "unknown"]
 
 
-@savable(formerly="ggslam.movers.found.MoverSight")
+@savable(formerly="ggslam.movers.mover_table.MoverSight")
 @dataclass(frozen=True)
 class MoverSight:
     """A mover in a frame.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a set of points is: its middle and the box around it along its own axes."""
+"""The middle of a set of points, and the box around it along its own axes."""
 
 from __future__ import annotations
 

@@ -30,6 +30,7 @@ from ggslam.objects.segmented_rows import (
 from ggslam.objects.table import ObjectTable, Observation
 from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.poses import quaternion_to_matrix
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 Vector = Sequence[float]
@@ -77,7 +78,7 @@ def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     keep_rows(scene, ~gone)
     _forget(scene, ids)
     rebuild_table(scene)
-    return Change(f"removed {what}: {int(gone.sum())} Gaussians", before, _no_gaussians(scene), left)
+    return Change(f"removed {what}: {quantity(int(gone.sum()), 'Gaussian')}", before, _no_gaussians(scene), left)
 
 
 def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
@@ -90,7 +91,7 @@ def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     keep_rows(scene, kept)
     _forget(scene, [i for i in scene.table.ids() if i not in ids])
     rebuild_table(scene)
-    text = f"kept {what}: {int(kept.sum())} Gaussians, {len(before.means)} removed"
+    text = f"kept {what}: {quantity(int(kept.sum()), 'Gaussian')}, {len(before.means)} removed"
     return Change(text, before, _no_gaussians(scene))
 
 
@@ -120,7 +121,7 @@ def move_objects(
     rest = f", {int(stray.sum())} floaters stay unlabelled" if stray.any() else ""
     text = f"moved {what} by {_numbers(shift)} m"
     text += f", turned by {_numbers(rotate_degrees)} degrees" if any(rotate_degrees) else ""
-    text += f": {int(rows.sum())} Gaussians{rest}"
+    text += f": {quantity(int(rows.sum()), 'Gaussian')}{rest}"
     return Change(text, before, copies_of(scene.gaussians, rows), left, motion=T)
 
 
@@ -171,7 +172,8 @@ def recolor_objects(scene: SegmentedMap, ids: Sequence[int], color: tuple[int, i
     rows = np.logical_or.reduce(own)
     before = copies_of(scene.gaussians, rows)
     recolor(scene.gaussians, rows, color)
-    text = f"recoloured {what} to #{''.join(f'{value:02x}' for value in color)}: {int(rows.sum())} Gaussians"
+    code = "".join(f"{value:02x}" for value in color)
+    text = f"recoloured {what} to #{code}: {quantity(int(rows.sum()), 'Gaussian')}"
     return Change(text, before, copies_of(scene.gaussians, rows))
 
 
@@ -198,7 +200,7 @@ def merge_objects(scene: SegmentedMap, kept: int, merged: int) -> Change:
         scene.votes = merged_votes(scene.votes, merged, kept)
     rebuild_table(scene, names, seen)
     nothing = _no_gaussians(scene)
-    return Change(f"merged {what}: {int(rows.sum())} Gaussians", nothing, nothing, merged=(kept, merged))
+    return Change(f"merged {what}: {quantity(int(rows.sum()), 'Gaussian')}", nothing, nothing, merged=(kept, merged))
 
 
 def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:

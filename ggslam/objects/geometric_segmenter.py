@@ -26,7 +26,7 @@ from ggslam.scene.camera import Camera
 from ggslam.system.tuning import Tuning
 
 
-class SegmentTuning(Tuning):
+class RegionTuning(Tuning):
     """How regions become segments."""
 
     flake_area = 6
@@ -88,7 +88,7 @@ class GeometricSegmenter:
         number = np.zeros(len(area), np.int32)
         number[kept] = int(plane_of.max()) + 1 + np.arange(len(kept))
         regions = np.where(rest, number[pieces], plane_of)
-        return grow_regions(regions, surface.valid, closed, SegmentTuning.growth * surface.step)
+        return grow_regions(regions, surface.valid, closed, RegionTuning.growth * surface.step)
 
     def _join_regions(
         self, regions: np.ndarray, plane_of: np.ndarray, planes: np.ndarray, surface: DepthSurface, color: np.ndarray
@@ -99,7 +99,7 @@ class GeometricSegmenter:
         borders = find_borders(regions, surface, plane_of, planes, colors_to_compare(color), surface.step + 1, settings)
         groups = Groups(int(regions.max()) + 1)
         convex, lies = is_convex(borders), lies_on(borders, regions, planes, surface, settings)
-        alike = ~convex & (borders.contrast < SegmentTuning.alike_contrast * settings.color_contrast)
+        alike = ~convex & (borders.contrast < RegionTuning.alike_contrast * settings.color_contrast)
         parts = is_hollow(borders, len(planes)) | self._is_flat(borders, alike, regions, planes, surface)
         bodies = convex & ~is_painted(borders, settings.color_contrast) & ~lies
         for k in np.flatnonzero(bodies | (alike & parts)):
@@ -117,12 +117,12 @@ class GeometricSegmenter:
         """bool [n]: those of the borders `asked` that part a plane and something that lies flat on it."""
         first, second = borders.pairs.T
         asked = (
-            asked & (first <= len(planes)) & (second > len(planes)) & (borders.length >= SegmentTuning.min_flat_border)
+            asked & (first <= len(planes)) & (second > len(planes)) & (borders.length >= RegionTuning.min_flat_border)
         )
         flat, places = np.zeros(len(asked), bool), np.flatnonzero(asked & (borders.closed >= 0.5 * borders.length))
         questions = [(int(second[k]), planes[first[k] - 1]) for k in places]
         flat[places] = (
-            share_near_planes(surface.points, regions, questions, self._settings.flat_m) >= SegmentTuning.min_flat
+            share_near_planes(surface.points, regions, questions, self._settings.flat_m) >= RegionTuning.min_flat
         )
         return flat
 
@@ -148,8 +148,8 @@ def _without_flakes(
                 best[flake] = (closed - concave, other)
     for flake in sorted(best, key=lambda k: area[k]):
         joined, other = best[flake]
-        small = flake > planes and area[flake] < SegmentTuning.flake_area * min_area * regions.size
-        if small and joined >= SegmentTuning.flake_closed * rim[flake]:
+        small = flake > planes and area[flake] < RegionTuning.flake_area * min_area * regions.size
+        if small and joined >= RegionTuning.flake_closed * rim[flake]:
             groups.join(flake, other)
     return groups.roots().astype(np.int32)[regions]
 

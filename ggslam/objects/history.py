@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What became of objects from visit to visit."""
+"""The history of objects from visit to visit."""
 
 from __future__ import annotations
 

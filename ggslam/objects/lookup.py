@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which object is at a place."""
+"""Finds the object at a place."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from ggslam.scene.camera import Camera
 from ggslam.system.tuning import Tuning
 
 
-class PlaneTuning(Tuning):
+class DepthPlaneTuning(Tuning):
     """When depth is flat."""
 
     block_sigmas = 2.0
@@ -119,7 +119,7 @@ def fit(
 def _grow(blocks: _Blocks, sigma: float, settings: GeometricSettings) -> np.ndarray:
     """Number of the group of each flat block, int [rows, columns], -1 = not flat: neighbours with like planes."""
     # Rounding of float32 sums adds a little to the noise.
-    flat = blocks.full & (blocks.error < PlaneTuning.block_sigmas * sigma)
+    flat = blocks.full & (blocks.error < DepthPlaneTuning.block_sigmas * sigma)
     unit = blocks.plane / np.maximum(np.linalg.norm(blocks.plane, axis=-1, keepdims=True), 1e-9)
     centre = blocks.right[..., 2] / np.maximum(blocks.count, 1)
     limit = np.cos(np.radians(settings.plane_degrees))
@@ -150,7 +150,7 @@ def _fit(
     group = number[group]
     sums = blocks.sums_of(group, len(order))
     fitted, error = sums.fit()
-    limit = PlaneTuning.plane_sigmas * sigma + settings.tolerance_m * (sums.inverse() / sizes[order]) ** 2
+    limit = DepthPlaneTuning.plane_sigmas * sigma + settings.tolerance_m * (sums.inverse() / sizes[order]) ** 2
     planes = np.zeros((0, 3))
     members: list[list[int]] = []
     for k in np.flatnonzero(error < limit).tolist():
@@ -180,7 +180,7 @@ def _claim(
     settings: GeometricSettings,
 ) -> np.ndarray:  # fmt: skip
     """Plane of each pixel: the nearest of those that it lies on and has the normal of, in pieces with blocks."""
-    label = claim_planes(surface, camera.rays(), planes, np.cos(np.radians(PlaneTuning.max_angle_deg)), settings)
+    label = claim_planes(surface, camera.rays(), planes, np.cos(np.radians(DepthPlaneTuning.max_angle_deg)), settings)
     support = np.zeros(label.shape, np.int32)
     grown = plane_of_block.repeat(size, 0).repeat(size, 1)
     support[: grown.shape[0], : grown.shape[1]] = grown

@@ -14,7 +14,7 @@ import numpy as np
 from ggslam.system.tuning import Tuning
 
 
-class TextureTuning(Tuning):
+class GapTextureTuning(Tuning):
     """How a gap is filled with texture."""
 
     half_patch = 4
@@ -35,8 +35,8 @@ def fill_gap(picture: np.ndarray, known: np.ndarray, gap: np.ndarray) -> np.ndar
         known: bool [H, W], where the picture may be copied from; at least one pixel.
         gap: bool [H, W], where colours are wanted.
     """
-    size = 2 * TextureTuning.half_patch + 1
-    most = TextureTuning.max_patches * size * size / 3
+    size = 2 * GapTextureTuning.half_patch + 1
+    most = GapTextureTuning.max_patches * size * size / 3
     if gap.sum() > most:
         return _filled_coarsely(picture, known, gap, float(np.sqrt(gap.sum() / most)))
     pixels = (255 * picture.clip(0, 1) + 0.5).astype(np.uint8)
@@ -44,7 +44,7 @@ def fill_gap(picture: np.ndarray, known: np.ndarray, gap: np.ndarray) -> np.ndar
     textured = _copy_patches(picture.astype(np.float32), known & ~gap, gap, smooth)
     if textured is None:
         return smooth[gap]
-    limit = TextureTuning.max_light
+    limit = GapTextureTuning.max_light
     light = cv2.GaussianBlur(smooth.mean(2) - textured.mean(2), (0, 0), size).clip(-limit, limit)
     return (textured + light[..., None])[gap].clip(0, 1)
 
@@ -65,7 +65,7 @@ def _filled_coarsely(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, fa
 def _copy_patches(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smooth: np.ndarray) -> np.ndarray | None:
     """The picture with the gap filled by known patches; what is neither known nor gap is `smooth`. None if no whole
     patch is known."""
-    half = TextureTuning.half_patch
+    half = GapTextureTuning.half_patch
     size = 2 * half + 1
     whole = cv2.erode(known.astype(np.uint8), np.ones((size, size), np.uint8), borderValue=0) > 0
     if not whole.any():
@@ -83,7 +83,7 @@ def _copy_patches(picture: np.ndarray, known: np.ndarray, gap: np.ndarray, smoot
         mask = np.repeat(done[window].astype(np.float32)[..., None], 3, 2)
         fit = cv2.matchTemplate(picture, canvas[window], cv2.TM_SQDIFF, mask=mask)
         drift = cv2.matchTemplate(picture, trend[window], cv2.TM_SQDIFF, mask=1 - mask)
-        cost = np.asarray(fit) + TextureTuning.trend_weight * np.asarray(drift)
+        cost = np.asarray(fit) + GapTextureTuning.trend_weight * np.asarray(drift)
         y, x = np.unravel_index(np.where(candidates, cost, np.inf).argmin(), cost.shape)
         fresh = todo[window]
         canvas[window][fresh] = picture[y : y + size, x : x + size][fresh]
@@ -98,7 +98,7 @@ def _next_place(canvas: np.ndarray, done: np.ndarray, todo: np.ndarray, confiden
     rim = todo & (cv2.dilate(done.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
     if not rim.any():  # nothing known touches what is left
         rim = todo
-    size = 2 * TextureTuning.half_patch + 1
+    size = 2 * GapTextureTuning.half_patch + 1
     sure = cv2.blur(confidence, (size, size))
     grey = np.where(done, canvas.mean(2), 0).astype(np.float32)
     solid = cv2.erode(done.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

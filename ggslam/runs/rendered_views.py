@@ -13,7 +13,7 @@ from ggslam.errors import InputError
 from ggslam.formats.point_sampling import PointSamplingTuning
 from ggslam.formats.voxel_cloud import VoxelCloud
 from ggslam.geometry.scene_size import scale_of_depth, voxel_times
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.table import ObjectTable
@@ -78,7 +78,7 @@ class RenderedViews:
             segmented: see the class.
         """
         places = keyframes.keyframes
-        cameras = [recording.camera if k.frame == ELSEWHERE else recording.camera_of(k.frame) for k in places]
+        cameras = [recording.camera if k.frame == FROM_EARLIER_RUN else recording.camera_of(k.frame) for k in places]
         return RenderedViews(cameras, [k.T_world_camera for k in places], parts.in_view, segmented)
 
     @staticmethod

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError, SequenceError
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, make_keyframe
 from ggslam.objects.table import Observation
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import fingerprint, open_recording_of
@@ -136,7 +136,7 @@ def _objects(folder: RunFolder, gaussians: GaussianMap) -> LearnedObjects | None
 def _bare_keyframe(number: int, T_world_camera: np.ndarray, camera: Camera) -> Keyframe:
     """A keyframe of another recording: its pose alone."""
     color, depth = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.uint16)
-    return Keyframe(number, ELSEWHERE, float("nan"), camera, color, depth, inverse(T_world_camera))
+    return Keyframe(number, FROM_EARLIER_RUN, float("nan"), camera, color, depth, inverse(T_world_camera))
 
 
 def _with_images(
@@ -166,7 +166,7 @@ def _with_images(
     for keyframe, record in zip(keyframes[first:], records, strict=True):
         frame = sequence.frame(record.frame, masks=with_masks)
         made = make_keyframe(keyframe.index, frame, keyframe.T_world_camera)
-        out.append(replace(made, frame_index=ELSEWHERE, iterations=record.iterations, instant=None))
+        out.append(replace(made, frame_index=FROM_EARLIER_RUN, iterations=record.iterations, instant=None))
     return out
 
 

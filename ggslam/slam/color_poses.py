@@ -13,7 +13,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.mapping.cpu.mapper import CpuMapper
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import ViewAlignmentSettings
 from ggslam.mapping.view_alignment import AlignmentTuning, align_view, grey_of
@@ -147,7 +147,7 @@ class ColorPoses:
         for numbers in self.mapper.stages():
             for keyframe in (self.mapper.keyframes[number] for number in numbers if number > 0):
                 known = keyframe.depth_m()
-                if keyframe.frame_index == ELSEWHERE or keyframe.instant is not None or not known.any():
+                if keyframe.frame_index == FROM_EARLIER_RUN or keyframe.instant is not None or not known.any():
                     continue  # keyframes of a rig stay as the rig has them
                 depth = float(np.median(known[known > 0]))
                 hidden = _find_hidden(None, self.mapper.valid_of(keyframe))

@@ -17,7 +17,7 @@ import torch
 
 from ggslam.loops.agreement import GroundLink
 from ggslam.loops.parts import KeyframeParts
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.movers.mover_table import FoundMover
 from ggslam.scene.gaussian_map import GaussianMap
@@ -85,7 +85,7 @@ class MapParts:
 
     def _largest(self, loops: LoopCloser) -> int:
         """The part with the most frames, the oldest of several; but a map that the run began with is never left."""
-        if any(keyframe.frame_index == ELSEWHERE for keyframe in self._mapper.keyframes):
+        if any(keyframe.frame_index == FROM_EARLIER_RUN for keyframe in self._mapper.keyframes):
             return 0
         located = [frame.keyframe for frame in self._poses.frames if _is_located(frame)]
         counts = Counter(loops.parts.of[keyframe] for keyframe in located if keyframe < len(loops))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.pruning import blank_part, drop_before, drop_moved, drop_pixels
 from ggslam.movers.outdated import OutdatedParts
@@ -61,7 +61,7 @@ class MapRemoval:
     def drop_outdated(self, found: Sequence[tuple[Keyframe, OutdatedParts]]) -> int:
         """Removes what keyframes of the map that the run began with show and newer ones look through; returns how many
         Gaussians went."""
-        births = np.array([k.index for k in self._mapper.keyframes if k.frame_index == ELSEWHERE])
+        births = np.array([k.index for k in self._mapper.keyframes if k.frame_index == FROM_EARLIER_RUN])
         gone = [(k, parts) for k, parts in found if parts.gone.any()]
         dropped = [(k, parts.gone, parts.around) for k, parts in gone]
         went = drop_before(self._mapper.map, births, dropped) if gone else 0

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.sight.margin import Margin
 from ggslam.sight.view import View
 
@@ -48,7 +48,7 @@ def count_chances(
     world = np.array(list(points.values()), float).reshape(-1, 3)
     begin = np.array([since.get(i, 0) for i in points], int)
     for keyframe in keyframes:
-        if keyframe.mask is None or keyframe.frame_index == ELSEWHERE or not len(world):
+        if keyframe.mask is None or keyframe.frame_index == FROM_EARLIER_RUN or not len(world):
             continue
         view = View.of(keyframe.depth_m(), keyframe.camera, keyframe.T_world_camera, _MARGIN)
         seen += view.classify_points(world).same & (keyframe.frame_index >= begin)

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ggslam.errors import SequenceError
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, MapLabels
 from ggslam.objects.association import Associator, MapView
 from ggslam.objects.geometric_segmenter import GeometricSegmenter
@@ -251,7 +251,7 @@ def observations(
     """
     seen: dict[int, list[int]] = {}
     for keyframe in keyframes:
-        if keyframe.mask is not None and keyframe.frame_index != ELSEWHERE:
+        if keyframe.mask is not None and keyframe.frame_index != FROM_EARLIER_RUN:
             for i in np.flatnonzero(np.bincount(current(keyframe.mask).reshape(-1))).tolist():
                 seen.setdefault(i, []).append(keyframe.frame_index)
     found = {i: Observation(min(frames), max(frames), len(frames)) for i, frames in seen.items() if i}

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.slam.config import Config
 from ggslam.slam.filters.earlier_views import EarlierViews
 from ggslam.slam.slam import Slam
@@ -62,7 +62,7 @@ def check_state(slam: Slam) -> None:
     mapper, surface = slam.mapper, slam.surface
     for number, keyframe in enumerate(mapper.keyframes):
         camera = keyframe.camera  # of another recording, which may have had more
-        if keyframe.frame_index != ELSEWHERE:
+        if keyframe.frame_index != FROM_EARLIER_RUN:
             if not 0 <= keyframe.camera_number < len(slam.cameras):
                 raise FormatError(f"keyframe {number}: its camera is not the one of this recording")
             camera = slam.cameras[keyframe.camera_number]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.rendering.exposure import change_of
 from ggslam.scene.poses import fit_similarity
 from ggslam.sequences.verdicts import Severity, Verdict, judge_scale_by
@@ -73,7 +73,7 @@ def _judge_motion(result: SlamResult) -> list[Verdict]:
 
 def _is_bare(keyframe: Keyframe) -> bool:
     """Whether it has too little texture to be tracked by."""
-    if keyframe.frame_index == ELSEWHERE:
+    if keyframe.frame_index == FROM_EARLIER_RUN:
         return False
     shrink = PhotometricSettings().shrink * max(1, round(keyframe.camera.width / 320))
     view = GreyDepth.from_images(keyframe.color, keyframe.depth_m(), keyframe.camera, shrink)
@@ -82,7 +82,7 @@ def _is_bare(keyframe: Keyframe) -> bool:
 
 def _judge_exposure(result: SlamResult) -> list[Verdict]:
     """Whether the camera's exposure changed against that of the map, which is the first keyframe's."""
-    ours = [k for k in result.keyframes if k.frame_index != ELSEWHERE]
+    ours = [k for k in result.keyframes if k.frame_index != FROM_EARLIER_RUN]
     changes = {k.frame_index: change_of(k.exposure) for k in ours}
     changed = {frame: gain for frame, gain in changes.items() if abs(np.log(gain)) > VerdictTuning.exposure_change}
     if not changed:

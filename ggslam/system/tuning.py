@@ -24,7 +24,7 @@ class _Frozen(type):
     """Refuses to assign and delete attributes of a class."""
 
     def __setattr__(cls, name: str, value: object) -> None:
-        raise AttributeError(f"{cls.__name__}.{name} is fixed; `overridden` changes it for the length of a block")
+        raise AttributeError(f"{cls.__name__}.{name} is fixed; overridden() changes it for the length of a block")
 
     def __delattr__(cls, name: str) -> None:
         raise AttributeError(f"{cls.__name__}.{name} is fixed")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may open the page: whoever has the address that was printed, from this machine's own names.
+"""Access to the page: only with the printed address, and only under this machine's own names.
 
 A browser lets every page that is open in it send requests to localhost. So a request must name a host that is ours (a
 name of somebody else's that was bent to 127.0.0.1 is not), come from no other page, and carry the token of the printed

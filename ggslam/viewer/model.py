@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a page needs of the map that it shows."""
+"""The interface between a page and the map that it shows."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ggslam.errors import ConfigError
 from ggslam.scene.poses import matrix_to_quaternion, quaternion_to_matrix
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import upright_axes
 from ggslam.viewer.model import EditableMap, ListedObject
@@ -139,7 +140,7 @@ class ObjectsTab:
         if action == "Export":
             name, content = self._model.export(object_id)
             client.send_file_download(name, content, save_immediately=True)
-            return f"{name}: {self._records[object_id].gaussians} Gaussians, {len(content):,} bytes"
+            return f"{name}: {quantity(self._records[object_id].gaussians, 'Gaussian')}, {len(content):,} bytes"
         self._hide(self._stage.hidden ^ {object_id})
         return None
 

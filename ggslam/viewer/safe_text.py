@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Words of users and of data sets on a page that takes Markdown with HTML in it."""
+"""Makes text of users and data sets safe for a page that renders Markdown with HTML."""
 
 from __future__ import annotations
 

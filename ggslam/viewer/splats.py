@@ -13,7 +13,7 @@ from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.tuning import Tuning
 
 
-class SplatTuning(Tuning):
+class DrawnSplatTuning(Tuning):
     """Which Gaussians are drawn."""
 
     max_size_m = 2.0
@@ -50,7 +50,7 @@ def splats_of(gaussians: Gaussians, index: np.ndarray | None = None) -> Splats:
     """Splats of a map's Gaussians, of those at `index` (int [M]) if it is given, in that order. Only the part of a
     colour that is the same from all sides is used."""
     rows = slice(None) if index is None else index
-    scales = np.minimum(np.exp(gaussians.log_scales.numpy()[rows]), SplatTuning.max_size_m)
+    scales = np.minimum(np.exp(gaussians.log_scales.numpy()[rows]), DrawnSplatTuning.max_size_m)
     axes = quaternion_to_matrix(gaussians.quaternions.numpy()[rows]).astype(np.float32) * scales[:, None, :]
     rgb = 0.5 + SH_C0 * gaussians.sh.numpy()[rows, 0]
     return Splats(
@@ -81,11 +81,11 @@ def most_visible(gaussians: Gaussians, limit: int, owners: np.ndarray | None = N
             chosen: the largest Gaussians are those of walls, and small objects would be left out.
     """
     opacities = opacities_of(gaussians)
-    seen = np.flatnonzero(opacities >= SplatTuning.min_opacity)
+    seen = np.flatnonzero(opacities >= DrawnSplatTuning.min_opacity)
     if len(seen) <= limit:
         return seen
     widths = np.sort(gaussians.log_scales.numpy()[seen], axis=1)[:, 1:].sum(axis=1)
-    weight = np.log(opacities[seen]) + np.minimum(widths, 2 * np.log(SplatTuning.max_size_m))
+    weight = np.log(opacities[seen]) + np.minimum(widths, 2 * np.log(DrawnSplatTuning.max_size_m))
     if owners is not None:
         ids = owners[seen]
         share = limit // (4 * len(np.unique(ids)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a page shows and where from, shared by the tabs beside it."""
+"""The state of a page that its tabs share: what it shows, and from where."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from ggslam.scene.gaussian_map import SH_C0
 from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import CameraTuning, Viewpoint, top_view, vertical_fov, view_of_pose
 from ggslam.viewer.model import ListedObject, ViewedMap
-from ggslam.viewer.splats import SplatTuning, colors_to_uint8, opacities_of
+from ggslam.viewer.splats import DrawnSplatTuning, colors_to_uint8, opacities_of
 
 STATIC = Path(__file__).with_name("static")
 _PARTS = ("renderer.js", "camera.js", "page.js")
@@ -37,7 +37,7 @@ class StaticPageTuning(Tuning):
     """Most points of each path."""
 
 
-SCALES = (float(np.log(StaticPageTuning.min_size_m)), float(np.log(SplatTuning.max_size_m)))
+SCALES = (float(np.log(StaticPageTuning.min_size_m)), float(np.log(DrawnSplatTuning.max_size_m)))
 """Logarithms of the smallest and largest standard deviation that are written, 255 steps (4 %) apart."""
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of the occupancy map, documented."""
+"""Settings of the occupancy map."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from ggslam.system.untrusted_files import read_untrusted
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.occupancy_arrays import output_bytes
 from ggslam.volumes.occupancy_settings import OccupancySettings, log_odds
-from ggslam.volumes.quantization import QuantizationTuning
+from ggslam.volumes.quantization import KeyGridTuning
 
 _BINARY: Final = 0
 """Code of OctoMap's binary format (.bt) in the compiled core."""
@@ -178,7 +178,7 @@ def _read_header(data: bytes, name: str) -> _Header:
     if fields.get("id") != "OcTree":
         raise FormatError(f"{name}: expected a map of kind OcTree, found {fields.get('id', 'none')!r}")
     nodes, resolution = _number(fields, "size", name), _number(fields, "res", name)
-    low, high = QuantizationTuning.resolution_range
+    low, high = KeyGridTuning.resolution_range
     if not low <= resolution <= high:
         raise FormatError(f"{name}: res: expected {low:g} to {high:g} m, found {fields['res']}")
     if nodes < 0 or nodes != int(nodes):

@@ -21,7 +21,7 @@ KEY_OFFSET: Final = 32768
 """OctoMap's key of the voxel whose lower corner is the origin of the world."""
 
 
-class QuantizationTuning(Tuning):
+class KeyGridTuning(Tuning):
     """Limits of the key grid."""
 
     resolution_range = (1e-4, 1e3)
@@ -81,6 +81,6 @@ def key_centers(keys: np.ndarray, resolution: float) -> np.ndarray:
 
 def check_resolution(resolution: float) -> None:
     """Raises ConfigError for an impossible edge of a voxel."""
-    low, high = QuantizationTuning.resolution_range
+    low, high = KeyGridTuning.resolution_range
     if not low <= resolution <= high:
         raise ConfigError(f"resolution: expected {low:g} to {high:g} m, found {resolution}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers of the truncated signed distance field."""
+"""Settings of the truncated signed distance field."""
 
 from __future__ import annotations
 

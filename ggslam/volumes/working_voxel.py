@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which voxels a view can be fused with, for those who asked for too small ones."""
+"""Finds the smallest voxel that a view can be fused with, for an error about voxels that are too small."""
 
 from __future__ import annotations
 

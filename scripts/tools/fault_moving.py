@@ -193,7 +193,7 @@ def killed_refinement(place: Place) -> None:
     place.ended.clear()
     run_program(place, KILLED, *few)
     again = place.ggslam(*few)
-    if "cells were done by an earlier call" in again.text and "trained" not in again.said:
+    if "an earlier call had finished" in again.text and "trained" not in again.said:
         place.keep("all cells that were trained")
 
 

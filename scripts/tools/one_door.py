@@ -50,6 +50,7 @@ ALLOWED = {
     "ggslam.viewer.static_page:static_page": "files of this package",
     "ggslam.cuda.compiler:library_path": "sources of this package",
     "ggslam.native.loader:source_hash": "sources of this package",
+    "ggslam.abi.headers:__init__": "headers of this package",
     "ggslam.system.interrupts:*": "/dev/null",
     "ggslam.submaps.index:create": "a new index",
     "ggslam.submaps.index:copy": "a new index",

@@ -30,7 +30,7 @@ from ggslam.jobs.run.grades import (
 from ggslam.jobs.run.map_fit import MapFit, measure_fit
 from ggslam.jobs.run.pipeline import RunOutcome, RunRequest, execute
 from ggslam.jobs.run.run_verdict import judge_result, judge_scores, overall
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.movers.mover_table import FoundMover, MoverSight
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest
@@ -167,7 +167,7 @@ def test_noise_does_not_make_it_bad(sound: RunOutcome) -> None:
 
 
 def test_nothing_to_compare_with(sound: RunOutcome) -> None:
-    elsewhere = [replace(k, frame_index=ELSEWHERE) for k in sound.result.keyframes]
+    elsewhere = [replace(k, frame_index=FROM_EARLIER_RUN) for k in sound.result.keyframes]
     view = RunFolder.open(sound.folder.path).map_in_parts().in_view
     assert measure_fit(elsewhere, view) is None
     assert measure_fit([replace(k, depth=np.zeros_like(k.depth)) for k in sound.result.keyframes], view) is None

@@ -12,7 +12,7 @@ import torch
 
 from ggslam.errors import SequenceError
 from ggslam.jobs.changes.stale_gaussians import without_stale_gaussians
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
@@ -39,7 +39,7 @@ def visit(
     frame = Frame(0, 0, 0.0, color, depth.astype(np.float32), CAMERA, mask=mask)
     source = SimpleNamespace(
         name="tuesday",
-        record=SimpleNamespace(keyframes=[SimpleNamespace(frame=f) for f in (ELSEWHERE, *range(own))]),
+        record=SimpleNamespace(keyframes=[SimpleNamespace(frame=f) for f in (FROM_EARLIER_RUN, *range(own))]),
         sequence=SimpleNamespace(frame=lambda index, masks: frame) if recording else None,
         known=SimpleNamespace(noise=DepthNoise()), has_lasting_ids=lambda: mask is not None,
     )

@@ -9,7 +9,7 @@ import torch
 
 from ggslam.mapping.cpu.insertion import fill_gaussians
 from ggslam.mapping.cpu.mapper import CpuMapper
-from ggslam.mapping.keyframe import ELSEWHERE, PoseAdam, make_keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, PoseAdam, make_keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.mean_map import AVERAGED
 from ggslam.mapping.pixel_grid import PixelGrid
@@ -260,7 +260,7 @@ def test_what_no_keyframe_or_the_newest_inserted_stays(birth: int) -> None:
 
 def test_what_an_earlier_map_has_stays() -> None:
     mapper = with_hidden(50, birth=0)
-    mapper.keyframes[0] = dataclasses.replace(mapper.keyframes[0], frame_index=ELSEWHERE)
+    mapper.keyframes[0] = dataclasses.replace(mapper.keyframes[0], frame_index=FROM_EARLIER_RUN)
     mapper.drop_hidden()
     assert (mapper.map.means[:, 2] > 3.5).sum() == 50
 

@@ -172,7 +172,7 @@ def test_stripes_run_on_through_a_gap(patches: int) -> None:
     image = np.broadcast_to(stripes[None, :, None], (60, 120, 3)).astype(np.float32)
     gap = np.zeros((60, 120), bool)
     gap[15:45, 30:90] = True
-    with overridden(texture.TextureTuning, max_patches=patches):
+    with overridden(texture.GapTextureTuning, max_patches=patches):
         filled = texture.fill_gap(np.where(gap[..., None], 0, image).astype(np.float32), ~gap, gap)
     wrong = (np.abs(filled - image[gap]).mean(1) > 0.25).mean()
     assert wrong < 0.15

@@ -112,7 +112,7 @@ def test_a_cache_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Monk
     stand_in(tmp_path, COMPILES, monkeypatch)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("GGSLAM_CACHE", str(tmp_path / "file" / "cache"))
-    with pytest.raises(MissingDependency, match="GGSLAM_CACHE"):
+    with pytest.raises(MissingDependency, match=str(tmp_path / "file" / "cache")):
         compiler.compiled_library("90")
 
 
@@ -129,7 +129,7 @@ def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_file_that_is_no_library(tmp_path: Path) -> None:
     (tmp_path / "broken.so").write_text("library\n")
-    with pytest.raises(MissingDependency, match="cannot be loaded"):
+    with pytest.raises(MissingDependency, match="broken.so"):
         CudaLibrary(tmp_path / "broken.so")
 
 

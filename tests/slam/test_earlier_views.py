@@ -10,7 +10,7 @@ import pytest
 from box_room import CAMERA, QUICK, RED, picture, red_share
 
 from ggslam.errors import FormatError
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.slam.config import load_config
 from ggslam.slam.filters.earlier_views import EarlierViews
 from ggslam.slam.saved_state import describe_state, restore_state
@@ -39,7 +39,7 @@ def two_visits(box_x: float, told: bool = True, frames: int = ALL) -> Slam:
     slam = go_on(new_slam(), range(EARLIER), BOX)
     if told:
         for keyframe in slam.mapper.keyframes:
-            keyframe.frame_index = ELSEWHERE
+            keyframe.frame_index = FROM_EARLIER_RUN
     return go_on(slam, range(EARLIER, frames), box_x)
 
 
@@ -71,7 +71,7 @@ def test_what_stands_before_an_earlier_view_is_left_out_of_it() -> None:
     """The wall behind it is there as before: its Gaussians stay."""
     slam = go_on(new_slam(), range(EARLIER), AWAY)
     for keyframe in slam.mapper.keyframes:
-        keyframe.frame_index = ELSEWHERE
+        keyframe.frame_index = FROM_EARLIER_RUN
     go_on(slam, range(EARLIER, ALL), BOX)
     first = slam.mapper.keyframes[0]
     box = (picture(0, 0, BOX).color == RED).all(2)

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, make_keyframe
 from ggslam.objects.table import Observation
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -33,7 +33,7 @@ def test_the_typical_point_is_a_gaussian_in_the_middle() -> None:
 def test_chances_are_segmented_keyframes_that_show_the_place() -> None:
     points = {5: np.array([0.0, 0, 2]), 6: np.array([0.0, 0, 2.5]), 8: np.array([0.0, 0, -2])}
     elsewhere = keyframe(6)
-    elsewhere.frame_index = ELSEWHERE
+    elsewhere.frame_index = FROM_EARLIER_RUN
     keyframes = [
         keyframe(0), keyframe(1), keyframe(2, masked=False), keyframe(3, x=10), keyframe(4, wall=1.0), keyframe(5),
         elsewhere,

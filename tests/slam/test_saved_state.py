@@ -16,7 +16,7 @@ import torch
 from ggslam.errors import ConfigError, FormatError
 from ggslam.loops.activity import ActivitySettings
 from ggslam.mapping.cpu.neighbours import NeighbourIndex
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import Config, load_config
@@ -109,7 +109,7 @@ def test_keyframes_of_an_earlier_map_may_be_of_a_rig(room: Path, camera_number: 
         slam.step(frame)
     slam.mapper.keyframes[0].camera_number = camera_number
     if elsewhere:
-        slam.mapper.keyframes[0].frame_index = ELSEWHERE
+        slam.mapper.keyframes[0].frame_index = FROM_EARLIER_RUN
     if camera_number and not elsewhere:
         with pytest.raises(FormatError, match="keyframe 0"):
             check_state(slam)

@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts" / "benchmarks"))
 import bench_sensitivity as bench  # noqa: E402
 
-from ggslam.geometry import scene_size  # noqa: E402
+from ggslam.geometry.scene_size import SceneSizeTuning  # noqa: E402
 from ggslam.slam.config import load_config  # noqa: E402
 
 
@@ -30,13 +30,12 @@ def test_every_internal_number_can_be_changed() -> None:
         load_config(None, change.overrides)
 
 
-def test_constants_hold_another_value_meanwhile() -> None:
-    changes = [c for c in bench.constant_changes(["geometry"]) if c.name.startswith("ggslam.geometry.scene_size:")]
-    name = changes[0].name.partition(":")[2]
-    usual = getattr(scene_size, name)
+def test_tuning_holds_another_value_meanwhile() -> None:
+    changes = [c for c in bench.tuning_changes(["geometry"]) if c.name == "geometry.SceneSizeTuning:near_m"]
+    assert [change.value for change in changes] == [0.5, 2.0] and SceneSizeTuning.near_m == 1.0
     with bench.applied(changes[0]):
-        assert getattr(scene_size, name) == changes[0].value != usual
-    assert getattr(scene_size, name) == usual
+        assert SceneSizeTuning.near_m == 0.5
+    assert SceneSizeTuning.near_m == 1.0
 
 
 @pytest.mark.parametrize(("hashes", "idle"), [(("a", "a"), True), (("a", "b"), False), (("a", ""), True)])

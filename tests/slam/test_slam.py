@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ggslam.errors import SequenceError
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
@@ -65,7 +65,8 @@ def test_with_noisy_depth_the_last_iterations_are_two_steps(frames: list[Frame])
 def test_the_end_has_more_steps_than_the_frames_had_and_some_for_each_keyframe(frames: list[Frame]) -> None:
     mapper = new_slam(frames).mapper
     assert mapper.last_iterations(0) == 0 and mapper.last_iterations(1000) == 1200
-    mapper.keyframes = 200 * [Mock(frame_index=3)] + 500 * [Mock(frame_index=ELSEWHERE)]  # these an earlier map has
+    earlier = 500 * [Mock(frame_index=FROM_EARLIER_RUN)]
+    mapper.keyframes = 200 * [Mock(frame_index=3)] + earlier
     assert mapper.last_iterations(0) == 0 and mapper.last_iterations(1000) == 2000
     mapper.is_live = True
     assert mapper.last_iterations(1000) == 400

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import sqlite3
 import subprocess
@@ -217,7 +218,9 @@ def test_a_damaged_part_harms_no_other(folder: Path, damage: str, reason: str) -
         with pytest.raises(FormatError, match=f"1_0_0.*points.pcd.*{reason}"):
             store.get((1, 0, 0), "points.pcd")
         problems = list(store.problems())
-        assert len(problems) == (damage != "flip") and all(reason in line and "1_0_0" in line for line in problems)
+        assert len(problems) == (damage != "flip") and all(
+            re.search(reason, line) and "1_0_0" in line for line in problems
+        )
         assert store.get((1, 0, 0), "places.npz") == b"56" and store.get((2, 0, 0), "points.pcd") == b"01234"
         store.put((1, 0, 0), {"points.pcd": b"mended"})
         assert store.get((1, 0, 0), "points.pcd") == b"mended"

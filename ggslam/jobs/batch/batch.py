@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the runs of a batch that are not there yet, and the table of all."""
+"""Makes the missing runs of a batch and the table of all runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Engine = Literal["local", "ray", "none"]
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """What a batch has made.
+    """Result of a batch.
 
     Attributes:
         states: of its runs.

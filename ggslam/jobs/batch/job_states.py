@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far each run of a batch is, and what is remembered of it: a file beside its folder, `jobs/NAME.json`."""
+"""The state of each run of a batch, kept in a file beside its folder, `jobs/NAME.json`."""
 
 from __future__ import annotations
 

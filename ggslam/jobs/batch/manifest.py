@@ -31,7 +31,7 @@ their own (`--log`, `--record`), run code of others (`--loss`), serve pages, or 
 
 @dataclass(frozen=True)
 class BatchJob:
-    """One run.
+    """A run of a batch.
 
     Attributes:
         recording, settings: names, for the table.

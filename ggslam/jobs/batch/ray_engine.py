@@ -32,7 +32,7 @@ _TOKEN = ".shared-by"
 
 @dataclass(frozen=True)
 class Made:
-    """What a worker made.
+    """Files that a worker produced.
 
     Attributes:
         exit_code, seconds, line: of the run.
@@ -62,7 +62,7 @@ class Begun:
 
 @dataclass(frozen=True)
 class RayJob:
-    """What a worker is given.
+    """Input of a worker.
 
     Attributes:
         job: the run to make.

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 
 from ggslam.jobs.batch.manifest import Manifest, option
 from ggslam.jobs.tasks.processors import ProcessorTuning
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 
@@ -41,7 +42,7 @@ def slurm_script(manifest: Manifest, arguments: Sequence[str], only: str, table:
     end = {"job-name": f"{title} table", "cpus-per-task": "1", "wrap": f"{command} {table}"}
     return "\n".join([
         "#!/bin/bash",
-        f"# Submits {len(manifest.jobs)} runs of {title} and a job for their table.",
+        f"# Submits {quantity(len(manifest.jobs), 'run')} of {title} and a job for their table.",
         "# Times and memory are guesses: change them to what your recordings need.",
         "set -eu",
         f"mkdir -p {shlex.quote(str(out))}",

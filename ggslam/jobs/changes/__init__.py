@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is different between two visits: what `ggslam changes` does."""
+"""Changes between two visits."""

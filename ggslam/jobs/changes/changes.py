@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is different between the visits of two finished runs: what `ggslam changes` does, usable from Python."""
+"""Finds what changed between the visits of two finished runs. `ggslam changes` calls this."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CHANGES_FILE = "changes.json"
 
 @dataclass(frozen=True)
 class ChangesOutcome:
-    """What came of a comparison.
+    """Result of comparing two visits.
 
     Attributes:
         table: the changes, in the world of the older run.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Changes as pages show them: a folder of changes read again, words, pictures."""
+"""Reads a folder that `ggslam changes` wrote, and describes the changes for pages."""
 
 from __future__ import annotations
 

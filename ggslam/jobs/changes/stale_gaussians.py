@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a visit that began in an earlier map still shows of it, although its own depth looked through it.
+"""Removes Gaussians of an earlier map that a visit's own depth looks through.
 
-A visit trains the earlier map further, and things that were carried away fade, but slowly: behind their last haze
-nothing would be seen to have changed.
+A visit that starts in an earlier map trains it further. Objects that were carried away fade slowly, and their haze
+would hide what changed behind them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 
 from ggslam.errors import GgslamError
 from ggslam.jobs.merge.sources import MergeSource
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.merging.coverage import PlacedRun
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.gaussian_map import GaussianMap
@@ -39,7 +39,7 @@ class StaleGaussianTuning(Tuning):
 def own_keyframes(record: KeyframesRecord) -> Sequence[int]:
     """Numbers of the keyframes of a run's own recording. A run that began in another's map has that one's, too: they
     saw what was there before. All of them if none is its own."""
-    own = [number for number, keyframe in enumerate(record.keyframes) if keyframe.frame != ELSEWHERE]
+    own = [number for number, keyframe in enumerate(record.keyframes) if keyframe.frame != FROM_EARLIER_RUN]
     return own or range(len(record.keyframes))
 
 
@@ -81,7 +81,7 @@ def without_stale_gaussians(source: MergeSource, placed: PlacedRun, notes: list[
 
 @dataclass(frozen=True)
 class _Seen:
-    """What keyframes say of n Gaussians.
+    """What a visit's keyframes show of n Gaussians.
 
     Attributes:
         counts: how many look through one, and how many see a surface there...

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a visit found of the objects of a grid store: from the history of an updated run, or from compared maps."""
+"""Events of a grid store's objects in a visit, from the history of an updated run or from compared maps."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run becomes a visit of a grid store: its cells, its objects, and what happened to those that were there."""
+"""Adds a run to a grid store as a visit: its cells, its objects, and what happened to earlier objects."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class SameWorldTuning(Tuning):
 
 @dataclass
 class _Comparison:
-    """What is known of a visit's objects before its cells are written."""
+    """The objects of a visit before its cells are written."""
 
     entry: VisitObjects
     known: dict[int, StoredObject]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How A is brought into the frame of B: not at all, by true poses, by common times, or by ICP."""
+"""Aligns A with the frame of B: not at all, by true poses, by common times, or by ICP."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.scene.poses import fit_similarity, inverse
 from ggslam.sequences.association import PairingTuning, pair_times
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 Alignment = Literal["auto", "none", "truth", "icp", "trajectory"]
 
 
-class AlignmentTuning(Tuning):
+class RunAlignmentTuning(Tuning):
     """When an alignment of two runs is believed."""
 
     arm_m = 1.0
@@ -41,7 +42,7 @@ class AlignmentTuning(Tuning):
 
 @dataclass(frozen=True)
 class Side:
-    """One of the two things compared.
+    """One side of a comparison.
 
     Attributes:
         path: a run's folder or a file.
@@ -78,8 +79,8 @@ def by_trajectory(a: Side, b: Side, pairs: np.ndarray) -> np.ndarray:
         raise ConfigError(f"`align` trajectory: {lacking.path} is a file and has no trajectory; use icp or none")
     if len(pairs) < FEWEST_POSES:
         raise ConfigError(
-            f"`align` trajectory: {a.path} and {b.path} have {len(pairs)} poses at common times, expected at least "
-            f"{FEWEST_POSES}"
+            f"`align` trajectory: {a.path} and {b.path} share {quantity(len(pairs), 'time')} of poses, expected at "
+            f"least {FEWEST_POSES}"
         )
     source, target = a.trajectory.T_world_camera[pairs[:, 0]], b.trajectory.T_world_camera[pairs[:, 1]]
     return align_points(source[:, :3, 3], target[:, :3, 3])[0]
@@ -108,9 +109,9 @@ def best_of_truth_and_none(
         T = by_truth(a, b)
     except ConfigError:
         return "none", np.eye(4)
-    few = Cloud(a.points[Cloud(a.points).sample(AlignmentTuning.probes, seed)])
+    few = Cloud(a.points[Cloud(a.points).sample(RunAlignmentTuning.probes, seed)])
     plain, moved = (overlap(few, cloud_b, max_distance, start, seed).fitness for start in (np.eye(4), T))
-    return ("truth", T) if moved > plain + AlignmentTuning.min_gain else ("none", np.eye(4))
+    return ("truth", T) if moved > plain + RunAlignmentTuning.min_gain else ("none", np.eye(4))
 
 
 def check_registration(a: Side, b: Side, found: CloudRegistration, back: float) -> None:
@@ -124,11 +125,11 @@ def check_registration(a: Side, b: Side, found: CloudRegistration, back: float) 
         ConfigError: it is nonsense.
     """
     best = max(found.overlap.fitness, back)
-    if best < AlignmentTuning.min_overlap:
+    if best < RunAlignmentTuning.min_overlap:
         raise ConfigError(
             f"`align` icp: {a.path} cannot be registered upon {b.path} by ICP: at the best pose found "
             f"({100 * found.moved_m:.0f} cm, {found.turned_deg:.0f} degrees away) {best:.0%} of the points "
-            f"have a partner, {AlignmentTuning.min_overlap:.0%} needed; ICP needs a start within about a metre: use "
+            f"have a partner, {RunAlignmentTuning.min_overlap:.0%} needed; ICP needs a start within about a metre: use "
             "truth or trajectory, or move one of them first"
         )
 
@@ -142,16 +143,18 @@ def _true_world(side: Side) -> np.ndarray:
                           "recording knows true poses")  # fmt: skip
     pairs = pair_times(side.trajectory.timestamps, side.truth.timestamps, 1e-3)
     if len(pairs) < FEWEST_POSES:
-        raise ConfigError(f"`align` truth: {side.path}: {len(pairs)} poses have a true one, {FEWEST_POSES} needed")
+        raise ConfigError(
+            f"`align` truth: {side.path}: found true poses for {quantity(len(pairs), 'pose')}, {FEWEST_POSES} needed"
+        )
     found, true = side.trajectory.T_world_camera[pairs[:, 0]], side.truth.T_world_camera[pairs[:, 1]]
     T = fit_similarity(_arms(found), _arms(true))[0]
     positions = true[:, :3, 3]
     error = float(np.sqrt((((T @ found)[:, :3, 3] - positions) ** 2).sum(1).mean()))
-    extent = float(np.linalg.norm(np.ptp(positions, axis=0))) + AlignmentTuning.arm_m
-    if error > AlignmentTuning.max_error * extent:
+    extent = float(np.linalg.norm(np.ptp(positions, axis=0))) + RunAlignmentTuning.arm_m
+    if error > RunAlignmentTuning.max_error * extent:
         raise ConfigError(
             f"`align` truth: the trajectory of {side.path} does not fit its true poses: {100 * error:.0f} cm off "
-            f"(RMSE) along a path that spans {extent - AlignmentTuning.arm_m:.2f} m"
+            f"(RMSE) along a path that spans {extent - RunAlignmentTuning.arm_m:.2f} m"
         )
     return T
 
@@ -159,6 +162,6 @@ def _true_world(side: Side) -> np.ndarray:
 def _arms(poses: np.ndarray) -> np.ndarray:
     """Places [4 N, 3]: of each camera [N, 4, 4], and points along its axes."""
     places = poses[:, None, :3, 3]
-    return np.concatenate([places, places + AlignmentTuning.arm_m * poses[:, :3, :3].transpose(0, 2, 1)], 1).reshape(
+    return np.concatenate([places, places + RunAlignmentTuning.arm_m * poses[:, :3, :3].transpose(0, 2, 1)], 1).reshape(
         -1, 3
     )

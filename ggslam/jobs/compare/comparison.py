@@ -52,7 +52,7 @@ class MeshSamplingTuning(Tuning):
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was found.
+    """Result of a comparison.
 
     Attributes:
         a, b: the two sides.

@@ -19,6 +19,7 @@ from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.runs.map_file import MapFile
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import make_folder
+from ggslam.system.plurals import quantity
 
 WHOLE = "all"
 """What the whole of a file without objects is called."""
@@ -88,7 +89,7 @@ def _edit_whole(
         )
     gaussians.move(torch.arange(len(gaussians)), torch.from_numpy(rigid_motion(middle, shift, turn)))
     turned = f", turned by {_text(turn)} degrees" if np.any(turn) else ""
-    return f"moved all by {_text(shift)} m{turned}: {len(gaussians)} Gaussians"
+    return f"moved all by {_text(shift)} m{turned}: {quantity(len(gaussians), 'Gaussian')}"
 
 
 def _text(values: Sequence[float]) -> str:

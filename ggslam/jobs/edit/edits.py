@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edits of a run's map: a new run folder with the edited map and pictures of before and after. What `ggslam edit` does,
-usable from Python."""
+"""Edits a run's map: writes a run folder with the edited map and pictures from before and after. `ggslam edit`
+calls this."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ggslam.jobs.edit.edit import KINDS, Edit
 from ggslam.jobs.edit.edited_file import edit_file
 from ggslam.jobs.edit.edited_run import save_edited
 from ggslam.jobs.edit.pictures import before_and_after
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
     Change,
@@ -43,6 +43,7 @@ from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 
@@ -59,7 +60,7 @@ Apply = Callable[[SegmentedMap, Edit], Change]
 
 @dataclass
 class EditOutcome:
-    """What came of it.
+    """Result of editing a run.
 
     Attributes:
         folder: the edited run, or the file that stands for it.
@@ -190,7 +191,7 @@ class _Source:
             raise RunFolderError(f"{folder.path / record.FILE}: it lists no keyframes or no tracked frames")
         # Keyframes of the map that the run began with have no images here.
         views = [
-            CameraView(recording.camera, inverse(k.T_world_camera), None) if k.frame == ELSEWHERE
+            CameraView(recording.camera, inverse(k.T_world_camera), None) if k.frame == FROM_EARLIER_RUN
             else CameraView(recording.camera_of(k.frame), inverse(k.T_world_camera), k.frame)
             for k in record.keyframes
         ]  # fmt: skip
@@ -230,7 +231,9 @@ def _with_consent(confirm: Callable[[str], bool] | None) -> Apply:
         removed = len(change.before.means)
         if confirm is None or edit.kind != "remove" or removed <= EditTuning.confirmed_share * before:
             return change
-        if not confirm(f"`remove` {names}: {removed} of {before} Gaussians, {removed / before:.0%} of the map"):
+        if not confirm(
+            f"`remove` {names}: {removed} of {quantity(before, 'Gaussian')}, {removed / before:.0%} of the map"
+        ):
             raise ConfigError(f"`remove` {names}: not confirmed; nothing was changed")
         return change
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is coded beside the positions of a cloud file, and how it comes back: colours, reflectance, ids."""
+"""Codes the attributes of a cloud beside its positions and restores them: colours, reflectance, ids."""
 
 from __future__ import annotations
 

@@ -16,11 +16,12 @@ from ggslam.objects.table import ObjectTable
 from ggslam.runs.map_container import MAP, TABLE, Container, open_container
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.system.atomic import write_bytes
+from ggslam.system.plurals import quantity
 
 
 @dataclass
 class Contents:
-    """What is in a file.
+    """Contents of a coded file.
 
     Attributes:
         facts: name and words of each thing that is to be known.
@@ -48,7 +49,7 @@ def contents_of_run(path: Path) -> Contents:
     found = Contents([
         ("map of a run", f"version {held.head.version}, written by ggslam {held.head.ggslam}, rate {held.head.rate}"),
         ("Gaussians", str(held.head.gaussians)),
-        ("keyframes", f"{len(frames.keyframes)} of {len(frames.frames)} frames"),
+        ("keyframes", f"{len(frames.keyframes)} of {quantity(len(frames.frames), 'frame')}"),
         ("objects", objects),
     ], held.head.gaussians)  # fmt: skip
     _add_stream(found, MAP, held.members[MAP])
@@ -65,7 +66,8 @@ def contents_of_cells(path: Path) -> Contents:
     head, count = cells.head, sum(member.gaussians for member in cells.head.cells.values())
     found = Contents([
         ("cells of a store", f"version {head.version}, written by ggslam {head.ggslam}, rate {head.rate}"),
-        ("grid", f"{len(head.cells)} cells of {head.spacing:g} m along {head.axes}"), ("Gaussians", str(count)),
+        ("grid", f"{quantity(len(head.cells), 'cell')} of {head.spacing:g} m along {head.axes}"),
+        ("Gaussians", str(count)),
     ], count)  # fmt: skip
     try:
         known = cells.objects()

@@ -26,6 +26,7 @@ from ggslam.reporting.plots import Plot, Series
 from ggslam.system.atomic import make_folder, write_text
 from ggslam.system.csv_text import csv_text
 from ggslam.system.json_files import write_json
+from ggslam.system.plurals import quantity
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ class _Pictures:
         points = self._place(cloud.grid)
         self._view: CloudView = view_of(points)
         original = draw_cloud(points, cloud.colors, self._view, 1 / cloud.quantization.scale)
-        self._original = (original, f"original, {len(cloud.grid)} points")
+        self._original = (original, f"original, {quantity(len(cloud.grid), 'point')}")
         self._drawn: dict[str, list[tuple[np.ndarray, str]]] = {}
 
     def _place(self, voxels: np.ndarray) -> np.ndarray:

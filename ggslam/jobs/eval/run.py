@@ -36,6 +36,7 @@ from ggslam.sequences.rig import RigSequence
 from ggslam.slam.filters.camera_fixtures import CameraFixtures, find_fixtures
 from ggslam.system.atomic import make_folder, write_text
 from ggslam.system.csv_text import csv_text
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 
@@ -109,11 +110,11 @@ def _score(
         notes.append(f"{share:.0%} of every image is fixed to the camera; its pixels count as without depth")
     past = sum(part.frames for part in folder.sequence().parts or [] if part.past)
     if past:
-        notes.append(f"{past} frames are of earlier visits, which the map was brought up to date from; images and "
-                     "objects are not scored against them")  # fmt: skip
+        notes.append(f"images and objects of {quantity(past, 'frame')} of earlier visits are not scored: the map was "
+                     "brought up to date since")  # fmt: skip
     lost = [f.frame for f in record.frames if f.is_lost]
     if lost:
-        notes.append(f"{len(lost)} frames were lost (the first: {lost[0]}); they have no pose and are in no score")
+        notes.append(f"no pose and no score for {quantity(len(lost), 'lost frame')}, the first: {lost[0]}")
     if metrics.trajectory is None:
         known = sequence.ground_truth is not None
         reason = "fewer than 3 frames have both poses" if known else "the recording has no ground-truth poses"

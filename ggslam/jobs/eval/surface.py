@@ -21,7 +21,7 @@ from ggslam.volumes.surface_points import SurfacePointTuning, surface_settings
 from ggslam.volumes.tsdf import TsdfMap
 
 
-class SurfaceScoreTuning(Tuning):
+class RunSurfaceTuning(Tuning):
     """How much of a recording is scored."""
 
     max_blocks = 150_000
@@ -70,7 +70,7 @@ class SurfaceScorer:
         """Counts a frame in."""
         if self._tsdf is None:
             return
-        if self._tsdf.dense_blocks > SurfaceScoreTuning.max_blocks:
+        if self._tsdf.dense_blocks > RunSurfaceTuning.max_blocks:
             self.reason = f"{METRIC_FILE} is scored against the depth of the frames up to {frame.index}"
             return
         depth = frame.depth if frame.moving is None else np.where(frame.moving, np.float32(0), frame.depth)

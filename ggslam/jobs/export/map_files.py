@@ -17,6 +17,7 @@ from ggslam.runs.opened_points import opened_points
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.object_names import object_file_name
 from ggslam.system.atomic import make_folder, write_bytes
+from ggslam.system.plurals import quantity
 
 OBJECT_EXTRAS = ("object_id", "identity")
 """Properties of a 3DGS PLY that say which object a Gaussian belongs to."""
@@ -62,7 +63,7 @@ def export_objects(
     dataclasses.replace(scene.table, objects=chosen).save(path / "objects.json")
     if not plain:
         _write_classifier(path / "map.ply", scene.classifier)
-    return f"wrote {len(chosen)} object{'s' * (len(chosen) != 1)} to {path}: {total} Gaussians"
+    return f"wrote {quantity(len(chosen), 'object')} to {path}: {quantity(total, 'Gaussian')}"
 
 
 def _export_object(
@@ -72,7 +73,7 @@ def _export_object(
     count = opaque.objects([record.id]).write(path, () if classifier is None else OBJECT_EXTRAS)
     if classifier is not None:
         _write_classifier(path, classifier)
-    return f"wrote {record.label()} to {path}: {count} Gaussians"
+    return f"wrote {record.label()} to {path}: {quantity(count, 'Gaussian')}"
 
 
 

@@ -22,6 +22,7 @@ from ggslam.runs.rendered_views import RenderedViews
 from ggslam.scene.frame import Frame
 from ggslam.scene.object_names import object_file_name
 from ggslam.system.atomic import make_folder
+from ggslam.system.plurals import quantity
 from ggslam.volumes.floor_frame import FLOOR_FILE, FloorTuning, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh
@@ -30,7 +31,7 @@ from ggslam.volumes.output_frame import OutputFrame
 
 @dataclass(frozen=True)
 class MeshRequest:
-    """Which mesh is wanted.
+    """A request for a mesh.
 
     Attributes:
         voxel: edge of the voxels, metres; None: as the run's settings say; where they say nothing, as goes with the
@@ -152,7 +153,7 @@ def _map_views(folder: RunFolder) -> _Views:
     views = RenderedViews.of_files(folder.path, folder.map_in_parts())
     if not len(views):
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
-    return _Views(_renders(views), len(views), f"depth rendered at {len(views)} keyframes")
+    return _Views(_renders(views), len(views), f"depth rendered at {quantity(len(views), 'keyframe')}")
 
 
 def _renders(views: RenderedViews) -> Iterator[PosedFrame]:
@@ -198,4 +199,5 @@ def _write_each(out: Path, mesh: Mesh, labels: np.ndarray, table: ObjectTable, i
     without = len(ids) - len(written)
     lacking = f" ({without} have no surface at this voxel)" if without else ""
     total = sum(len(part.triangles) for part in written)
-    return f"wrote {len(written)} object{'s' * (len(written) != 1)} to {out}{lacking}: {total} triangles, from {origin}"
+    wrote = f"wrote {quantity(len(written), 'object')} to {out}{lacking}"
+    return f"{wrote}: {quantity(total, 'triangle')}, from {origin}"

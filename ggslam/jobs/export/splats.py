@@ -25,7 +25,7 @@ from ggslam.submaps.grid import GridStore
 
 @dataclass(frozen=True)
 class SplatRequest:
-    """Which Gaussians are wanted.
+    """A request for Gaussians.
 
     Attributes:
         objects: of these only, names or ids, "mug,7", or "all"; None: of the whole map.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The work behind `ggslam localize`: opens map and recording, locates every frame, writes what came of it."""
+"""Localizes a recording in a stored map: opens both, locates every frame, and writes the results."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
+from ggslam.system.plurals import quantity
 from ggslam.system.settings import tuning_note
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import TargetSettings
@@ -69,7 +70,7 @@ class LocateTuning(Tuning):
 
 @dataclass(frozen=True)
 class LocalizeRequest:
-    """What is asked for.
+    """A request to localize a recording.
 
     Attributes:
         map: folder of a grid store or a run, or a cloud.
@@ -150,7 +151,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     with delay_interrupts():
         write_localization(report, out, observer)
     if error is not None:
-        observer.note(f"stopped after {len(results)} of {len(recording)} frames, which are in {out}")
+        observer.note(f"stopped after {len(results)} of {quantity(len(recording), 'frame')}, which are in {out}")
         raise error
     return report
 
@@ -330,7 +331,9 @@ def _run(
             results.append(localizer.locate(item))
             observer.advance(len(results), len(recording))
         if isinstance(recording, ScanSequence) and recording.all_empty:
-            raise SequenceError(f"{recording.path}: none of {len(recording)} scans has a point with a position")
+            raise SequenceError(
+                f"{recording.path}: none of {quantity(len(recording), 'scan')} has a point with a position"
+            )
     except (GgslamError, KeyboardInterrupt) as stopped:  # what was located is written first
         return results, stopped
     return results, None

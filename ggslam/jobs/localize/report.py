@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What came of locating a recording in a map: the numbers of SRT-PM's table 1, a trajectory, plots."""
+"""Results of localizing a recording: the numbers of SRT-PM's table 1, a trajectory, and plots."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be set where recordings are located in stored maps."""
+"""Settings of localization in stored maps."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seconds by part of a merge."""
+"""Seconds that the parts of a merge take."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 
 
 class Clock:
-    """Counts from when it is made."""
+    """Counts seconds from its creation."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several runs are read, and the folder of the one that they become is begun."""
+"""Reads several runs and starts the folder of the merged run."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several runs in one world: where their keyframes are in it, and their maps."""
+"""Brings several runs into one world: the poses of their keyframes, and their maps."""
 
 from __future__ import annotations
 

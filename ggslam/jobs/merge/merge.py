@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finished runs as one: what `ggslam merge` does, usable from Python."""
+"""Merges finished runs into one. `ggslam merge` calls this."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from ggslam.system.interrupts import delay_interrupts
 
 @dataclass
 class MergeOutcome:
-    """What came of a merge.
+    """Result of a merge.
 
     Attributes:
         folder: the merged run.
@@ -111,7 +111,7 @@ def _bare_runs(sources: list[MergeSource], objects: UnitedObjects) -> list[str]:
 
 @dataclass
 class _Merge:
-    """A merge on its way."""
+    """A merge in progress."""
 
     sources: list[MergeSource]
     folder: RunFolder

@@ -15,7 +15,7 @@ from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.trajectory import write_tum
 from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.merge.truth import truth_transforms
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.merging.joint_graph import JointPoses
 from ggslam.merging.objects import UnitedObjects
 from ggslam.objects.history import History
@@ -140,7 +140,7 @@ class MergedRun:
         for source in self.sources:
             for k, old in enumerate(source.record.keyframes):
                 new = self.keyframes[source.first_keyframe + k]
-                frame = ELSEWHERE if old.frame == ELSEWHERE else old.frame + source.first_frame
+                frame = FROM_EARLIER_RUN if old.frame == FROM_EARLIER_RUN else old.frame + source.first_frame
                 keyframes.append(old.model_copy(update={
                     "index": new.index, "frame": frame,
                     "timestamp": None if old.timestamp is None else old.timestamp + source.time_shift_s,

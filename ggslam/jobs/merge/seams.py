@@ -12,7 +12,7 @@ from ggslam.jobs.merge.sources import MergeSource
 from ggslam.jobs.merge.unseen_gaussians import UnseenGaussians
 from ggslam.jobs.progress import Observer
 from ggslam.mapping.finished import load_finished, train_by_turns
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, make_keyframe
 from ggslam.merging.coverage import PlacedRun
 from ggslam.merging.objects import UnitedObjects
 from ggslam.native.loader import NativeContext
@@ -23,7 +23,7 @@ from ggslam.slam.parts import make_mapper
 
 @dataclass(frozen=True)
 class TrainedSeams:
-    """What came of it.
+    """Result of training at the seams.
 
     Attributes:
         keyframes: of all runs, as training left their poses.
@@ -95,8 +95,8 @@ def keyframes_of(
         for k, record in enumerate(source.record.keyframes):
             index, T, camera = source.first_keyframe + k, poses[number][k], source.known.cameras[k]
             no_color, no_depth = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.uint16)
-            keyframe = Keyframe(index, ELSEWHERE, float("nan"), camera, no_color, no_depth, inverse(T))
-            if seam[number][k] and source.sequence is not None and record.frame != ELSEWHERE:
+            keyframe = Keyframe(index, FROM_EARLIER_RUN, float("nan"), camera, no_color, no_depth, inverse(T))
+            if seam[number][k] and source.sequence is not None and record.frame != FROM_EARLIER_RUN:
                 frame = source.sequence.frame(record.frame, masks=with_masks)
                 mask = frame.mask if table is None or frame.mask is None else table[frame.mask]
                 frame = replace(frame, index=source.first_frame + record.frame, mask=mask, instant=None)

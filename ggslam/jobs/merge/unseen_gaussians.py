@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians that the keyframes at hand hardly see, and that training on these is not to change.
+"""Protects Gaussians that the given keyframes hardly see from training on these keyframes.
 
-What lies behind a surface or beside an image still shines through by a thousandth. The optimizer steps as far for a
-thousandth as for all of a pixel, so that within a few hundred steps such Gaussians take any colour; other views, which
+A Gaussian behind a surface or beside an image still contributes a thousandth. The optimizer steps as far for a
+thousandth as for a whole pixel, so that within a few hundred steps such Gaussians take any colour; other views, which
 are not trained on, see it.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells that are done, beside a store that is as it was until all of them are: a store of its own within its folder.
+"""Keeps trained cells in a store within the store's folder, until all are trained and replace the old cells together.
 
     map.grid/refining/        its visits: a name made of all that the work depends on, and "finished" at its end
     map.grid/.refining-*      one that is done with, and being deleted

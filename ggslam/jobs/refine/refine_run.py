@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run whose map is trained further on its keyframes: what `ggslam refine RUN` does."""
+"""Trains the map of a finished run further on its keyframes. `ggslam refine RUN` calls this."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.visit_records import exposure_of
 from ggslam.mapping.finished import StillMapper
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, make_keyframe
 from ggslam.mapping.scale import scale_settings
 from ggslam.native.loader import NativeContext
 from ggslam.objects.segmented_map import SegmentedMap
@@ -42,7 +42,7 @@ _STAY = ("trajectory.txt", "config.yaml", "sequence.json", "loops.json", STEPS_F
 
 @dataclass
 class RunRefinement:
-    """What came of refining a run.
+    """Result of refining a run.
 
     Attributes:
         folder: the refined run.
@@ -126,7 +126,7 @@ def _read_keyframes(
     """With their images, and where these show something; those of other recordings are left out."""
     keyframes, known, valid = list[Keyframe](), source.keyframes().keyframes, list[np.ndarray | None]()
     for done, record in enumerate(known, 1):
-        if record.frame != ELSEWHERE:
+        if record.frame != FROM_EARLIER_RUN:
             frame = sequence.frame(record.frame, masks=False)
             keyframe = make_keyframe(len(keyframes), frame, record.T_world_camera)
             keyframe.exposure = exposure_of(record).copy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A grid store trained further, cell by cell: what `ggslam refine STORE` does.
+"""Trains a grid store further, cell by cell. `ggslam refine STORE` calls this.
 
 Every cell is trained from the store as it was, with an order of its own, so that the result does not depend on how many
 workers there are nor on which cell comes first.
@@ -30,11 +30,12 @@ from ggslam.jobs.tasks.engines import Engine
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.store_copy import copy_store
+from ggslam.system.plurals import quantity
 
 
 @dataclass
 class StoreRefinement:
-    """What came of refining a store.
+    """Result of refining a store.
 
     Attributes:
         path: the store.
@@ -117,7 +118,7 @@ def _check_recordings(store: GridStore) -> None:
 
 @dataclass
 class _Refinement:
-    """A store about to be trained."""
+    """A store while it is refined."""
 
     store: GridStore
     done: CellsDone
@@ -149,7 +150,9 @@ class _Refinement:
         self.done.finish()
         if len(failures) == outcome.cells:
             first = next(iter(outcome.failures.values()))
-            raise FormatError(f"{self.store.path}: no part of its {outcome.cells} cells can be used: {first}")
+            raise FormatError(
+                f"{self.store.path}: no part of its {quantity(outcome.cells, 'cell')} can be used: {first}"
+            )
         outcome.seconds = time.perf_counter() - start
         return outcome
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number of refining a store, documented."""
+"""Settings of refining a store."""
 
 from __future__ import annotations
 

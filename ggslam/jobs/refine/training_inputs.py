@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the cells of a store are trained with: their own Gaussians, those around them, and the keyframes that see them.
+"""Inputs of training a cell: its own Gaussians, those around it, and the keyframes that see them.
 """
 
 from __future__ import annotations

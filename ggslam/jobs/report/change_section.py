@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a page that tells what changed between two visits, and what became of objects."""
+"""The section of a page on changes between two visits and the history of objects."""
 
 from __future__ import annotations
 

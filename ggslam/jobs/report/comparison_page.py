@@ -24,6 +24,7 @@ from ggslam.jobs.report.run_plots import (
 from ggslam.reporting import page as p
 from ggslam.reporting.page import Html
 from ggslam.reporting.plots import Plot
+from ggslam.system.plurals import quantity
 
 _ABSENT = "not there"
 
@@ -67,7 +68,7 @@ def comparison_page(
 
 def _lead(runs: Sequence[RunData]) -> str:
     count = len(_recordings(runs))
-    return f"{len(runs)} runs of {'one recording' if count == 1 else f'{count} recordings'}"
+    return f"{quantity(len(runs), 'run')} of {'one recording' if count == 1 else quantity(count, 'recording')}"
 
 
 def _recordings(runs: Sequence[RunData]) -> set[str]:

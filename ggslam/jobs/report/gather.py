@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gathers what reports show from a run folder; runs of older versions, or edited ones, have less."""
+"""Reads what reports show from a run folder. Runs of older versions and edited runs have less."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Movers in pictures: recorded frames with the boxes about what moves in them, and the ways that it went."""
+"""Pictures of movers: recorded frames with boxes around what moves, and its paths."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of a run's report that tells of what moved."""
+"""The section of a run's report on movers."""
 
 from __future__ import annotations
 

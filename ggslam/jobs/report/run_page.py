@@ -21,6 +21,7 @@ from ggslam.reporting.page import Html
 from ggslam.runs.records.metrics import SETS, MetricsRecord, SegmentationRecord, SurfaceScoresRecord
 from ggslam.runs.records.record import Record
 from ggslam.runs.records.verdict import GRADES
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 FOOTER = "Written by ggslam. The page needs nothing but itself: no network, no other files."
@@ -56,7 +57,7 @@ def run_page(run: RunData) -> str:
 def _lead(run: RunData) -> str:
     size = "" if run.recording is None else f" at {run.recording.camera.width}x{run.recording.camera.height}"
     frames = len(run.tracked.get("frame", ()))
-    return f"{frames} frames of {run.recording_name()}{size}, {len(run.keyframes)} keyframes"
+    return f"{quantity(frames, 'frame')} of {run.recording_name()}{size}, {quantity(len(run.keyframes), 'keyframe')}"
 
 
 def _verdict(run: RunData) -> Html:
@@ -161,7 +162,7 @@ def _object_scores(scores: SegmentationRecord) -> Html:
         [i, o.name or "", *_numbers(o, (("", "iou", 100.0, ".1f"),))] for i, o in scores.per_object.items()
     ]
     listed = p.table(["id", "name", "IoU, %"], each, sorts=True, text_columns=(1,))
-    return p.join([overall, p.tag("details", p.tag("summary", f"{len(each)} objects one by one"), listed)])
+    return p.join([overall, p.tag("details", p.tag("summary", f"{quantity(len(each), 'object')} one by one"), listed)])
 
 
 def _views(run: RunData) -> Html:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a run saves its state, and what it takes to go on from there."""
+"""Decides when a run saves its state, and saves what resuming needs."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ggslam.slam.slam import Slam
 from ggslam.system.tuning import Tuning
 
 
-class CheckpointTuning(Tuning):
+class CheckpointIntervalTuning(Tuning):
     """How often a run saves its state if the settings leave it open."""
 
     share = 1 / 80
@@ -41,7 +41,8 @@ class Checkpointing:
 
     Args:
         checkpoints: of the run.
-        every: frames from one to the next; None: as often as takes no more than `CheckpointTuning.share` of the time;
+        every: frames from one to the next; None: as often as takes no more than `CheckpointIntervalTuning.share` of
+            the time;
             0: only when the run ends early.
         sequence: the recording.
         observer: receives a note if a checkpoint cannot be saved; the run continues.
@@ -51,7 +52,7 @@ class Checkpointing:
         self._checkpoints, self._every, self._sequence, self._observer = checkpoints, every, sequence, observer
         self._frames, self._told = 0, False
         self._last = time.perf_counter()
-        self._bytes_a_second = CheckpointTuning.bytes_per_s
+        self._bytes_a_second = CheckpointIntervalTuning.bytes_per_s
         self._sizes = _FileSizes(sequence)
         self._newest: Frame | None = None
 
@@ -67,8 +68,8 @@ class Checkpointing:
             return 0 < self._every <= self._frames
         passed = time.perf_counter() - self._last
         return (
-            passed > CheckpointTuning.min_interval_s
-            and CheckpointTuning.share * passed > _size_of(slam) / self._bytes_a_second
+            passed > CheckpointIntervalTuning.min_interval_s
+            and CheckpointIntervalTuning.share * passed > _size_of(slam) / self._bytes_a_second
         )
 
     def save(self, slam: Slam) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the figures of a run are worth: each aspect of `verdict.json` as good, doubtful or bad.
+"""Grades each aspect of a run in `verdict.json` as good, doubtful or bad.
 
 Every limit stands here, with what it was set by. They were set between what runs of sound recordings (walks with
 Kinect, RealSense, HoloLens and an iPhone, rendered and generated rooms, at full and half size) and runs of faulty ones
@@ -19,6 +19,7 @@ from ggslam.runs.records.verdict import AspectRecord, Grade, worst
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
 from ggslam.slam.verdicts import VerdictTuning
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 
@@ -99,7 +100,7 @@ OF_RECORDING = {
 
 @dataclass(frozen=True)
 class ScoredFigures:
-    """What only scoring tells.
+    """Figures that only scoring provides.
 
     Attributes:
         overfit_db: PSNR of keyframes over that of held-out frames, exposure forgiven; None: no frame was held out.
@@ -129,13 +130,13 @@ def grade_tracked(result: SlamResult, found: list[Verdict], stopped: bool = Fals
         if stopped or total < TrackingGradeTuning.min_frames or codes & {"no_motion", "both_repeat"}
         else "good",
     ]
-    words = [f"{total - lost} of {total} frames located"]
+    words = [f"{total - lost} of {quantity(total, 'frame')} located"]
     words += [f"{searched} of them by search"] if searched else []
     words += [f"{doubted} against what the image shows"] if doubted else []
     words += ["nothing in view tells the motion"] if "textureless" in codes else []
     words += ["most with an open direction"] if "degenerate" in codes else []
     words += [f"the path jumps {len(jumps)} times (the first: frame {jumps[0]})"] if jumps else []
-    words += [f"{dropped} frames dropped"] if dropped else []
+    words += [f"{quantity(dropped, 'frame')} dropped"] if dropped else []
     words += ["the depth images show noise"] if "depth_noise" in codes else []
     words += ["both streams hang"] if "both_repeat" in codes else []
     one = ["too few to tell"] if total < TrackingGradeTuning.min_frames else ["one frame shows no motion"]
@@ -227,7 +228,7 @@ def grade_objects(table: ObjectTable | None, scored: ScoredFigures) -> AspectRec
         return _aspect(["bad"], 0, "objects", ["none, though they were looked for"])
     share = max(counts) / (sum(counts) + table.unlabelled_gaussians)
     grades = [_at_most(share, ObjectGradeTuning.doubtful_object_share, ObjectGradeTuning.bad_object_share)]
-    number = "1 object" if len(counts) == 1 else f"{len(counts)} objects"
+    number = quantity(len(counts), "object")
     words = [f"{number}, the largest has {share:.0%} of the Gaussians"]
     if scored.id_accuracy is not None:
         grades.append(
@@ -251,8 +252,8 @@ def grade_movers(result: SlamResult) -> AspectRecord:
         _at_most(rate, ObjectGradeTuning.doubtful_movers, ObjectGradeTuning.bad_movers) if often else "good",
         "bad" if often and picture > ObjectGradeTuning.bad_moving_share else "good",
     ]
-    movers = "1 mover" if len(result.movers) == 1 else f"{len(result.movers)} movers"
-    words = [f"{movers} in {frames} of {total} frames, {picture:.1%} of the image there"]
+    movers = quantity(len(result.movers), "mover")
+    words = [f"{movers} in {frames} of {quantity(total, 'frame')}, {picture:.1%} of the image there"]
     return _aspect(grades, 100 * frames / max(1, total), "%", words)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What seems wrong with a run: verdicts on its recording, as `ggslam inspect` gives them, and on what it measured."""
+"""Verdicts on a run: on its recording, as `ggslam inspect` gives them, and on its measurements."""
 
 from __future__ import annotations
 

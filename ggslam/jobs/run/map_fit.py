@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from ggslam.evaluation.images import SSIM_WINDOW, fit_colors, ssim_map
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, make_keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, make_keyframe
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -93,7 +93,7 @@ def measure_fit(
             taken, and what the map does not show is left out.
     """
     rasterizer, rows = CpuRasterizer(), []
-    for keyframe in _spread([k for k in keyframes if k.frame_index != ELSEWHERE]):
+    for keyframe in _spread([k for k in keyframes if k.frame_index != FROM_EARLIER_RUN]):
         view = rasterizer.forward(
             map_in_view(keyframe.camera, keyframe.T_camera_world), keyframe.camera, keyframe.T_camera_world,
             features=False,

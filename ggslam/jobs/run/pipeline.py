@@ -41,6 +41,7 @@ from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import reason_against_saving
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import StopRequest, stop_on_request
+from ggslam.system.plurals import quantity
 
 T = TypeVar("T")
 
@@ -83,21 +84,17 @@ class RunOutcome:
         """One line for people."""
         r = self.result
         rate = r.frames_per_second()
-        parts = [_number_of(len(r.frames), "frame"), *([f"{rate:.1f} frames/s"] if np.isfinite(rate) else []),
-                 _number_of(len(r.keyframes), "keyframe"), _number_of(r.gaussian_count, "Gaussian")]  # fmt: skip
+        parts = [quantity(len(r.frames), "frame"), *([f"{rate:.1f} frames/s"] if np.isfinite(rate) else []),
+                 quantity(len(r.keyframes), "keyframe"), quantity(r.gaussian_count, "Gaussian")]  # fmt: skip
         counts = Counter(frame.status for frame in r.frames)
         told = [status for status in ("recovered", "doubted", "lost") if counts[status]]
-        parts += [f"{_number_of(counts[status], 'frame')} {status}" for status in told]
-        parts += [f"{_number_of(len(r.dropped_frames), 'frame')} dropped"] if r.dropped_frames else []
+        parts += [f"{quantity(counts[status], 'frame')} {status}" for status in told]
+        parts += [f"{quantity(len(r.dropped_frames), 'frame')} dropped"] if r.dropped_frames else []
         closed = sum(event.kind == "closed" for event in r.loop_events)
-        parts += [f"{_number_of(closed, 'loop')} closed"] if closed else []
+        parts += [f"{quantity(closed, 'loop')} closed"] if closed else []
         joined = sum(event.kind == "joined" for event in r.loop_events)
-        parts += [f"{_number_of(joined, 'part')} joined"] if joined else []
+        parts += [f"{quantity(joined, 'part')} joined"] if joined else []
         return ", ".join(parts)
-
-
-def _number_of(number: int, thing: str) -> str:
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def execute(request: RunRequest, observer: Observer | None = None, follower: Follower | None = None) -> RunOutcome:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Saving a run although its folder cannot be written to any more: the disk is full, the folder read-only or gone."""
+"""Saves a run elsewhere when its folder cannot be written: the disk is full, or the folder is read-only or gone."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Going on with a run that was cut off: is there something to go on from, and is everything as it was?"""
+"""Resumes an interrupted run: finds its checkpoint and checks that recording and settings are unchanged."""
 
 from __future__ import annotations
 

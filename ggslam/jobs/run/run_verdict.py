@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a run is: the grades of its aspects as one, and what to try next."""
+"""The verdict on a run: the grades of its aspects combined, and advice on what to try next."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ggslam.jobs.run.grades import (
     grade_tracked,
 )
 from ggslam.jobs.run.map_fit import MapFit
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.objects.table import ObjectTable
 from ggslam.rendering.exposure import change_of
 from ggslam.runs.records.metrics import MetricsRecord
@@ -27,6 +27,7 @@ from ggslam.runs.records.verdict import AspectRecord, FitRecord, Grade, RunVerdi
 from ggslam.sequences.camera_doubts import doubt_centre
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.result import SlamResult
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
 
@@ -38,7 +39,7 @@ _CAUSES = (
 """Codes of verdicts on the recording that explain a bad run, what explains most first."""
 
 
-class VerdictTuning(Tuning):
+class GainTuning(Tuning):
     """When a camera's gain changes."""
 
     same_gain = 1.3
@@ -132,7 +133,7 @@ def _failure(result: SlamResult) -> str:
     total, lost = len(result.frames), [f for f in result.frames if f.status == TrackingStatus.LOST.value]
     if len(lost) <= TrackingGradeTuning.max_lost * total:
         return ""
-    return f"the camera was lost in {len(lost)} of {total} frames (the first: {lost[0].frame_index})"
+    return f"the camera was lost in {len(lost)} of {quantity(total, 'frame')} (the first: {lost[0].frame_index})"
 
 
 def _advice(
@@ -183,11 +184,11 @@ def _slower(result: SlamResult, look: str) -> str:
 
 def _start_later(result: SlamResult) -> str:
     """To begin where the exposure is that of most keyframes; "" if that does not help."""
-    ours = [k for k in result.keyframes if k.frame_index != ELSEWHERE]
+    ours = [k for k in result.keyframes if k.frame_index != FROM_EARLIER_RUN]
     gains = np.array([change_of(k.exposure) for k in ours])
     if not len(gains):
         return ""
-    usual = np.abs(np.log(gains / np.median(gains))) < np.log(VerdictTuning.same_gain)
+    usual = np.abs(np.log(gains / np.median(gains))) < np.log(GainTuning.same_gain)
     first = ours[int(usual.argmax())]
     source = {frame.frame_index: frame.source_index for frame in result.frames}.get(first.frame_index)
     return f"`start` {source}: the frames before have another exposure" if usual.any() and source else ""

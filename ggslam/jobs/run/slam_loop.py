@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop over a recording: frame after frame into `Slam`, with checkpoints on the way, until it ends or is ended."""
+"""The loop over a recording: feeds frames to `Slam` and saves checkpoints until the end or an interruption."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from ggslam.slam.result import SlamResult, StepReport, tracked_poses
 from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.slam import Slam
 from ggslam.system.interrupts import StopRequest
+from ggslam.system.plurals import quantity
 from ggslam.system.staging import new_staging
 
 Follower = Callable[[Slam, Frame, StepReport], None]
@@ -36,7 +37,7 @@ Follower = Callable[[Slam, Frame, StepReport], None]
 
 @dataclass
 class SlamLoop:
-    """What the loop works with.
+    """Everything that the loop over a recording uses.
 
     Attributes:
         sequence: the recording.
@@ -158,7 +159,9 @@ class SlamLoop:
             if self.folder is not None and slam.frames:
                 stamps = np.array([frame.timestamp for frame in slam.frames])
                 kept = self.folder.save_trajectory(stamps, _last_poses(slam), repr(failure))
-                self.observer.note(f"the map is lost; the trajectory of {len(stamps)} frames is in {kept.path}")
+                self.observer.note(
+                    f"the map is lost; the trajectory of {quantity(len(stamps), 'frame')} is in {kept.path}"
+                )
             raise
 
 

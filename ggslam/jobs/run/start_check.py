@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A look at a recording's camera, depth and masks before a run spends its time on it."""
+"""Checks a recording's camera, depth and masks before a run."""
 
 from __future__ import annotations
 

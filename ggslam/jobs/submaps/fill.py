@@ -36,13 +36,14 @@ from ggslam.submaps.cell_records import CellChange
 from ggslam.submaps.grid import GridStore
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.submaps.store_objects import ObjectEvent, StoreObjects, read_objects
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 AddRun = Callable[[Path, GridStore, "str | None", "float | None"], object]
 """Writes a run (its folder) into a store that is open for writing, as a visit of a name at a time."""
 
 
-class FillTuning(Tuning):
+class StoreFillTuning(Tuning):
     """What a recording must bring to a store."""
 
     max_missed = 0.1
@@ -53,7 +54,7 @@ class FillTuning(Tuning):
 
 @dataclass(frozen=True)
 class SubmapsRequest:
-    """What is asked for.
+    """A request to fill a grid store.
 
     Attributes:
         source: folder of a run, a cloud, or folder of a recording.
@@ -149,7 +150,7 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
             observer.begin("record", len(poses))
             watched = _with_progress(items, observer, len(poses))
             written = record_visit(store, watched, poses, sights, request.visit or source.resolve().name, request.at)
-            observer.note(f"{len(written)} cells written")
+            observer.note(f"{quantity(len(written), 'cell')} written")
             if missed := _words_of_missed(store, poses):
                 observer.note(missed)
         elif cloud is not None:
@@ -259,10 +260,10 @@ def _poses(
     before = after - 1
     last = np.minimum(after, len(times) - 1)
     nearest = np.where(np.abs(times[before] - timestamps) <= np.abs(times[last] - timestamps), before, last)
-    near = np.abs(times[nearest] - timestamps) <= FillTuning.max_time_gap_s
+    near = np.abs(times[nearest] - timestamps) <= StoreFillTuning.max_time_gap_s
     poses[near] = found.T_world_camera[order][nearest[near]]
     if not near.any():
-        raise FormatError(f"{request.poses}: none of its times is within {FillTuning.max_time_gap_s} s of a frame")
+        raise FormatError(f"{request.poses}: none of its times is within {StoreFillTuning.max_time_gap_s} s of a frame")
     return poses
 
 
@@ -270,13 +271,13 @@ def _words_of_missed(store: GridStore, poses: np.ndarray) -> str:
     """What to say of items, of poses [n, 4, 4], in cells that nothing is recorded of; empty if those are few."""
     known = poses[np.isfinite(poses).all((1, 2)), :3, 3]
     missed = sum(store.key_of(position) not in store for position in known)
-    if missed <= FillTuning.max_missed * len(known):
+    if missed <= StoreFillTuning.max_missed * len(known):
         return ""
     s, grid = store.settings, store.grid
     enough = math.ceil(50 * s.spacing * math.sqrt(grid.spans.sum())) / 100
     return (
-        f"{missed} of {len(known)} poses lie in cells that nothing was recorded of: none came within R {s.radius:g} m "
-        f"of their centres; `--set submaps.radius={enough:g}` records every cell that is passed"
+        f"{missed} of {quantity(len(known), 'pose')} lie in cells that nothing was recorded of: none came within R "
+        f"{s.radius:g} m of their centres; `--set submaps.radius={enough:g}` records every cell that is passed"
     )
 
 

@@ -22,7 +22,7 @@ from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.tuning import Tuning
 
 
-class SensorTuning(Tuning):
+class StoreSensorTuning(Tuning):
     """How settings of a store follow from its sensor."""
 
     scans = 5
@@ -53,7 +53,7 @@ class SensorTuning(Tuning):
     """Points that the spacing of a cloud is measured from, about."""
 
 
-_SHORT = replace(INDOORS, radius=SensorTuning.radius_in_cells * INDOORS.spacing)
+_SHORT = replace(INDOORS, radius=StoreSensorTuning.radius_in_cells * INDOORS.spacing)
 """Of a scanner that sees no farther than rooms reach."""
 
 
@@ -63,32 +63,34 @@ def settings_of_scans(scans: ScanSequence, cut: bool = False) -> SubmapSettings:
     Raises:
         FormatError: a scan is damaged.
     """
-    chosen = np.unique(np.linspace(0, len(scans) - 1, SensorTuning.scans).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(scans) - 1, StoreSensorTuning.scans).round().astype(int))
     ranges = np.concatenate([np.linalg.norm(scans.scan(number).points, axis=1) for number in chosen.tolist()])
     ranges = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(ranges):
         return _SHORT
-    most, farthest = np.percentile(ranges, [SensorTuning.reach_percentile, SensorTuning.farthest_percentile]).tolist()
-    return _of_reach(most * SensorTuning.reach_factor, farthest, cut)
+    most, farthest = np.percentile(
+        ranges, [StoreSensorTuning.reach_percentile, StoreSensorTuning.farthest_percentile]
+    ).tolist()
+    return _of_reach(most * StoreSensorTuning.reach_factor, farthest, cut)
 
 
 def settings_of_cloud(points: np.ndarray) -> SubmapSettings:
     """What suits a cloud [n, 3] that is cut into cells, where no scanner is known: by its size."""
-    few = points[:: max(1, len(points) // SensorTuning.samples)]
+    few = points[:: max(1, len(points) // StoreSensorTuning.samples)]
     few = few[np.isfinite(few).all(1)]
     if not len(few):
         return INDOORS
     low, high = np.percentile(few, [1, 99], axis=0)
-    if np.sort(high - low)[1] < SensorTuning.min_outdoor_extent_m:
+    if np.sort(high - low)[1] < StoreSensorTuning.min_outdoor_extent_m:
         return INDOORS
-    return _of_reach(SensorTuning.outdoor_radius_m, SensorTuning.outdoor_radius_m, cut=True)
+    return _of_reach(StoreSensorTuning.outdoor_radius_m, StoreSensorTuning.outdoor_radius_m, cut=True)
 
 
 def with_chosen(settings: SubmapSettings, chosen: Mapping[str, Any]) -> SubmapSettings:
     """Settings with fields that were set on purpose; R goes with an edge of a cell that was."""
     edge = chosen.get("spacing")
     if edge is not None and "radius" not in chosen and settings.radius != INDOORS.radius:
-        settings = replace(settings, radius=SensorTuning.radius_in_cells * edge)
+        settings = replace(settings, radius=StoreSensorTuning.radius_in_cells * edge)
     return replace(settings, **chosen)
 
 
@@ -104,15 +106,16 @@ def in_words(settings: SubmapSettings) -> str:
 def _of_reach(reach: float, farthest: float, cut: bool) -> SubmapSettings:
     if reach <= INDOORS.partial_radius:
         return _SHORT
-    radius = min(SensorTuning.max_length_m, _round_up(reach))
+    radius = min(StoreSensorTuning.max_length_m, _round_up(reach))
     spacing = max(
-        INDOORS.spacing, _handy(radius / (SensorTuning.cells_in_cloud_reach if cut else SensorTuning.cells_in_reach))
+        INDOORS.spacing,
+        _handy(radius / (StoreSensorTuning.cells_in_cloud_reach if cut else StoreSensorTuning.cells_in_reach)),
     )
     return replace(
-        INDOORS, partial_radius=radius, spacing=spacing, radius=SensorTuning.radius_in_cells * spacing,
-        sensor_range=min(SensorTuning.max_length_m, max(radius, _round_up(farthest))),
-        voxel=_handy(radius / SensorTuning.voxels_in_reach),
-        change_distance=max(INDOORS.change_distance, 2 * radius / SensorTuning.voxels_in_reach),
+        INDOORS, partial_radius=radius, spacing=spacing, radius=StoreSensorTuning.radius_in_cells * spacing,
+        sensor_range=min(StoreSensorTuning.max_length_m, max(radius, _round_up(farthest))),
+        voxel=_handy(radius / StoreSensorTuning.voxels_in_reach),
+        change_distance=max(INDOORS.change_distance, 2 * radius / StoreSensorTuning.voxels_in_reach),
         lookahead=max(INDOORS.lookahead, spacing),
     )  # fmt: skip
 
@@ -125,4 +128,4 @@ def _handy(metres: float) -> float:
 
 
 def _round_up(metres: float) -> float:
-    return SensorTuning.length_step_m * math.ceil(metres / SensorTuning.length_step_m - 1e-9)
+    return StoreSensorTuning.length_step_m * math.ceil(metres / StoreSensorTuning.length_step_m - 1e-9)

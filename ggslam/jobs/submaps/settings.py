@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be set where a grid store is made."""
+"""Settings of making a grid store."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from ggslam.errors import ConfigError, GgslamError
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.rendering.exposure import identity_exposure
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recorded
@@ -49,7 +49,7 @@ def remember_run(store: GridStore, folder: RunFolder) -> None:
 
 def _record_of(folder: RunFolder) -> VisitRecord:
     record = folder.keyframes()
-    known = [keyframe for keyframe in record.keyframes if keyframe.frame != ELSEWHERE]
+    known = [keyframe for keyframe in record.keyframes if keyframe.frame != FROM_EARLIER_RUN]
     return VisitRecord(
         run=str(folder.path.absolute()), sequence=folder.sequence(), config=config_to_dict(folder.config()),
         keyframes=known, poses=record.poses(),

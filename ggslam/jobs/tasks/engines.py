@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where pieces of work are done."""
+"""Engines that run tasks."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def do_locally(
 
 
 class _Worker(Generic[Task]):
-    """A process and what it is at."""
+    """A worker process and its current task."""
 
     def __init__(self, processors: Sequence[int]) -> None:
         self.pipe, other = Pipe()
@@ -73,7 +73,7 @@ class _Worker(Generic[Task]):
 
 
 class _Pool(Generic[Task, Result]):
-    """Workers, each in its place."""
+    """A pool of workers."""
 
     def __init__(self, work: Callable[[Task], Result], places: Sequence[Sequence[int]]) -> None:
         self._work, self._places = work, places

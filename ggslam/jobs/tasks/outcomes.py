@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A piece of work done: its result, or why there is none."""
+"""The outcome of a task: its result, or the reason why there is none."""
 
 from __future__ import annotations
 

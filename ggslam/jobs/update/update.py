@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run brought up to date by a later visit: what `ggslam update` does, usable from Python."""
+"""Brings a run up to date with a later visit. `ggslam update` calls this."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class UpdateTuning(Tuning):
 
 @dataclass
 class UpdateOutcome:
-    """What came of an update.
+    """Result of an update.
 
     Attributes:
         folder: the run that shows the latest state.
@@ -102,7 +102,7 @@ def update_run(
 
 @dataclass
 class _Update:
-    """An update on its way."""
+    """An update in progress."""
 
     sources: list[MergeSource]
     folder: RunFolder

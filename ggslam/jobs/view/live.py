@@ -20,6 +20,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import vertical_fov, view_from_behind
 from ggslam.viewer.safe_text import plain
@@ -50,7 +51,7 @@ class LiveViewTuning(Tuning):
 
 @dataclass
 class _Snapshot:
-    """What is shown: copies, so that the run can go on."""
+    """A snapshot for the page, copied so that the run can continue."""
 
     gaussians: GaussianTensors
     poses: np.ndarray
@@ -186,7 +187,7 @@ def _snapshot(slam: Slam, frame: Frame, report: StepReport, title: str) -> _Snap
     pose = None if report.frame.status == "lost" else slam.pose_of(report.frame)
     psnr = f"{report.psnr:.1f} dB" if np.isfinite(report.psnr) else "-"
     text = (
-        f"**{plain(title)}**  \nframe {report.frame.frame_index} · {len(keyframes)} keyframes"
+        f"**{plain(title)}**  \nframe {report.frame.frame_index} · {quantity(len(keyframes), 'keyframe')}"
         f" · {report.gaussians:,} Gaussians · PSNR {psnr} · overlap {report.frame.overlap:.0%} · {report.frame.status}"
     )
     return _Snapshot(copies, poses, keyframes, frame, pose, text)

@@ -33,6 +33,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.object_names import object_file_name
 from ggslam.sequences import Sequence
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted
 from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover
@@ -167,10 +168,10 @@ class ViewedRun:
             shown = min(len(self._gaussians), self._max_splats)
             parts = [f"{len(self._gaussians):,} Gaussians" + (f" ({shown:,} shown)" if shown < len(self._gaussians)
                                                               else "")]  # fmt: skip
-            taken = [f"{len(self.frame_poses)} frames", f"{len(self.keyframe_poses)} keyframes"]
-            parts += taken if self.folder.has_poses else [f"{len(self.frame_poses)} views around it"]
+            taken = [quantity(len(self.frame_poses), "frame"), quantity(len(self.keyframe_poses), "keyframe")]
+            parts += taken if self.folder.has_poses else [f"{quantity(len(self.frame_poses), 'view')} around it"]
             if self._segmented is not None:
-                parts.append(f"{len(self._segmented.table)} objects")
+                parts.append(quantity(len(self._segmented.table), "object"))
             return " · ".join(parts)
 
     def splats(self, coloring: Coloring, frame: int) -> dict[int, Splats]:

@@ -20,6 +20,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 
@@ -99,7 +100,7 @@ def frames_of_run(
         raise RunFolderError(f"{folder.path}: no frame of this run was located")
     lacking = len(sequence) - len(source.poses)
     if lacking:
-        source.notes.append(f"{lacking} frames that the run did not locate are left out")
+        source.notes.append(f"left out {quantity(lacking, 'frame')} that the run did not locate")
     far = far_away(source.poses)
     if far:
         which = f"{len(far)}, the first of frame {far[0]}"

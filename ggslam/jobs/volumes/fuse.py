@@ -34,7 +34,7 @@ from ggslam.volumes.volume_settings import VolumeSettings
 
 @dataclass(frozen=True)
 class VolumesRequest:
-    """What is wanted of which run or recording.
+    """A request for volumes of a run or a recording.
 
     Attributes:
         source: folder of a run or a recording.
@@ -86,7 +86,7 @@ class VolumesRequest:
 
 @dataclass
 class VolumesOutcome:
-    """What was made.
+    """Result of making volumes.
 
     Attributes:
         out: folder of the results.
@@ -111,7 +111,7 @@ class VolumesOutcome:
 
 @dataclass
 class _Fused:
-    """What fusing gave: the maps, where the cameras were, names of objects, and why it stopped early."""
+    """Result of fusing: the maps, camera poses, names of objects, and the reason if it stopped early."""
 
     maps: VolumeMaps
     name: str

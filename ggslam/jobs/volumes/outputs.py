@@ -37,6 +37,7 @@ from ggslam.runs.records.volumes import VolumesRecord
 from ggslam.scene.origin import moved_pose
 from ggslam.scene.poses import translation
 from ggslam.system.json_files import write_json
+from ggslam.system.plurals import quantity
 from ggslam.system.staging import finish_saving, make_staging, publish
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name
@@ -71,7 +72,7 @@ class VolumeOutputTuning(Tuning):
 
 @dataclass(frozen=True)
 class OutputRequest:
-    """What is written, beside what there always is.
+    """Optional outputs.
 
     Attributes:
         mesh: file of the mesh; None: mesh.ply beside the rest.
@@ -132,7 +133,7 @@ class Surface:
 
 @dataclass
 class Outputs:
-    """What was written.
+    """Files that were written.
 
     Attributes:
         files: all of them.
@@ -173,7 +174,7 @@ class _Writer:
         save_tsdf(self.path("tsdf.npz"), tsdf)
         held = tsdf.memory_bytes / 1e6
         self.tell(
-            f"TSDF: {len(tsdf)} blocks of 8^3 voxels, {tsdf.dense_blocks} near surfaces, {held:.0f} MB",
+            f"TSDF: {quantity(len(tsdf), 'block')} of 8^3 voxels, {tsdf.dense_blocks} near surfaces, {held:.0f} MB",
             tsdf={"blocks": len(tsdf), "dense_blocks": tsdf.dense_blocks, "memory_mb": held},
         )
 
@@ -202,7 +203,7 @@ class _Writer:
             safe = "".join(c if c.isalnum() else "_" for c in name)
             path = self.path(f"object_{number}_{safe}.ply")
             write_mesh(path, part.vertices, part.triangles, part.normals, part.colors, part.labels)
-        self.tell(f"{len(objects)} objects have a mesh of their own: {self.out / 'object_*.ply'}")
+        self.tell(f"wrote meshes of {quantity(len(objects), 'object')}: {self.out / 'object_*.ply'}")
 
     def floor(self) -> None:
         """Which way is up, and where the floor is."""
@@ -247,8 +248,8 @@ class _Writer:
         held = field_.memory_bytes / 1e6
         ground = "the floor" if upright.floor is not None else "a metre below the camera"
         self.tell(
-            f"distance field: {len(field_)} blocks, {held:.0f} MB, last update {1e3 * seconds:.0f} ms; slice "
-            f"{height - base:.2f} m above {ground}",
+            f"distance field: {quantity(len(field_), 'block')}, {held:.0f} MB, last update {1e3 * seconds:.0f} ms; "
+            f"slice {height - base:.2f} m above {ground}",
             esdf={"blocks": len(field_), "memory_mb": held, "last_update_ms": 1e3 * seconds,
                   "slice_height": height - base, "band": [low, high], "map_frame": axes},
         )  # fmt: skip

@@ -81,7 +81,7 @@ _FUSED = "fused"
 
 @dataclass
 class StoreVolumes:
-    """What came of it.
+    """Result of making the volumes of a store.
 
     Attributes:
         out: folder of the results, a grid store with a mesh of the whole.
@@ -220,7 +220,7 @@ class _Work:
 
 @dataclass
 class _Volumes:
-    """Volumes about to be made."""
+    """The volumes of a store while they are made."""
 
     work: _Work
     results: GridStore

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Those who look on while a run goes on: a page in the browser, a log for rerun."""
+"""Watchers of a running run: a page in the browser, a log for rerun."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.mapping.cpu.exposure import ExposureAdam
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.rendering.exposure import (
     ExposureTuning,
@@ -165,7 +165,7 @@ class KeyframeExposures:
     def typical(self, keyframes: Sequence[Keyframe]) -> np.ndarray | None:
         """Median gain against the map, [3], over the frames that the keyframes stand for. None if the exposure did not
         change, too little is known, or the map was made before: it keeps what it was trained with."""
-        if not self.changed or any(keyframe.frame_index == ELSEWHERE for keyframe in keyframes):
+        if not self.changed or any(keyframe.frame_index == FROM_EARLIER_RUN for keyframe in keyframes):
             return None
         weights = frame_weights([keyframe.frame_index for keyframe in keyframes])
         told = [k.index for k in keyframes if self.known[k.index] and not self.blind[k.index]]

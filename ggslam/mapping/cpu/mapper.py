@@ -16,7 +16,7 @@ from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_g
 from ggslam.mapping.cpu.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.identity import IdentityTuning
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe, PoseAdam, make_keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
@@ -173,7 +173,7 @@ class CpuMapper(Mapper):
         if not self.settings.exposure.compensate:
             return
         for keyframe in (self.keyframes[number] for number in self._trainable()):
-            if keyframe.frame_index != ELSEWHERE:
+            if keyframe.frame_index != FROM_EARLIER_RUN:
                 view = self._render(keyframe, features=False)
                 self._exposures.measure_again(keyframe, self._look(keyframe, view))
 
@@ -196,7 +196,7 @@ class CpuMapper(Mapper):
         if not least or not self.keyframes or len(self._trainable()) < len(self._all_numbers):
             return
         keyframes = [self.keyframes[k] for k in self._all_numbers]
-        own, newest = [k for k in keyframes if k.frame_index != ELSEWHERE], keyframes[-1]
+        own, newest = [k for k in keyframes if k.frame_index != FROM_EARLIER_RUN], keyframes[-1]
         untrained = {k.index for k in own if k is newest or (k.instant is not None and k.instant == newest.instant)}
         born = self.map.birth_keyframe.numpy()
         stays = ~np.isin(born, [k.index for k in own if k.index not in untrained])

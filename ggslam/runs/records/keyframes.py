@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from ggslam.errors import RunFolderError
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.rendering.exposure import frame_weights, identity_exposure, typical_gain
 from ggslam.runs.records.record import Array, NumberOrNone, Record, RecordFile
 from ggslam.slam.result import SlamResult
@@ -20,7 +20,7 @@ class KeyframeRecord(Record):
 
     Attributes:
         index: its number.
-        frame: index of its frame; `mapping.keyframe.ELSEWHERE` if it is of another recording.
+        frame: index of its frame; `mapping.keyframe.FROM_EARLIER_RUN` if it is of another recording.
         timestamp: seconds.
         T_world_camera: [4, 4].
         exposure: gain and offset of each colour channel, [3, 2].
@@ -86,7 +86,7 @@ class KeyframesRecord(RecordFile):
 
     def typical_exposure(self) -> np.ndarray:
         """Median gain [3] against the map over the run's frames, see `rendering.exposure.typical_gain`."""
-        own = [k for k in self.keyframes if k.frame != ELSEWHERE]
+        own = [k for k in self.keyframes if k.frame != FROM_EARLIER_RUN]
         gains = [np.ones(3) if k.exposure is None else k.exposure[:, 0] for k in own]
         return typical_gain(gains, frame_weights([k.frame for k in own])) if own else np.ones(3)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ggslam.mapping.keyframe import ELSEWHERE, Keyframe
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.movers.outdated import (
     EarlierView,
     OutdatedParts,
@@ -101,7 +101,7 @@ class EarlierViews(FrameFilter):
         T_world_newest = tracking.T_world_camera
         if tracking.status not in SURE or noise is None or not self._is_new(T_world_newest):
             return []
-        earlier = [k for k in keyframes if k.frame_index == ELSEWHERE and k.depth.size]
+        earlier = [k for k in keyframes if k.frame_index == FROM_EARLIER_RUN and k.depth.size]
         near = self._near(earlier, newest, T_world_newest)
         if not near:
             return []

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.geometry.moved_depth import largest_shift
-from ggslam.mapping.keyframe import ELSEWHERE
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor, grow
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
@@ -145,7 +145,7 @@ class MoverFilter(FrameFilter):
         keyframes = removal.keyframes
         latest, earlier = (
             keyframes[-1],
-            [k for k in keyframes[-1 - MoverFilterTuning.max_keyframes : -1] if k.frame_index != ELSEWHERE],
+            [k for k in keyframes[-1 - MoverFilterTuning.max_keyframes : -1] if k.frame_index != FROM_EARLIER_RUN],
         )
         views = [(k.depth_m(), k.T_world_camera, k.mask) for k in earlier]
         gone = self.gone_since(views, newest, latest.T_world_camera)
