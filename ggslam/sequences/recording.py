@@ -166,7 +166,7 @@ class ReadOptions:
         """
         if self.own_camera is not None:
             return None
-        return _read_with_hint(read, "give them with `camera` or `intrinsics`")
+        return _read_with_hint(read, "give the camera with `camera` or `intrinsics`")
 
     def recorded_scale(self, read: Callable[[], float]) -> float:
         """Units of depth images per metre: what a user tells as such, else what `read` finds, else what a camera file
@@ -183,7 +183,7 @@ class ReadOptions:
         except SequenceError as error:
             if of_camera is not None:
                 return of_camera
-            raise SequenceError(f"{error} (`depth_scale` tells it instead)") from None
+            raise SequenceError(f"{error} (give it with `depth_scale`)") from None
 
     def add_truth(self, recording: Recording, read: Callable[[], None]) -> None:
         """Lets `read` give a recording its true poses, unless nobody wants them. They serve scores, so that they are
@@ -201,7 +201,7 @@ class ReadOptions:
         Raises:
             SequenceError: of `read`; it names the argument that would tell the camera.
         """
-        return None if self.depth_camera is not None else _read_with_hint(read, "`depth_camera` tells it instead")
+        return None if self.depth_camera is not None else _read_with_hint(read, "give it with `depth_camera`")
 
 
 def _read_with_hint(read: Callable[[], T], instead: str) -> T:

@@ -125,7 +125,7 @@ def test_what_no_usd_can_hold(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="at least one"):
         write_gaussian_usd(tmp_path / "map.usda", small_map(0, 0))
     gaussians.log_scales[1, 1] = 100.0
-    with pytest.raises(FormatError, match="larger than float32"):
+    with pytest.raises(FormatError, match="float32"):
         write_gaussian_usd(tmp_path / "map.usda", gaussians)
     gaussians.means[4, 0] = float("nan")
     with pytest.raises(FormatError, match="position of Gaussian 4"):

@@ -49,7 +49,7 @@ def rewrite(path: Path, change: Callable[[str, bytes], bytes | None]) -> None:
         (lambda name, content: b"{" if name == "metadata" else content, "walk.r3d, metadata: not JSON"),
         (lambda name, content: None if name.endswith("3.depth") else content, "frame 3: .*rgbd/3.depth is missing"),
         (lambda name, content: None if name.endswith(".depth") else content, "a recording without depth"),
-        (lambda name, content: content[:-9] if name.endswith("3.depth") else content, "3.depth: LZFSE stream is trunc"),
+        (lambda name, content: content[:-9] if name.endswith("3.depth") else content, "3.depth: .*LZFSE"),
         (lambda name, content: content[:-200] if name.endswith("3.jpg") else content, "3.jpg: JPEG is truncated"),
         (lambda name, content: b"" if name.endswith("2.jpg") else content, "2.jpg: file is empty"),
     ],

@@ -277,7 +277,7 @@ def test_what_opencv_writes_is_what_opencv_reads(tmp_path: Path) -> None:
         ("K.txt", "hello\n", "hello"),
         ("ost.yaml", ros("plumb_bob", FIVE).replace("cols: 5", "cols: 4"), "1 x 4.*5"),
         ("ost.yaml", ros("plumb_bob", (0.1, 0.2, 0.3)), "plumb_bob.*distortion.*3"),
-        ("info.yaml", ECHO.replace("  width: 0", "  width: 320").replace("  x_offset: 0", "  x_offset: 9"), "cut out"),
+        ("info.yaml", ECHO.replace("  width: 0", "  width: 320").replace("  x_offset: 0", "  x_offset: 9"), "roi"),
         ("orb.yaml", ORB2.replace("Camera.cy", "Camera.zy"), "'cy'"),
         ("orb.yaml", STELLA.replace("perspective", "equirectangular"), "equirectangular"),
         ("d.yaml", "width: 640\nheight: 480\nfx: 1\nfy: 1\ncx: 1\ncy: 1\nT_color_depth: [1]\n",
