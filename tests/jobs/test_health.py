@@ -111,7 +111,7 @@ def test_time_that_goes_back_or_jumps() -> None:
     assert "sort the recording" in longer[0].text
     gap = np.delete(times, range(50, 80))
     assert [v.code for v in judge_times(gap)] == ["frames_missing"]
-    assert "about 30 frames are missing in 1 gaps" in judge_times(gap)[0].text
+    assert "about 30 frames are missing in 1 gap " in judge_times(gap)[0].text
     assert judge_times(np.delete(times, 50)) == []
 
 

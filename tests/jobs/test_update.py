@@ -53,7 +53,7 @@ def test_images_of_the_earlier_visit_are_not_scored(updated: RunFolder) -> None:
     said = succeed("eval", updated.path, "--no-lpips")
     metrics = updated.metrics()
     assert metrics is not None and metrics.images.all is not None
-    assert metrics.images.all.frames == 16 and "16 frames are of earlier visits" in " ".join(said.split())
+    assert metrics.images.all.frames == 16 and "16 frames of earlier visits" in " ".join(said.split())
     assert metrics.images.all.psnr > 15
 
 
