@@ -136,7 +136,7 @@ def _print(report: LocalizationReport) -> None:
     rows = [
         ["localisation time, mean", f"{ms['mean']:.1f} ms"],
         ["localisation time, 95 %", f"{ms['p95']:.1f} ms"],
-        ["of it on the map, mean", f"{s['map_ms_mean']:.1f} ms"],
+        ["of which reading the map, mean", f"{s['map_ms_mean']:.1f} ms"],
         ["points in the reference map, mean", f"{s['map_points_mean']:.0f}"],
         ["RMSE against the given poses", centimetres(s["rmse_m"])],
         ["RMSE after rigid alignment", centimetres(s["rmse_aligned_m"])],

@@ -230,7 +230,7 @@ def refuse_other_options(context: typer.Context, more: Iterable[str] = ()) -> se
     sources = {name: context.get_parameter_source(name) for name in options_of}
     given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
     for name in sorted(given - _WITH_RESUME - set(more)):
-        raise ConfigError(f"--resume: {options_of[name]} does not go with it: the run goes on as it was begun")
+        raise ConfigError(f"--resume: a resumed run keeps its options; {options_of[name]} cannot be changed")
     return given
 
 

@@ -47,7 +47,7 @@ class ArrayArchive:
 
     @property
     def held_bytes(self) -> int:
-        """Of the arrays held in memory now."""
+        """Bytes of arrays held in memory."""
         return self._bytes
 
     def put(self, name: str, arrays: Arrays) -> None:

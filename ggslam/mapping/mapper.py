@@ -297,7 +297,7 @@ class Mapper(ABC):
 
     def _iterate_wholly(self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0) -> None:
         """One iteration of the final refinement on some keyframes: a step on all pixels of one or, where depth is
-        noisy, STEPS on every second pixel of as many. It is the same whether identities are trained, too, or not."""
+        noisy, several on every second pixel of as many. It is the same whether identities are trained, too, or not."""
         for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
             keyframe = self._draw(numbers)
             grid = self._choose_grid(keyframe) if self._is_noisy else ALL_PIXELS
@@ -429,7 +429,7 @@ class Mapper(ABC):
             self.map.bound_colors()
 
     def _is_world(self, keyframe: Keyframe) -> bool:
-        """Whether its pose stays: the first keyframe is the world, with those that its rig took at the same instant."""
+        """Whether the pose is fixed (gauge): the first keyframe, with those of its rig then, defines the world."""
         number, first = self._all_numbers[0], self.keyframes[self._all_numbers[0]].instant
         if keyframe.index == number or first is None or keyframe.instant != first:
             return keyframe.index == number

@@ -42,23 +42,23 @@ class Verification:
         """For people."""
         mark, files = self.mark, self.mark.files
         if files is None:
-            lines = [f"{self.path}: no manifest: it was made before there were any; its files cannot be checked"]
+            lines = [f"{self.path}: has no manifest (an early version wrote it), so its files cannot be checked"]
         else:
             total = sum(record.bytes for record in files.values()) / 1e6
             lines = [f"{self.path}: {quantity(len(files), 'file')}, {total:.1f} MB"]
         lines += [f"  {problem}" for problem in self.problems]
         lines += [f"  {name}: not in the manifest" for name in self.others]
         lines += [f"  incomplete: {note}" for note in mark.notes() if not mark.complete and "edited" not in note]
-        lines += ["  it can be gone on with: ggslam run --resume"] if self.resumable else []
+        lines += ["  to continue it: ggslam run --resume"] if self.resumable else []
         return [*lines, self.summary()]
 
     def summary(self) -> str:
         """In one line."""
         if self.good:
-            return "all as it was written"
+            return "all files match the manifest"
         names = [problem.name for problem in self.problems]
         more = f" and {len(names) - 3} more" if names[3:] else ""
-        changed = f"not as it was written: {', '.join(names[:3])}{more}"
+        changed = f"{', '.join(names[:3])}{more}: changed, damaged or missing"
         return "; ".join([changed] * bool(names) + ["not complete"] * (not self.mark.complete))
 
 

@@ -224,9 +224,9 @@ def _read_recording(
     recording.void_id = stored.void_id
     if stored.depth_delay is not None:
         delay_depth(recording, stored.depth_delay)
-    if not DepthScaleTuning.min_scale <= recording.depth_scale <= 1 / DepthScaleTuning.min_scale:
-        found_scale = f"found {recording.depth_scale}"
-        raise SequenceError(f"{folder}: depth scale must be a positive number of usual size, {found_scale}")
+    low, high = DepthScaleTuning.min_scale, 1 / DepthScaleTuning.min_scale
+    if not low <= recording.depth_scale <= high:
+        raise SequenceError(f"{folder}: depth scale must be {low:g} to {high:g}, found {recording.depth_scale}")
     return recording
 
 

@@ -158,7 +158,7 @@ class Sequence:
         self.scale: float = self._geometry.scale
         if self.scale < 1 and min(self.camera.width, self.camera.height) < SequenceTuning.min_side:
             size = f"{self.camera.width}x{self.camera.height}"
-            needed = f"needed are {SequenceTuning.min_side} pixels a side"
+            needed = f"each side needs at least {SequenceTuning.min_side} pixels"
             raise SequenceError(f"`scale`: {self.scale:g} leaves images of {size}, {needed}")
         self.native_camera: Camera = self._geometry.native_camera
         self.finer: bool = self._geometry.finer

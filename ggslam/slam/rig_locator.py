@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -36,7 +37,7 @@ class DarkImageTuning(Tuning):
     """Distance, in rows and columns, between the pixels that are looked at."""
 
 
-@savable(not_saved="_config _surface _masks _tracker _loops _pager _policy _poses _filters _rig _engine")
+@savable(not_saved="_config _surface _masks _tracker _loops _pager _policy _poses _filters _rig _engine _chains")
 class RigLocator(FrameLocator):
     """See `FrameLocator`. A camera that sees nothing, or has no frame at an instant, is carried along by the others.
     No parts begin in a lost rig, and colour does not correct its poses.
@@ -47,12 +48,16 @@ class RigLocator(FrameLocator):
         parts: of the run.
         policy: chooses keyframes.
         poses: of the frames so far.
+        chains: the filters of each camera's frames.
     """
 
-    def __init__(self, rig: Rig, config: Config, parts: RunParts, policy: KeyframePolicy, poses: FramePoses) -> None:
+    def __init__(
+        self, rig: Rig, config: Config, parts: RunParts, policy: KeyframePolicy, poses: FramePoses,
+        chains: Sequence[FrameFilter],
+    ) -> None:  # fmt: skip
         super().__init__(config, parts, policy, poses, FrameFilter())
         assert isinstance(self._tracker, GicpTracker)
-        self._rig, self._clock = rig, RigClock()
+        self._rig, self._clock, self._chains = rig, RigClock(), chains
         self._engine = RigTrackingEngine(parts.context)
         self._tracker.engine = self._engine
 
@@ -63,8 +68,9 @@ class RigLocator(FrameLocator):
     def locate(self, frames: list[Frame], growing: bool, takes_keyframes: bool) -> Located:
         """Locates the frames of an instant, one of each camera that has one."""
         now = frames[0].timestamp
-        self._engine.views = [RigView(f.camera, f.depth, self._T_first_of(f, now)) for f in frames]
-        joint = self._locate(frames, self._lead(frames))
+        expected = [self._chains[frame.camera_number].expect(frame) for frame in frames]
+        self._engine.views = [RigView(f.camera, f.depth, self._T_first_of(f, now)) for f in expected]
+        joint = self._locate(expected, self._lead(expected))
         self._clock.follow(None if joint.status is TrackingStatus.LOST else joint.T_world_camera, now)
         return Located(frames, joint, self._of_frames(frames, joint, now))
 

@@ -49,7 +49,7 @@ class RigSlam(Slam):
         return FilterChain.make_for_rig(made_of, len(self.rig.names))
 
     def _make_locator(self, parts: RunParts) -> RigLocator:
-        return RigLocator(self.rig, self.config, parts, self.policy, self.poses)
+        return RigLocator(self.rig, self.config, parts, self.policy, self.poses, self.chains)
 
     def check(self) -> None:
         """Raises FormatError if it has not what it must have of each camera: its state may come from a file."""

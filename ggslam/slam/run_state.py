@@ -151,7 +151,7 @@ class RunState:
 
     @property
     def refinement_steps(self) -> int:
-        """Optimisation steps that `finish` makes, those of a run that was cut off among them."""
+        """Optimisation steps that `finish` makes, including those that an interrupted run made."""
         if not self.mapper.keyframes or not self.growing:
             return 0
         asked, before = self.config.refine_iterations, self.mapper.times.iterations - self.refine_iterations

@@ -18,6 +18,7 @@ from ggslam.errors import ConfigError, FormatError
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.slam.config import Config
 from ggslam.slam.filters.earlier_views import EarlierViews
+from ggslam.slam.parts import run_library
 from ggslam.slam.slam import Slam
 from ggslam.system.object_tree import Keeper, Kept, describe, restore
 from ggslam.system.savable import Rule, Rules, savable_classes
@@ -54,7 +55,8 @@ def reason_against_saving(config: Config) -> str | None:
     """Why the state of a run with these settings cannot be saved; None: it can."""
     if config.memory_limit_mb:
         return "memory is limited (memory_limit_mb)"
-    return None if config.device == "cpu" else f"the map is on a GPU (device: {config.device})"
+    on_cpu = config.device == "cpu" or (config.device == "auto" and run_library(config)[0] is None)
+    return None if on_cpu else f"the map is on a GPU (device: {config.device})"
 
 
 def check_state(slam: Slam) -> None:

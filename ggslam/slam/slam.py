@@ -59,9 +59,8 @@ class Slam(RunState):
             `mapping.extra_loss.ExtraLoss`.
 
     Raises:
-        InputError: a camera, settings or an extra loss that are none.
-        ConfigError: a limit of memory that is less than the program itself takes; no such device; an extra loss on a
-            GPU.
+        InputError: an argument is not a camera, a configuration or a function.
+        ConfigError: a limit of memory that is less than the program itself takes; no such device.
     """
 
     # --- the loop ----------------------------------------------------------------------------------------------------
@@ -101,7 +100,8 @@ class Slam(RunState):
         with self.schedule.beside_mapping():
             located = self.track(cleaned)
 
-        # 3. Decide whether the frames become keyframes: those that show enough that the map does not.
+        # 3. Decide whether the frames become keyframes: those that show enough that the map does not, and one every
+        #    few frames.
         chosen = self._choose_keyframes(located)
         self._note_poses(located, chosen)
 

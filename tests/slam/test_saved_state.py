@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from ggslam.errors import ConfigError, FormatError
+from ggslam.errors import ConfigError, FormatError, MissingDependency
 from ggslam.loops.activity import ActivitySettings
 from ggslam.mapping.cpu.neighbours import NeighbourIndex
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import open_sequence
+from ggslam.slam import parts
 from ggslam.slam.config import Config, load_config
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.result import SlamResult
@@ -171,3 +172,17 @@ def test_a_state_is_data_and_must_fit(room: Path) -> None:
         describe_state(fresh(dataclasses.replace(config, memory_limit_mb=4000.0)))
     assert reason_against_saving(config) is None
     assert "GPU" in str(reason_against_saving(dataclasses.replace(config, device="cuda")))
+
+
+@pytest.mark.parametrize("has_gpu", [False, True])
+def test_a_device_that_is_left_open_is_saved_where_it_is_the_cpu(
+    monkeypatch: pytest.MonkeyPatch, has_gpu: bool
+) -> None:
+    def library_for_device() -> object:
+        if not has_gpu:
+            raise MissingDependency("no GPU")
+        return object()
+
+    monkeypatch.setattr(parts, "library_for_device", library_for_device)
+    reason = reason_against_saving(Config(device="auto"))
+    assert "GPU" in str(reason) if has_gpu else reason is None

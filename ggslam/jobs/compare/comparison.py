@@ -119,7 +119,7 @@ def compare(
         a, b: what to compare.
         align: "none": both are in one frame already, as runs of one recording are (the first camera's); "truth": by
             the true poses that a run kept, files lying in their world; "icp": A is registered upon B; "trajectory": the
-            positions at common times are laid upon one another (Umeyama, without scale); "auto": "truth" where that
+            positions at common times are aligned (Umeyama, without scale); "auto": "truth" where that
             clearly brings them nearer than "none".
         max_distance: metres up to which points are partners, for fitness and inlier RMSE; ICP ends at closer pairs
             where the clouds are dense (`geometry.coarse_to_fine`).

@@ -110,7 +110,7 @@ def works(findings: list[Finding]) -> bool:
 
 
 def _system() -> Iterator[Finding]:
-    yield Finding("system", "ggslam", "ok", f"{__version__} in {Path(__file__).parent}")
+    yield Finding("system", "ggslam", "ok", f"{__version__} in {Path(__file__).parents[2]}")
     python = f"{platform.python_version()} ({sys.executable})"
     good = sys.version_info >= (3, 10)
     yield Finding("system", "python", "ok" if good else "broken", python, "" if good else "use Python 3.10 or newer")

@@ -216,7 +216,7 @@ class _Run:
             checkpoints.remove()
             folder.discard()
             reason = result.frames[0].reason if result.frames else "no frame could be read"
-            raise error if error is not None else SequenceError(f"{sequence.path}: no map could be begun: {reason}")
+            raise error if error is not None else SequenceError(f"{sequence.path}: could not start a map: {reason}")
         outcome = self._save(result, error)
         self._look_at(outcome)
         if error is None and outcome.failure is None:
@@ -232,7 +232,7 @@ class _Run:
         elif self.config.realtime_fps:
             reason = "it is made in real time"
         if reason is not None and every != 0:
-            self.observer.note(f"no checkpoints are made, so the run cannot be resumed if it is cut off: {reason}")
+            self.observer.note(f"no checkpoints are made, so an interrupted run cannot be resumed: {reason}")
         if reason is not None or (every == 0 and resumption is None) or not isinstance(sequence, Sequence):
             return None
         if resumption is None:
