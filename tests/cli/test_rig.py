@@ -123,4 +123,4 @@ def test_what_cannot_be_is_refused(rig: Path, tmp_path: Path) -> None:
     text = (rig / "rig.yaml").read_text()
     (tmp_path / "rig.yaml").write_text(text.replace("recording: ", f"recording: {rig}/").replace("back\n", "nowhere\n"))
     refuse(ggslam("run", tmp_path / "rig.yaml", "--out", tmp_path / "a"), "rig.yaml", "nowhere")
-    refuse(ggslam("run", rig, "--depth-scale", 1000, "--out", tmp_path / "a"), "say it in the rig's file")
+    refuse(ggslam("run", rig, "--depth-scale", 1000, "--out", tmp_path / "a"), "--depth-scale", "rig.yaml")
