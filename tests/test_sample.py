@@ -17,6 +17,7 @@ from ggslam.synthetic.writer import write_synthetic_sequence
 SAMPLE = Path(__file__).parents[1] / "assets" / "sample"
 
 
+@pytest.mark.long("the room is rendered anew")
 def test_the_sample_is_the_generated_room(tmp_path: Path) -> None:
     sample, room = open_sequence(SAMPLE), open_sequence(
         write_synthetic_sequence(tmp_path / "room", frames=len(open_sequence(SAMPLE)), noise=False)

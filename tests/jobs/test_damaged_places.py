@@ -29,7 +29,7 @@ CHANGES: list[tuple[str, Change, str]] = [
     ("surface_normals", lambda a: a[:-1], "'normals'"),
     ("surface_points", lambda a: a[:-1], "'normals'"),
     ("surface_counts", first(-1), "'counts'"),
-    ("surface_counts", lambda a: a + 1, "points do not fit"),
+    ("surface_counts", lambda a: a + 1, "surface: the counts"),
     ("surface_reach", first(np.inf), "'reach'"),
     ("surface_reach", first(1e30), "'reach'"),
     ("surface_poses", first(np.nan), "'poses'"),
