@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training step of a finished run's map against one of OpenSplat's CPU build, by turns on the same images.
+"""A training step of a finished run's map against one of OpenSplat's CPU build: the same Gaussians, images and poses.
 
     python scripts/benchmarks/bench_opensplat.py RUN --opensplat PATH/TO/opensplat
 
-OpenSplat (github.com/pierotofy/OpenSplat, AGPL: built outside this checkout, GPU_RUNTIME=CPU) starts from as many
-points of the run's surface as its map has Gaussians, sees the run's images at the same size, and neither splits nor
-reduces images. Its step is the time of many steps less that of few, over their number. Ours is `ggslam refine` counted
-in the same way. Both use all processors that they want.
+OpenSplat (github.com/pierotofy/OpenSplat, AGPL: built outside this checkout, GPU_RUNTIME=CPU) resumes from the run's
+Gaussians, with harmonics of degree 1, the least it has, and neither splits Gaussians nor reduces images. A step is the
+time of many steps less that of few, over their number; ours is that of `ggslam refine`. Both use all processors that
+they want, by turns.
 """
 
 from __future__ import annotations
@@ -22,20 +22,29 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.runs.folder import RunFolder
-
-ROW_END = b"end_header\n"
+END = b"end_header\n"
 
 
-def thin_points(path: Path, count: int) -> int:
-    """Keeps `count` rows of a binary PLY of points, evenly; how many there are then."""
-    header, _, body = path.read_bytes().partition(ROW_END)
-    found = re.search(rb"element vertex (\d+)", header)
-    assert found is not None, path
-    rows = np.frombuffer(body, np.uint8).reshape(int(found[1]), -1)
-    kept = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int))]
-    path.write_bytes(header.replace(found[0], b"element vertex %d" % len(kept)) + ROW_END + kept.tobytes())
-    return len(kept)
+def read_rows(path: Path) -> tuple[list[bytes], np.ndarray]:
+    """Header lines and rows of a binary PLY with one element."""
+    header, _, body = path.read_bytes().partition(END)
+    kinds = {b"float": "<f4", b"int": "<i4", b"uchar": "u1"}
+    fields = [(name.decode(), kinds[kind]) for kind, name in re.findall(rb"property (\w+) (\w+)", header)]
+    return header.splitlines(), np.frombuffer(body, np.dtype(fields))
+
+
+def write_start(theirs: Path, ours: Path, out: Path, step: int) -> int:
+    """Writes our Gaussians as OpenSplat's output is written, after so many steps; returns their number."""
+    header, template = read_rows(theirs)
+    _, rows = read_rows(ours)
+    filled = np.zeros(len(rows), template.dtype)
+    for name in filled.dtype.names or ():
+        if name in (rows.dtype.names or ()):
+            filled[name] = rows[name]
+    lines = [re.sub(rb"iteration \d+", b"iteration %d" % step, line) for line in header]
+    lines = [re.sub(rb"element vertex \d+", b"element vertex %d" % len(rows), line) for line in lines]
+    out.write_bytes(b"\n".join(lines) + b"\n" + END + filled.tobytes())
+    return len(rows)
 
 
 def seconds(command: list[object]) -> float:
@@ -52,22 +61,23 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--steps", type=int, nargs=2, default=(5, 45), help="of OpenSplat, few and many")
     arguments = parser.parse_args()
-    gaussians = RunFolder.open(arguments.run).gaussians().count
     ggslam: list[object] = [sys.executable, "-m", "ggslam"]
     with tempfile.TemporaryDirectory() as made:
-        images = Path(made, "images")
-        export = [*ggslam, "export", arguments.run, "--format", "nerfstudio", "--out", images]
-        subprocess.run([str(word) for word in export], check=True, capture_output=True)
-        points = thin_points(images / "points.ply", gaussians)
+        images, splats, start = Path(made, "images"), Path(made, "ours.ply"), Path(made, "start.ply")
+        seconds([*ggslam, "export", arguments.run, "--format", "nerfstudio", "--out", images])
+        seconds([*ggslam, "export", arguments.run, "--format", "ply", "--out", splats])
+        theirs = [arguments.opensplat, images, "--cpu", "--downscale-factor", 1, "--num-downscales", 0,
+                  "--sh-degree", 1, "--warmup-length", 10**6, "-o", Path(made, "out.ply")]  # fmt: skip
+        seconds([*theirs, "-n", 1])
+        gaussians = write_start(Path(made, "out.ply"), splats, start, step=10)
         times: dict[str, list[float]] = {"OpenSplat": [], "ours": []}
         few, many = arguments.steps
         for _ in range(arguments.repeat):
-            theirs = [arguments.opensplat, images, "--cpu", "--downscale-factor", 1, "--num-downscales", 0,
-                      "--sh-degree", 1, "--warmup-length", 10**6, "-o", Path(made, "out.ply"), "-n"]  # fmt: skip
-            times["OpenSplat"].append((seconds([*theirs, many]) - seconds([*theirs, few])) / (many - few))
-            ours = [*ggslam, "refine", arguments.run, "--out", Path(made, "refined"), "--overwrite", "--steps"]
-            times["ours"].append((seconds([*ours, 20 * many]) - seconds([*ours, 20 * few])) / (20 * (many - few)))
-    print(f"{gaussians} Gaussians, {points} points; milliseconds a step, {arguments.repeat} turns")
+            resume = [*theirs, "--resume", start, "-n"]
+            times["OpenSplat"].append((seconds([*resume, 10 + many]) - seconds([*resume, 10 + few])) / (many - few))
+            refine = [*ggslam, "refine", arguments.run, "--out", Path(made, "refined"), "--overwrite", "--steps"]
+            times["ours"].append((seconds([*refine, 20 * many]) - seconds([*refine, 20 * few])) / (20 * (many - few)))
+    print(f"{gaussians} Gaussians; milliseconds a step, {arguments.repeat} turns")
     for name, each in times.items():
         print(f"  {name}: {1e3 * statistics.median(each):.1f} ({', '.join(f'{1e3 * one:.1f}' for one in each)})")
     ratios = [theirs / ours for theirs, ours in zip(times["OpenSplat"], times["ours"], strict=True)]
