@@ -15,7 +15,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ _NUMBERS: dict[str, Any] = {
     **{f"{name}_t": getattr(ctypes, f"c_{name}") for name in _INTEGERS},
 }  # fmt: skip
 _RESULTS: dict[str, Any] = {"void": None, "char*": ctypes.c_char_p}
-_SKIPPED = re.compile(r"//[^\n]*|^#[^\n]*", re.MULTILINE)
+_SKIPPED = re.compile(r"//[^\n]*|^#(?:pragma once|include)\b[^\n]*", re.MULTILINE)
 _DECLARATION = re.compile(
     r"\s*(?:struct (?:alignas\(\d+\) )?(?P<struct>\w+) \{(?P<fields>[^}]*)\};"
     r"|enum (?P<enum>\w+)(?: : int)? \{(?P<values>[^}]*)\};"
@@ -44,7 +44,8 @@ class Declarations:
     """What the headers of a folder declare.
 
     Args:
-        folder: of the headers, which are read in the order of their names.
+        folder: of the headers.
+        names: of the headers, without suffix, in the order in which they are read.
         structures: those of other headers that these include.
 
     Attributes:
@@ -57,7 +58,9 @@ class Declarations:
         NativeCoreError: a header cannot be read, or holds something else.
     """
 
-    def __init__(self, folder: Path, structures: Mapping[str, type[ctypes.Structure]] | None = None) -> None:
+    def __init__(
+        self, folder: Path, names: Sequence[str], structures: Mapping[str, type[ctypes.Structure]] | None = None
+    ) -> None:
         self.structures: dict[str, type[ctypes.Structure]] = {}
         self.functions: dict[str, tuple[Any, list[Any]]] = {}
         self.values: dict[str, Any] = {}
@@ -65,7 +68,7 @@ class Declarations:
         self._types: dict[str, Any] = {**(structures or {}), **_NUMBERS}
         self._numbers: dict[str, int] = {}
         self._module = f"ggslam.abi.{folder.name}"
-        for path in sorted(folder.glob("*.hpp")):
+        for path in (folder / f"{name}.hpp" for name in names):
             try:
                 data = path.read_bytes()
             except OSError as error:

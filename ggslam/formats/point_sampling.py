@@ -168,9 +168,10 @@ def _cubes(discs: SurfaceDiscs, voxel_size: float) -> np.ndarray | None:
 
 def _add_samples(
     merged: VoxelSums, gaussians: GaussianMap, discs: SurfaceDiscs, voxel_size: float, with_object_id: bool,
-    chunk: int = PointSamplingTuning.samples_at_once,
+    chunk: int | None = None,
 ) -> VoxelSums:  # fmt: skip
-    """The sums with those of samples of a map, of which `chunk` are in memory at a time."""
+    """The sums with those of samples of a map, of which `chunk` are in memory at a time (None: as usual)."""
+    chunk = PointSamplingTuning.samples_at_once if chunk is None else chunk
     pending, waiting = [], 0
     for position, weight, color, object_id in disc_samples(gaussians, discs, voxel_size, chunk):
         lattice = np.rint(position / voxel_size)

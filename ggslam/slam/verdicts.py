@@ -11,6 +11,7 @@ from ggslam.scene.poses import fit_similarity
 from ggslam.sequences.verdicts import Severity, Verdict, judge_scale_by
 from ggslam.slam.map_parts import NOT_JOINED
 from ggslam.slam.result import SlamResult
+from ggslam.system.plurals import word_for
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp_tracker import GicpTrackerTuning
 from ggslam.tracking.photometric import GreyDepth, textured_points
@@ -89,9 +90,9 @@ def _judge_exposure(result: SlamResult) -> list[Verdict]:
         return []
     frame, gain = max(changed.items(), key=lambda item: abs(np.log(item[1])))
     text = (
-        f"the exposure changed: from frame {min(changed)} on {len(changed)} of {len(ours)} keyframes are darker or "
-        f"brighter than the map, frame {frame} {gain:.2f} times as bright; training compensates for it; "
-        "fix exposure and white balance if the camera can"
+        f"the exposure changed: from frame {min(changed)} on {len(changed)} of {len(ours)} keyframes "
+        f"{word_for(len(changed), 'is', 'are')} darker or brighter than the map, frame {frame} {gain:.2f} times as "
+        "bright; training compensates for it; fix exposure and white balance if the camera can"
     )
     return [Verdict("exposure", "doubtful", text)]
 

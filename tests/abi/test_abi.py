@@ -10,6 +10,7 @@ import shutil
 import subprocess
 from ctypes import c_double, c_int32, c_void_p
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -56,7 +57,7 @@ GGSLAM_EXPORT void ggslam_part_clear(void* part);
 
 def read(folder: Path, text: str) -> Declarations:
     (folder / "part.hpp").write_text(text)
-    return Declarations(folder)
+    return Declarations(folder, ["part"])
 
 
 def test_a_header_is_read(tmp_path: Path) -> None:
@@ -84,6 +85,7 @@ def test_a_header_is_read(tmp_path: Path) -> None:
         ("GGSLAM_EXPORT void", "void", "void ggslam_part_clear"),
         ("double values", "double values = 3, more", "values"),
         ("kMostRows = 4", "kMostRows = 4 * 2", "4 \\* 2"),
+        ("// One row.", "#if GGSLAM_ROWS", "#if GGSLAM_ROWS"),
     ],
 )
 def test_what_cannot_be_read_is_refused(tmp_path: Path, old: str, new: str, named: str) -> None:
@@ -134,13 +136,25 @@ def test_every_field_stands_where_the_compiler_puts_it(tmp_path: Path, name: str
     assert ours == compiled_layouts(tmp_path, name, declared)
 
 
+@pytest.mark.parametrize("side", [core, cuda])
+def test_all_headers_are_listed_in_the_order_of_their_hash(side: ModuleType) -> None:
+    folder = Path(str(side.__file__)).parent
+    assert list(side.HEADERS) == sorted(path.stem for path in folder.glob("*.hpp"))
+
+
+def test_a_missing_header_is_named(tmp_path: Path) -> None:
+    with pytest.raises(NativeCoreError, match=r"part\.hpp: No such file"):
+        Declarations(tmp_path, ["part"])
+
+
 def test_another_size_is_named() -> None:
     class Pair(ctypes.Structure):
         _fields_ = [("first", ctypes.c_float), ("second", c_double)]
 
     binding.check_sizes("library", {"Pair": Pair}, [16])
-    with pytest.raises(NativeCoreError, match="library: Pair.* 16 .* 8"):
-        binding.check_sizes("library", {"Pair": Pair}, [8])
+    for size in (8, 24):
+        with pytest.raises(NativeCoreError, match=f"library: Pair.* 16 .* {size}"):
+            binding.check_sizes("library", {"Pair": Pair}, [size])
     with pytest.raises(NativeCoreError, match="library.* 1 .* 2"):
         binding.check_sizes("library", {"Pair": Pair}, [16, 8])
 

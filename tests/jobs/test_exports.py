@@ -52,7 +52,7 @@ def test_only_keyframes_and_what_is_held_out(run: RunFolder, tmp_path: Path) -> 
 def test_a_folder_with_something_in_it_is_left_alone(run: RunFolder, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     for kind in ("colmap", "nerfstudio"):
-        with pytest.raises(RunFolderError, match="`out`"):
+        with pytest.raises(RunFolderError, match="not an empty.*`out`"):
             export_run(run, tmp_path, kind)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
@@ -164,6 +164,6 @@ def test_what_does_not_go_together(run: RunFolder, tmp_path: Path) -> None:
     assert "says ply, but --format says pcd" in str(refused(str(run.path), "--format", "pcd", *out))
     assert isinstance(refused(str(run.path), "--format", "splat", "--keyframes", *out), ConfigError)
     assert isinstance(refused(str(run.path), "--format", "colmap", "--voxel", "0", *out), ConfigError)
-    with pytest.raises(RunFolderError, match=r"1\.1"):
+    with pytest.raises(RunFolderError, match=r"no Gaussian.* 1\.1 "):
         export_run(run, tmp_path / "map.splat", "splat", min_opacity=1.1)
     assert not list(tmp_path.iterdir())

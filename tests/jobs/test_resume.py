@@ -118,7 +118,7 @@ def test_a_run_killed_at_any_moment_goes_on(room: Path, whole: Path, tmp_path: P
     with pytest.raises(Killed):
         execute(request(room, out), KillAt(**moment))
     assert not (out / "run.json").exists()
-    with pytest.raises(RunFolderError, match="`resume`$"):
+    with pytest.raises(RunFolderError, match="before it was saved.*`resume`$"):
         RunFolder.open(out)
     with pytest.raises(RunFolderError, match="`resume`.*`overwrite`"):
         execute(request(room, out))
@@ -167,14 +167,14 @@ def test_a_damaged_checkpoint_is_passed_over(cut: Path, whole: Path) -> None:
 def test_no_checkpoint_is_whole(cut: Path) -> None:
     for path in states(cut):
         path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(RunFolderError, match=r"state-0000"):
+    with pytest.raises(RunFolderError, match=r"state-0000.*ends too early"):
         resume(cut)
 
 
 def test_what_a_state_needs_is_checked_too(cut: Path) -> None:
     for path in (cut / checkpoints.FOLDER).glob("kept-*.bin"):
         path.unlink()
-    with pytest.raises(RunFolderError, match=r"kept-000001\.bin"):
+    with pytest.raises(RunFolderError, match=r"kept-000001\.bin.*missing"):
         resume(cut)
 
 
@@ -202,7 +202,7 @@ def test_another_recording_is_refused(cut: Path, room: Path, whole: Path, tmp_pa
 
 def test_what_would_change_the_result_is_refused(cut: Path, tmp_path: Path) -> None:
     for words in (["--seed", 3], ["--out", tmp_path], ["--iterations", 4], ["--overwrite"], ["--set", "seed=2"]):
-        refuse(ggslam("run", "--resume", cut, *words), f"--resume: {words[0]} does not go with it")
+        refuse(ggslam("run", "--resume", cut, *words), "--resume", f"{words[0]} cannot be changed")
     refuse(ggslam("run", "--resume", tmp_path / "nowhere"), "nowhere: no such folder")
     start = (cut / checkpoints.FOLDER / "start.json").read_text()
     (cut / checkpoints.FOLDER / "start.json").write_text(start.replace('"sh_degree": 0', '"sh_degree": 1'))
@@ -392,4 +392,4 @@ def test_a_model_runs_only_if_it_is_named_again(cut: Path) -> None:
 def test_no_model_is_taken_by_a_run_without(cut: Path) -> None:
     again = ("run", "--resume", cut, "--set")
     refuse(ggslam(*again, "masks.model=a.onnx"), "was begun without a model of masks")
-    refuse(ggslam(*again, "mapping.iterations_per_frame=1"), "--set does not go with it")
+    refuse(ggslam(*again, "mapping.iterations_per_frame=1"), "--set cannot be changed")

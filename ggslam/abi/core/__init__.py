@@ -8,7 +8,8 @@ from typing import Any
 
 from ggslam.abi.headers import Declarations
 
-DECLARED = Declarations(Path(__file__).parent)
+HEADERS = ("codec", "common", "mapping", "objects", "rendering", "sight", "tracking", "volumes")
+DECLARED = Declarations(Path(__file__).parent, HEADERS)
 globals().update(DECLARED.names)
 
 

@@ -9,7 +9,8 @@ from typing import Any
 from ggslam.abi.core import DECLARED as CORE
 from ggslam.abi.headers import Declarations
 
-DECLARED = Declarations(Path(__file__).parent, CORE.structures)
+HEADERS = ("common", "mapping", "rendering", "tracking")
+DECLARED = Declarations(Path(__file__).parent, HEADERS, CORE.structures)
 globals().update(DECLARED.names)
 
 

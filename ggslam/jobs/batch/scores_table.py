@@ -16,6 +16,7 @@ from ggslam.reporting.page import Html, bullets, page, section, table
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.verdict import Grade, RunVerdict, worst
 from ggslam.system.csv_text import csv_text
+from ggslam.system.plurals import quantity
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,8 @@ class ScoresTable:
             section("Scores", "scores", table(self.head(), self.cells(), sorts=True, text_columns=(1, 3))),
             section("Notes", "notes", bullets(self.notes())),
         ]
-        lead = f"{sum(row.runs for row in self.rows if row.recording != MEAN)} runs, {len(self.failed)} failed"
+        runs = sum(row.runs for row in self.rows if row.recording != MEAN)
+        lead = f"{quantity(runs, 'run')}, {len(self.failed)} failed"
         return page(self.title, lead, parts, [("scores", "Scores"), ("notes", "Notes")], self.machine)
 
     def files(self) -> dict[str, Callable[[], str]]:

@@ -39,6 +39,7 @@ from ggslam.submaps.store_objects import (
     read_objects,
     write_objects,
 )
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 
 
@@ -144,7 +145,7 @@ def _compare(
         if past == last:
             events = add_evidence(events, _told_changes(folder), known)
         else:
-            entry.notes.append(f"{last + 1 - past} visits at once: changed looks are not told")
+            entry.notes.append(f"{quantity(last + 1 - past, 'visit')} at once: changed looks are not told")
         done = replace(entry, compared="history", events=events)
         return _Comparison(done, known, seen, [other.visit for other in continued])
     if continued:  # the same run again

@@ -20,7 +20,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
-from ggslam.system.plurals import quantity
+from ggslam.system.plurals import quantity, word_for
 from ggslam.system.tuning import Tuning
 
 
@@ -150,7 +150,8 @@ def frames_of_recording(request: SequenceRequest, objects: bool = True) -> Frame
     source = FrameSource(str(sequence.path), sequence, poses, names=dict(sequence.instance_names))
     source.notes.append(f"poses of the recording itself ({sequence.pose_source})")
     if len(poses) < len(sequence):
-        source.notes.append(f"{len(sequence) - len(poses)} frames without a pose are left out")
+        left_out = len(sequence) - len(poses)
+        source.notes.append(f"{quantity(left_out, 'frame')} without a pose {word_for(left_out, 'is', 'are')} left out")
     if objects and sequence.has_masks:
         source.label = _own_mask
     return source

@@ -28,6 +28,7 @@ from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
 from ggslam.slam.filters.movers import SURE
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
+from ggslam.system.plurals import quantity
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import DepthNoise
@@ -132,7 +133,7 @@ class EarlierViews(FrameFilter):
         """What the user should know."""
         if not self.gaussians:
             return []
-        return [f"{self.gaussians} Gaussians of the map it began with are left out: the run looks through them"]
+        return [f"left out of the map it began with: {quantity(self.gaussians, 'Gaussian')} that the run looks through"]
 
     def check(self) -> bool:
         """Whether all arrays have the shapes of their views."""
