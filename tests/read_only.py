@@ -42,7 +42,7 @@ def read_only_images() -> Iterator[list[Frame]]:
     """Inside, what readers and sequences give is read-only, and torch's warning about such arrays is an error. Yields
     the frames that were delivered; at the end they are as they were, also if compiled code got hold of them."""
     delivered: list[Frame] = []
-    sums: list[dict[str, int]] = []
+    sums: list[tuple[Frame, dict[str, int]]] = []
     make = sequence.Sequence._frame
 
     def frame(self: sequence.Sequence, *given: Any) -> Frame:
@@ -51,7 +51,8 @@ def read_only_images() -> Iterator[list[Frame]]:
         if found.mask_loader is not None:
             found = dataclasses.replace(found, mask_loader=_locking(found.mask_loader))
         delivered.append(found)
-        sums.append({name: _sum(array) for name in _IMAGES if (array := getattr(found, name)) is not None})
+        # A pair at once: several threads may read frames.
+        sums.append((found, {name: _sum(array) for name in _IMAGES if (array := getattr(found, name)) is not None}))
         return found
 
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
@@ -61,5 +62,6 @@ def read_only_images() -> Iterator[list[Frame]]:
         patch.setattr(MaskReader, "read", _locking(MaskReader.read))
         patch.setattr(sequence.Sequence, "_frame", frame)
         yield delivered
-    for found, kept in zip(delivered, sums, strict=True):
+    assert len(sums) == len(delivered)
+    for found, kept in sums:
         assert {name: _sum(getattr(found, name)) for name in kept} == kept
