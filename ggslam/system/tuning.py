@@ -43,7 +43,7 @@ def overridden(kind: type[Tuning], **values: Any) -> Iterator[None]:
     Raises:
         AttributeError: the class has no field of this name.
     """
-    before = {name: vars(kind)[name] if name in vars(kind) else getattr(kind, name) for name in values}
+    before = {name: getattr(kind, name) for name in values}
     try:
         for name, value in values.items():
             type.__setattr__(kind, name, value)
