@@ -19,6 +19,7 @@ from ggslam.scene.poses import inverse, separation
 from ggslam.sequences import open_sequence
 from ggslam.sequences.rig import RigSequence, by_instant
 from ggslam.slam.config import Config, load_config
+from ggslam.slam.filters.frame_filter import FrameFilter
 from ggslam.slam.result import SlamResult
 from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.saved_state import describe_state, restore_state
@@ -193,3 +194,19 @@ def test_keyframes_of_a_rig_are_not_aligned_one_by_one(sequence: RigSequence) ->
     before = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
     slam.color_poses.align_keyframes()
     assert all(np.array_equal(k.T_world_camera, T) for k, T in zip(slam.mapper.keyframes, before, strict=True))
+
+
+class Blindfold(FrameFilter):
+    """Lets the tracker see no depth of one camera."""
+
+    def expect(self, frame: Frame) -> Frame:
+        return dataclasses.replace(frame, depth=np.zeros_like(frame.depth))
+
+
+def test_the_tracker_aligns_what_each_cameras_filters_let_it_see(sequence: RigSequence) -> None:
+    slam = RigSlam(sequence.rig, config(), sequence.has_masks)
+    slam.chains[1].filters.append(Blindfold())
+    frames = next(iter(by_instant(sequence)))
+    located = slam.track([slam.clean(frame) for frame in frames])
+    assert [len(result.points) > 0 for result in located.tracked] == [True, False]
+    assert all(frame.depth.any() for frame in located.frames)  # the map is made of all depth
