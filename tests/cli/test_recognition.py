@@ -7,8 +7,10 @@ import shutil
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from ggslam.formats.point_cloud import write_point_cloud
 from tests.command_line import ggslam, refuse, succeed
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample"
@@ -26,9 +28,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "notes.txt").write_text("hello\n")
     with zipfile.ZipFile(place / "data.zip", "w") as archive:
         archive.writestr("a.txt", "a")
-    (place / "cloud.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 1\n"
-    )
+    write_point_cloud(place / "cloud.ply", np.array([[0.0, 0.0, 1.0]]), {})
     succeed("run", SAMPLE, "--stop", 3, "--out", place / "run", "--no-eval")
     return place
 

@@ -20,7 +20,7 @@ from ggslam.system.untrusted_files import given_path, is_plain_name, open_untrus
 
 REPLICA = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 """Replica's scenes in the order in which papers list them."""
-_KEYS = {"out", "options", "recordings", "settings", "seeds"}
+_KEYS = {"out", "options", "recordings", "settings", "seeds", "baseline"}
 ALLOWED = (
     "config", "set", "start", "stop", "stride", "scale", "format", "depth-scale", "pose-convention", "masks", "camera",
     "intrinsics", "depth-camera", "depth-kind", "depth-delay", "upright", "void-id", "min-confidence", "topic",
@@ -67,11 +67,30 @@ class Manifest:
         title: of its table.
         out: folder of its runs and tables.
         jobs: its runs, in the order of the table.
+        baseline: settings that the file says to compare with.
     """
 
     title: str
     out: Path
     jobs: list[BatchJob] = field(default_factory=list)
+    baseline: str | None = None
+
+    def baseline_name(self, asked: str | None = None) -> str | None:
+        """Settings that the others are compared with: the ones asked for, or those of the file, or the first of
+        several.
+
+        Raises:
+            ConfigError: there are no settings of that name.
+        """
+        names = list(dict.fromkeys(job.settings for job in self.jobs))
+        name = asked or self.baseline
+        if name is None:
+            return names[0] if len(names) > 1 else None
+        if name not in names:
+            raise ConfigError(f"`baseline`: expected one of the settings {', '.join(names)}, found {name}")
+        return name
+
+
 FLAGS = {"upright", "loops", "no-loops", "skip-bad-frames", "no-skip-bad-frames", "check", "no-check", "strict"}
 """Those of them that take no value."""
 
@@ -114,7 +133,10 @@ def read_manifest(path: str | Path, out: Path | None = None, options: Sequence[s
     folder = out or (_own_folder(path, str(values["out"])) if "out" in values else Path("runs") / path.stem)
     words = [(*common, *own, *chosen) for _, _, own in recordings for chosen in settings.values()]
     _refuse_models(str(path), asked, words)
-    return Manifest(path.stem, folder, _jobs(recordings, settings, seeds, (*asked, *common), str(path)))
+    baseline = values.get("baseline")
+    if baseline is not None and baseline not in settings:
+        raise ConfigError(f"{path}: baseline: expected one of the settings {', '.join(settings)}, found {baseline!r}")
+    return Manifest(path.stem, folder, _jobs(recordings, settings, seeds, (*asked, *common), str(path)), baseline)
 
 
 def manifest_of_folder(
