@@ -80,15 +80,15 @@ Rule = Callable[[MetricsRecord, Path], float]
 
 
 def _mean_error(metrics: MetricsRecord, run: Path) -> float:
-    return _scaled(metrics.number("trajectory", "ate_mean_m"), 100)
+    return _scale(metrics.number("trajectory", "ate_mean_m"), 100)
 
 
 def _error(metrics: MetricsRecord, run: Path) -> float:
-    return _scaled(metrics.number("trajectory", "ate_rmse_m"), 100)
+    return _scale(metrics.number("trajectory", "ate_rmse_m"), 100)
 
 
 def _trained_frames(metrics: MetricsRecord, run: Path) -> float:
-    return _scaled(metrics.number("images", "keyframes", "psnr"), 1)
+    return _scale(metrics.number("images", "keyframes", "psnr"), 1)
 
 
 def _every_fifth(metrics: MetricsRecord, run: Path) -> float:
@@ -101,7 +101,7 @@ def _every_fifth(metrics: MetricsRecord, run: Path) -> float:
     return statistics.fmean(found) if found else math.nan
 
 
-def _scaled(value: float | None, factor: float) -> float:
+def _scale(value: float | None, factor: float) -> float:
     return math.nan if value is None else factor * value
 
 
