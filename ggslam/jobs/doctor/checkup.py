@@ -68,7 +68,7 @@ EXTRAS = {
     "ros": Extra(("rosbags",), "ROS 1 and ROS 2 bags"),
     "ray": Extra(("ray",), "batches on a Ray cluster"),
     "realsense": Extra(("pyrealsense2",), "RealSense cameras and their .bag files"),
-    "docs": Extra(("material",), "building the pages of docs/", False),
+    "docs": Extra(("zensical",), "building the pages of docs/", False),
 }
 """By their names in pyproject.toml."""
 
