@@ -27,10 +27,9 @@ from typing import Any
 from commands import ROOT
 
 sys.path.insert(0, str(ROOT))
-from tests.viewer.browser import open_browser, wait_for
-
 from ggslam.jobs.view.serve import write_page
 from ggslam.runs.folder import RunFolder
+from tests.viewer.browser import open_browser, wait_for
 
 EVENTS_PER_S = 60
 _COUNT = """
@@ -47,7 +46,7 @@ map.renderer.onframe = (shot, complete) => {
 
 @dataclass(frozen=True)
 class Result:
-    """Of a drag: pictures/s, milliseconds a picture, pixels of the picture per CSS pixel, seconds until it was sharp."""
+    """Of a drag: pictures/s, ms a picture, pixels of the picture per CSS pixel, seconds until it was sharp."""
 
     pictures_per_s: float
     frame_ms: float
@@ -62,7 +61,9 @@ def mouse(browser: Any, kind: str, x: float, y: float) -> None:
 
 def drag(browser: Any, seconds: float) -> Result:
     """Drags around a circle in the middle of the map."""
-    box = browser.execute_script("const r = ggslam.map.canvas.getBoundingClientRect(); return [r.x, r.y, r.width, r.height]")
+    box = browser.execute_script(
+        "const r = ggslam.map.canvas.getBoundingClientRect(); return [r.x, r.y, r.width, r.height]"
+    )
     x, y = box[0] + box[2] / 2, box[1] + box[3] / 2
     radius = min(box[2], box[3]) / 4
     mouse(browser, "mousePressed", x + radius, y)

@@ -117,7 +117,7 @@ class MapView {
   pick(x, y) {
     const width = this.canvas.clientWidth, height = this.canvas.clientHeight, focal = this.camera.focal(width, height);
     const chunks = new Map([...this.chunks].map(([chunk, splats]) => [chunk, { splats, marks: this.marks.get(chunk) }]));
-    const shot = { view: this.camera.view(), focal, near: this.camera.near };
+    const shot = { view: this.camera.view(), focal, near: this.camera.near, width, height };
     return pickSplat(chunks, this.states, this.displacement, shot, [(x - width / 2) / focal, (y - height / 2) / focal]);
   }
 
