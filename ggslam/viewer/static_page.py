@@ -23,7 +23,13 @@ from ggslam.viewer.model import ListedObject, ViewedMap
 from ggslam.viewer.splats import DrawnSplatTuning, colors_to_uint8, opacities_of
 
 STATIC = Path(__file__).with_name("static")
-_PARTS = ("renderer.js", "camera.js", "page.js")
+MAP_SCRIPTS = (
+    "splat_rules.js", "unpack.js", "displacement.js", "sorter.js", "webgl_programs.js", "splat_textures.js",
+    "webgl_renderer.js", "splat_projector.js", "tile_painter.js", "painting_worker.js", "painter_pool.js",
+    "processor_renderer.js", "map_lines.js", "picker.js", "resolution.js", "map_view.js",
+)  # fmt: skip
+"""What `MapView` consists of, in the order in which a page needs it."""
+_PARTS = (*MAP_SCRIPTS, "camera.js", "page.js")
 
 
 class StaticPageTuning(Tuning):

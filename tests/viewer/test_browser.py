@@ -155,7 +155,7 @@ def test_the_static_page_shows_splats_and_objects_from_disk(browser: Any, run: R
     model, size = write_page(run, tmp_path / "room.html", max_splats=MAX_SPLATS)
     assert size == (tmp_path / "room.html").stat().st_size < 2_000_000
     browser.get((tmp_path / "room.html").as_uri())
-    b.wait_for(lambda: browser.execute_script("return !!window.ggslam && !!ggslam.renderer.sorted"))
+    b.wait_for(lambda: browser.execute_script("return !!window.ggslam && !!ggslam.drawn"))
     before = b.screenshot(browser)
     assert before[20:400, 20:540].std() > 8
     rows = browser.find_elements("css selector", "#objects li")
@@ -200,6 +200,6 @@ def test_the_static_page_of_a_run_without_objects_opens(browser: Any, run: RunFo
     (plain.path / "objects.json").unlink()
     write_page(plain, tmp_path / "plain.html", max_splats=1000)
     browser.get((tmp_path / "plain.html").as_uri())
-    b.wait_for(lambda: browser.execute_script("return !!window.ggslam && !!ggslam.renderer.sorted"))
+    b.wait_for(lambda: browser.execute_script("return !!window.ggslam && !!ggslam.drawn"))
     assert not browser.find_element("id", "choose").is_displayed()
     assert b.errors(browser) == []

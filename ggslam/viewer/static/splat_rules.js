@@ -1,0 +1,23 @@
+// SPDX-License-Identifier: Apache-2.0
+// The rules of drawing, those of ggslam/rendering/reference.py; workers get a copy. Coordinates: x right, y down, z
+// forward. Screens have their principal point in the middle.
+
+const SPLAT_RULES = Object.freeze({
+  lowPass: 0.3, // pixels squared, added to both variances of a projected splat
+  minAlpha: 1 / 255, // fainter contributions are left out
+  maxAlpha: 0.999,
+  minTransmittance: 1e-4, // a pixel takes no further splat once its transmittance is below
+  slopeMargin: 0.65, // of the screen: slopes beyond are clamped in the Jacobian
+  visible: 1, selected: 2, // bits of an object's state
+  marked: 1, gone: 2, // bits of a splat's marks
+  tint: [255, 217, 26], tintShare: 0.45, // of what is selected
+});
+
+// A worker from functions and classes of this page: `main` runs in it and sees `parts` by their names.
+function startWorker(main, ...parts) {
+  const text = [`"use strict"; const SPLAT_RULES = ${JSON.stringify(SPLAT_RULES)};`, ...parts.map(String), `(${main})();`];
+  const address = URL.createObjectURL(new Blob([text.join("\n")], { type: "text/javascript" }));
+  const worker = new Worker(address);
+  URL.revokeObjectURL(address);
+  return worker;
+}
