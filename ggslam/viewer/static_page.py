@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One HTML file that shows a map without server and network: splats in 19 or 22 bytes each, compressed, with a small
+"""One HTML file that shows a map without server and network: splats in 19 to 26 bytes each, compressed, with a small
 WebGL program of our own."""
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from ggslam.viewer.splats import DrawnSplatTuning, colors_to_uint8, opacities_of
 
 STATIC = Path(__file__).with_name("static")
 MAP_SCRIPTS = (
-    "splat_rules.js", "unpack.js", "displacement.js", "sorter.js", "webgl_programs.js", "splat_textures.js",
-    "webgl_renderer.js", "splat_projector.js", "tile_painter.js", "painting_worker.js", "painter_pool.js",
-    "processor_renderer.js", "map_lines.js", "picker.js", "resolution.js", "map_view.js",
+    "splat_rules.js", "unpack.js", "displacement.js", "seen_shapes.js", "sorter.js", "webgl_programs.js",
+    "splat_textures.js", "webgl_renderer.js", "splat_projector.js", "tile_painter.js", "painting_worker.js",
+    "painter_pool.js", "processor_renderer.js", "map_lines.js", "picker.js", "resolution.js", "map_view.js",
 )  # fmt: skip
 """What `MapView` consists of, in the order in which a page needs it."""
 _PARTS = (*MAP_SCRIPTS, "camera.js", "page.js")
@@ -49,8 +49,9 @@ SCALES = (float(np.log(StaticPageTuning.min_size_m)), float(np.log(DrawnSplatTun
 
 
 def pack_splats(
-    gaussians: Gaussians, rows: np.ndarray, colors: np.ndarray, owners: np.ndarray, identity: np.ndarray | None
-) -> tuple[bytes, np.ndarray, np.ndarray]:
+    gaussians: Gaussians, rows: np.ndarray, colors: np.ndarray, owners: np.ndarray, identity: np.ndarray | None,
+    seen: np.ndarray | None = None,
+) -> tuple[bytes, np.ndarray, np.ndarray]:  # fmt: skip
     """Splats as compressed bytes, column by column.
 
     Args:
@@ -59,6 +60,7 @@ def pack_splats(
         colors: uint8 [N, 3], theirs.
         owners: object ids uint16 [N], theirs.
         identity: colours of their identity vectors uint8 [N, 3], or None.
+        seen: from where they were seen, uint8 [N, 4] of `viewed_sides`, or None.
 
     Returns:
         The bytes, and the lowest and highest corner [3] of the centres, between which these are written in 65,535
@@ -77,6 +79,7 @@ def pack_splats(
     ]
     columns += [colors.T, np.rint(255 * opacities_of(gaussians)[rows]).astype(np.uint8), _halves(owners)]
     columns += [] if identity is None else [identity.T]
+    columns += [] if seen is None else [seen.T]
     return zlib.compress(b"".join(np.ascontiguousarray(column).tobytes() for column in columns), 9), low, high
 
 
@@ -87,17 +90,17 @@ def _halves(values: np.ndarray) -> np.ndarray:
 
 def static_page(
     model: ViewedMap, title: str, gaussians: Gaussians, rows: np.ndarray, identity: np.ndarray | None,
-    owners: np.ndarray,
+    owners: np.ndarray, seen: np.ndarray | None = None,
 ) -> str:  # fmt: skip
     """The page as text.
 
     Args:
         model: the map.
         title: of the page.
-        gaussians, rows, identity, owners: as in `pack_splats`.
+        gaussians, rows, identity, owners, seen: as in `pack_splats`.
     """
     colors = colors_to_uint8(0.5 + SH_C0 * gaussians.sh.numpy()[rows, 0])
-    packed, low, high = pack_splats(gaussians, rows, colors, owners, identity)
+    packed, low, high = pack_splats(gaussians, rows, colors, owners, identity, seen)
     objects = model.objects()
     frames = list(model.frame_poses)
     shown = [
@@ -109,6 +112,7 @@ def static_page(
     top = top_view(gaussians.means.numpy()[rows], poses[:, :3, 3], poses[0, :3, 2], model.up, fov)
     scene = {
         "count": len(rows), "low": low, "high": high, "scales": SCALES, "identity": identity is not None,
+        "seen": seen is not None,
         "objects": [_object_values(record) for record in objects], "unlabelled": int((owners == 0).sum()),
         "about": model.describe(), "up": model.up, "fov": fov,
         "views": {"Start": _view(start), "Top": _view(top)},

@@ -39,6 +39,7 @@ from ggslam.system.untrusted_files import is_plain_name, read_untrusted
 from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover
 from ggslam.viewer.splats import Splats, most_visible, splats_of
 from ggslam.viewer.static_page import static_page
+from ggslam.viewer.viewed_sides import viewed_sides
 from ggslam.volumes.map_upright import upright_of
 
 
@@ -242,7 +243,13 @@ class ViewedRun:
             rows = self._most_visible()
             owners = self._gaussians.object_id.numpy()[rows].astype(np.uint16)
             identity = self._identity_colors(rows)
-            return static_page(self, title, self._gaussians, rows, identity, owners)
+            return static_page(self, title, self._gaussians, rows, identity, owners, self._viewed_sides(rows))
+
+    def _viewed_sides(self, rows: np.ndarray) -> np.ndarray | None:
+        """See `viewed_sides`; None where the poses are none of a recording."""
+        if not self.folder.has_poses:
+            return None
+        return viewed_sides(self._gaussians, rows, self.camera, list(self.frame_poses.values()))
 
     def _identity_colors(self, rows: np.ndarray) -> np.ndarray | None:
         """uint8 [N, 3] of the Gaussians' identity vectors; None if they have none."""
