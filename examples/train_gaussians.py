@@ -8,10 +8,11 @@ python examples/train_gaussians.py demo/room demo/trained.ply
 from __future__ import annotations
 
 import sys
+from typing import cast
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 import ggslam
 from ggslam import GaussianModel
@@ -54,7 +55,8 @@ def main(recording: str, out: str, frames: str = "6", epochs: str = "20") -> Non
     model = begin(sequence[0], poses[0])
     before = mean_psnr(model, sequence, poses)
 
-    loader = DataLoader(sequence, batch_size=1, shuffle=True, collate_fn=ggslam.collate_frames)
+    frames_of_it = cast("Dataset[ggslam.Frame]", sequence)  # it has what torch asks for, without loading torch
+    loader = DataLoader(frames_of_it, batch_size=1, shuffle=True, collate_fn=ggslam.collate_frames)
     optimizer = torch.optim.Adam(model.parameter_groups(means=3e-4), eps=1e-15)
     for epoch in range(int(epochs)):
         for batch in loader:
@@ -62,7 +64,7 @@ def main(recording: str, out: str, frames: str = "6", epochs: str = "20") -> Non
             loss = ggslam.color_loss(view.image, batch["color"][0])
             loss = loss + 0.5 * ggslam.depth_loss(view.depth, batch["depth"][0])
             optimizer.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]  # torch does not say its types
             optimizer.step()
         print(f"epoch {epoch}: loss {loss.item():.4f}")
 

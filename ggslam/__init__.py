@@ -40,13 +40,20 @@ if _TYPE_CHECKING:
     from ggslam.formats.trajectory import Trajectory as Trajectory
     from ggslam.formats.trajectory import read_trajectory as read_trajectory
     from ggslam.formats.trajectory import write_tum as write_tum
-    from ggslam.jobs.edit.edits import Edit as Edit
+    from ggslam.jobs.changes.changes import find_changes as find_changes
+    from ggslam.jobs.compare.comparison import compare_maps as compare_maps
+    from ggslam.jobs.edit.edit import Edit as Edit
     from ggslam.jobs.edit.edits import edit_run as edit_run
     from ggslam.jobs.export.export_run import export_run as export_run
+    from ggslam.jobs.localize.localize_recording import localize_recording as localize_recording
+    from ggslam.jobs.merge.merge import merge_runs as merge_runs
+    from ggslam.jobs.refine.refine_run import refine_run as refine_run
     from ggslam.jobs.render.render_run import render_run as render_run
     from ggslam.jobs.run.evaluate_run import evaluate_run as evaluate_run
     from ggslam.jobs.run.pipeline import RunOutcome as RunOutcome
     from ggslam.jobs.run.run_recording import run_recording as run_recording
+    from ggslam.jobs.update.update import update_run as update_run
+    from ggslam.jobs.volumes.fuse_volumes import fuse_volumes as fuse_volumes
     from ggslam.objects.lookup import objects_at as objects_at
     from ggslam.objects.table import ObjectTable as ObjectTable
     from ggslam.rendering import GaussianModel as GaussianModel
@@ -107,8 +114,16 @@ _HOMES = {
     "ggslam.runs.opened_points": ("surface_points",),
     "ggslam.formats.splat_formats": ("read_splats",),
     "ggslam.formats.trajectory": ("Trajectory", "read_trajectory", "write_tum"),
-    "ggslam.jobs.edit.edits": ("Edit", "edit_run"),
+    "ggslam.jobs.edit.edit": ("Edit",),
+    "ggslam.jobs.edit.edits": ("edit_run",),
     "ggslam.jobs.export.export_run": ("export_run",),
+    "ggslam.jobs.changes.changes": ("find_changes",),
+    "ggslam.jobs.compare.comparison": ("compare_maps",),
+    "ggslam.jobs.localize.localize_recording": ("localize_recording",),
+    "ggslam.jobs.merge.merge": ("merge_runs",),
+    "ggslam.jobs.refine.refine_run": ("refine_run",),
+    "ggslam.jobs.update.update": ("update_run",),
+    "ggslam.jobs.volumes.fuse_volumes": ("fuse_volumes",),
     "ggslam.jobs.render.render_run": ("render_run",),
     "ggslam.jobs.run.pipeline": ("RunOutcome",),
     "ggslam.jobs.run.run_recording": ("run_recording",),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 _MARK = r"\d+-[0-9a-f]{8}(?![0-9a-f])"
 """Number of a process and eight digits: how hidden names end that ggslam gives to what is not done yet."""
@@ -49,6 +50,27 @@ class ConfigError(GgslamError):
     """A setting is unknown or has an impossible value."""
 
 
+class AnotherKindError(GgslamError):
+    """A file or folder is there, but is not of the kind that was asked for.
+
+    Attributes:
+        path: of it.
+        wanted: the kind.
+    """
+
+    wanted = "input"
+
+    def __init__(self, path: object, reason: str) -> None:
+        super().__init__(f"{path}: {reason}")
+        self.path = Path(str(path))
+
+
+class NotARecordingError(AnotherKindError, SequenceError):
+    """A recording was asked for."""
+
+    wanted = "recording"
+
+
 class TrackingLostError(GgslamError):
     """Most frames of a recording have no pose: the run was saved, but is no result."""
 
@@ -73,6 +95,30 @@ class NoPointsError(FormatError):
 
 class RunFolderError(GgslamError):
     """A run folder cannot be written or lacks a part that was asked for."""
+
+
+class NotARunError(AnotherKindError, RunFolderError):
+    """A run was asked for."""
+
+    wanted = "run"
+
+
+class NotABatchError(AnotherKindError, ConfigError):
+    """The manifest of a batch or a folder of recordings was asked for."""
+
+    wanted = "batch"
+
+
+class NotACloudError(AnotherKindError, FormatError):
+    """A point cloud was asked for."""
+
+    wanted = "cloud"
+
+
+class NotAStreamError(AnotherKindError, FormatError):
+    """A coded stream was asked for."""
+
+    wanted = "stream"
 
 
 class RenderError(GgslamError):

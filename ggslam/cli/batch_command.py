@@ -36,7 +36,9 @@ EPILOG = """
 
   ggslam batch recordings/ --options "--scale 0.5" --seeds 0,1,2
 
-  ggslam batch --replica data/Replica
+  ggslam batch --replica data/Replica --by-paper-rules
+
+  ggslam batch experiments.yaml --dry-run
 
   ggslam batch experiments.yaml --engine ray --address auto
 
@@ -87,6 +89,17 @@ Only = Annotated[
     int | None,
     typer.Option(help="Make only the run with this number, counted from 0, and no table; used by job arrays."),
 ]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Check all runs and list them; make none.")]
+Baseline = Annotated[
+    str | None,
+    typer.Option(
+        help="Settings that the table compares the others with; default: as the manifest says, or the first ones."
+    ),
+]
+ByRules = Annotated[
+    bool,
+    typer.Option("--by-paper-rules", help="Show our figures by each paper's rules too, beside the published ones."),
+]
 Retry = Annotated[bool, typer.Option("--retry", help="Repeat failed runs.")]
 
 
@@ -103,18 +116,31 @@ def batch(
     write_only: WriteOnly = False,
     table_only: TableOnly = False,
     only: Only = None,
+    dry_run: DryRun = False,
+    baseline: Baseline = None,
+    by_rules: ByRules = False,
 ) -> None:
     """Run recordings x settings x seeds, each into a folder of its own, and write one table of their scores.
 
+    All options and recordings are checked before the first run.
+
     Runs that are done are skipped and those that were cut off go on, so the same command can be given again. Exit
     code 1 if a run failed."""
+    from ggslam.cli.batch_check import check_jobs, list_jobs
     from ggslam.jobs.batch.batch import run_batch, run_one
+    from ggslam.jobs.batch.job_states import states_of
 
     jobs = _manifest(manifest, replica, out, options, seeds)
+    jobs.baseline_name(baseline)
     if write_only != (engine is EngineName.slurm):
         raise ConfigError("--engine slurm needs --write-only, and only it has that: ggslam does not submit jobs itself")
     if address is not None and engine is not EngineName.ray:
         raise ConfigError("--address is for --engine ray")
+    if not table_only and only is None:
+        check_jobs(states_of(jobs, retry), recordings=not write_only)
+    if dry_run:
+        list_jobs(states_of(jobs, retry))
+        return
     if write_only:
         from ggslam.jobs.batch.slurm_script import slurm_script
 
@@ -128,7 +154,7 @@ def batch(
     else:
         with _progress() as told:
             chosen = cast("RunEngine", "none" if table_only else engine.value)
-            outcome = run_batch(jobs, workers, retry, told.note, chosen, address)
+            outcome = run_batch(jobs, workers, retry, told.note, chosen, address, baseline, by_rules)
         _show(outcome)
         failed = bool(outcome.failures)
     if failed:
@@ -227,22 +253,30 @@ def _progress() -> Iterator[_Lines | _LiveTable]:
         yield _LiveTable(live)
 
 
+def _print_columns(title: str, outcome: BatchOutcome, chosen: Sequence[int]) -> None:
+    from rich.table import Table
+
+    shown, head = Table(title=title), outcome.table.head()
+    for k in chosen:
+        shown.add_column(head[k], justify="left" if k < 2 else "right")
+    for row in outcome.table.cells(spreads=head[chosen[-1]].startswith("Δ")):
+        shown.add_row(*(row[k] for k in chosen))
+    console.print(shown)
+
+
 def _counts(states: Sequence[JobState], words: Sequence[str]) -> list[str]:
     counts = Counter(state.state.value for state in states)
     return [f"{counts[word]} {word}" for word in words if counts[word]]
 
 
 def _show(outcome: BatchOutcome) -> None:
-    from rich.table import Table
-
     from ggslam.jobs.batch.scores_table import COLUMNS
 
-    shown, own = Table(title=outcome.table.title), 3 + len(COLUMNS)  # papers' figures are in the files
-    for number, title in enumerate(outcome.table.head()[:own]):
-        shown.add_column(title, justify="left" if number < 2 else "right")
-    for row in outcome.table.cells(spreads=False):
-        shown.add_row(*row[:own])
-    console.print(shown)
+    names, own = 2, 3 + len(COLUMNS)  # papers' figures are in the files
+    _print_columns(outcome.table.title, outcome, [*range(own)])
+    if outcome.table.baseline is not None:
+        deltas = [k for k, title in enumerate(outcome.table.head()) if title.startswith("Δ")]
+        _print_columns(f"against {outcome.table.baseline}", outcome, [*range(names), *deltas])
     for note in outcome.table.notes():
         console.print(note, highlight=False, markup=False)
     console.print(f"wrote {', '.join(map(str, outcome.files))}", highlight=False, markup=False)

@@ -77,14 +77,14 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="JSON file to write all numbers to.")] = None,
 ) -> None:  # fmt: skip
     """Compare two maps: how far apart trajectories and surfaces are, and scores side by side. B is the reference."""
-    from ggslam.jobs.compare.comparison import compare as compare_sides
+    from ggslam.jobs.compare.comparison import compare_maps
     from ggslam.runs.folder import RunFolder
     from ggslam.system.atomic import write_text
     from ggslam.system.json_files import json_ready
 
     for path in (a, b) if changes else ():
         RunFolder.open(path)  # before anything takes long
-    found = compare_sides(a, b, align.value, max_distance, _numbers(thresholds), seed)
+    found = compare_maps(a, b, align.value, max_distance, _numbers(thresholds), seed)
     _print(found, max_distance)
     values = found.to_dict()
     if changes:

@@ -41,7 +41,9 @@ from ggslam.cli import (
 from ggslam.cli.argument_names import with_options
 from ggslam.cli.console import PlainConsole
 from ggslam.cli.old_names import Command
-from ggslam.errors import GgslamError
+from ggslam.cli.recognition import with_advice
+from ggslam.cli.usage_words import UsageError, in_own_words
+from ggslam.errors import AnotherKindError, GgslamError
 from ggslam.system.interrupts import Interrupted, exit_code, stop_like_ctrl_c
 from ggslam.system.tuning import Tuning
 
@@ -58,13 +60,31 @@ _TORCH_HAS_NO_MEMORY = "DefaultCPUAllocator: "
 
 
 class _Commands(TyperGroup):
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parses the words before the command's name."""
+        try:
+            return list(super().parse_args(ctx, list(args)))
+        except UsageError as error:
+            raise in_own_words(error, args) from None
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
+        """The command of a name."""
+        try:
+            return super().resolve_command(ctx, args)
+        except UsageError as error:
+            error.ctx = error.ctx or ctx
+            raise in_own_words(error, args) from None
+
     def invoke(self, context: Any) -> Any:
         """Runs a command; errors that name arguments name options from here on."""
         try:
             with stop_like_ctrl_c():
                 return super().invoke(context)
+        except UsageError as error:
+            raise in_own_words(error) from None
         except GgslamError as error:
-            error.args = (with_options(str(error)),)
+            text = with_advice(error) if isinstance(error, AnotherKindError) else str(error)
+            error.args = (with_options(text),)
             raise
         except Interrupted as stop:  # Ctrl-C itself is typer's
             raise SystemExit(exit_code(stop)) from None
@@ -75,7 +95,7 @@ app = typer.Typer(
     name="ggslam",
     help="RGB-D Gaussian SLAM on two CPU cores: a recording in; trajectory, Gaussian map and scores out.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )

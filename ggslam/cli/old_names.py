@@ -7,6 +7,8 @@ from typing import Any
 
 from typer.core import TyperCommand
 
+from ggslam.cli.usage_words import UsageError, in_own_words
+
 OLD_NAMES = {
     "compare": {"--json": "--out"},
     "decode": {"--workers": "--threads"},
@@ -25,7 +27,12 @@ class Command(TyperCommand):
         """Parses the words after they were put into today's names; what follows a lone `--` is no option."""
         names = OLD_NAMES.get(str(ctx.info_name), {})
         end = args.index("--") if "--" in args else len(args)
-        return list(super().parse_args(ctx, [_translate(word, names) for word in args[:end]] + args[end:]))
+        words = [_translate(word, names) for word in args[:end]] + args[end:]
+        try:
+            return list(super().parse_args(ctx, list(words)))
+        except UsageError as error:
+            error.ctx = error.ctx or ctx
+            raise in_own_words(error, words) from None
 
 
 def _translate(word: str, names: dict[str, str]) -> str:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
@@ -49,6 +49,11 @@ EPILOG = """
   ggslam run --resume runs/kitchen
 """
 
+_SHORTCUTS = {
+    "mapping.iterations_per_frame": "iterations", "refine_iterations": "refine", "realtime_fps": "realtime",
+    "threads": "threads", "seed": "seed", "loops.enabled": "loops", "tracker": "tracker", "device": "device",
+}  # fmt: skip
+"""Settings that have options of their own, with their parameters."""
 _MODEL = "masks.model"
 """Setting that whoever goes on with a run has to know, if it has one."""
 _WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate", "strict"}
@@ -57,6 +62,13 @@ _WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host",
 
 STRICT_EXIT_CODE: Final = 3
 """Exit code under --strict of a run that ended but is bad, or whose recording seems wrong."""
+
+
+class TrackerName(str, Enum):
+    """How a run tracks the camera."""
+
+    gicp = "gicp"
+    edges_planes = "edges_planes"
 
 
 class DeviceName(str, Enum):
@@ -82,8 +94,8 @@ Realtime = Annotated[
     float | None, typer.Option(metavar="FPS", help="Deliver frames at this rate; tracker and mapper run side by side.")
 ]
 Tracker = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="gicp: track by generalised ICP (default); edges_planes: by edges and planes."),
+    TrackerName | None,
+    typer.Option(help="gicp: track by generalised ICP (default); edges_planes: by edges and planes."),
 ]
 Loss = Annotated[
     str | None,
@@ -181,10 +193,7 @@ def run(
         "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
         camera, intrinsics, depth_kind, depth_delay, upright, void_id,
     )  # fmt: skip
-    given = _overrides(settings, {
-        "mapping.iterations_per_frame": iterations, "refine_iterations": refine, "realtime_fps": realtime,
-        "threads": threads, "seed": seed, "loops.enabled": loops, "tracker": tracker, "device": device,
-    })  # fmt: skip
+    given = overrides_of(context.params)
     request = replace(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
         map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check, loss=loss,
@@ -198,10 +207,16 @@ def _recording(sequence: Path | None) -> Path:
     return sequence
 
 
-def _overrides(settings: list[str] | None, shortcuts: dict[str, Any]) -> list[str]:
-    """What `--set` says, and the options that stand for a setting."""
-    values = {name: value.value if isinstance(value, Enum) else value for name, value in shortcuts.items()}
-    return [*(settings or []), *(f"{name}={value}" for name, value in values.items() if value is not None)]
+def overrides_of(parameters: Mapping[str, Any]) -> list[str]:
+    """What `--set` says, and the options that stand for a setting.
+
+    Args:
+        parameters: of this command.
+    """
+    given = {name: parameters[parameter] for name, parameter in _SHORTCUTS.items()}
+    values = {name: value.value if isinstance(value, Enum) else value for name, value in given.items()}
+    chosen = [f"{name}={value}" for name, value in values.items() if value is not None]
+    return [*(parameters["settings"] or []), *chosen]
 
 
 def _go_on(

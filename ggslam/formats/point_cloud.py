@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.errors import FormatError, InputError, NoPointsError
+from ggslam.errors import FormatError, InputError, NoPointsError, NotACloudError
 from ggslam.formats.gaussian_ply import object_ids
 from ggslam.formats.pcd import read_pcd, write_pcd
 from ggslam.formats.ply import read_ply, write_ply
@@ -92,7 +92,7 @@ def read_point_cloud(path: str | Path, tell: bool = True) -> ColoredCloud:
             raise FormatError(f"{path}: no element 'vertex'; it has {', '.join(ply.elements) or 'none'}")
         return _cloud(path, ply.elements["vertex"], ply.comments, tell)
     if path.suffix.lower() != ".pcd" and not start.startswith((b"#", b"VERS")):
-        raise FormatError(f"{path}: neither a PLY nor a PCD file (it begins with {start!r})")
+        raise NotACloudError(path, f"neither a PLY nor a PCD file (it begins with {start!r})")
     return _cloud(path, read_pcd(path), [], tell)
 
 

@@ -32,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam import __version__
-from ggslam.errors import FormatError, RunFolderError
+from ggslam.errors import FormatError, NotARunError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.trajectory import Trajectory, read_tum, write_tum
 from ggslam.movers.point_files import POINTS_FILE, points_from_arrays
@@ -57,6 +57,7 @@ from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config, config_from_dict
 from ggslam.slam.result import SlamResult
 from ggslam.system.folder_lock import LOCK_FILE, refuse_other_writers
+from ggslam.system.missing_paths import why_missing
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.staging import finish_saving, is_being_saved, leftovers, refuse_links_at
 from ggslam.system.untrusted_files import printable, read_untrusted_text, refuse_links
@@ -123,7 +124,7 @@ class RunFolder:
         if not (Path(path) / MARKER).is_file():
             if has_checkpoints(Path(path)):
                 raise RunFolderError(f"{path}: the run was cut off before it was saved; go on with it: `resume`")
-            raise RunFolderError(f"{path}: {_why_no_run(Path(path))}")
+            raise no_run(Path(path))
         refuse_links(path, RunFolderError)
         if is_being_saved(Path(path), MARKER):
             finish_saving(Path(path), MARKER)
@@ -407,13 +408,13 @@ def as_written(path: Path) -> Iterator[None]:
         raise RunFolderError(f"{path}: not as ggslam writes it: {error!r}") from error
 
 
-def _why_no_run(path: Path) -> str:
-    """What is there instead of a run."""
+def no_run(path: Path) -> RunFolderError:
+    """The error that says what is there instead of a run."""
     if path.is_dir():
-        return "is not a run of ggslam (no run.json)"
-    if not path.is_file():
-        return "is neither a folder nor a regular file (a pipe or a device?)" if path.exists() else "no such folder"
-    if path.suffix in (".ggz", ".ggc"):
-        return "is a file, and a run is a folder; `ggslam decode` makes one of it"
-    taken = "view, render, export, edit, encode and compare take files of Gaussians"
-    return f"is a file, and a run is a folder ({taken})"
+        return NotARunError(path, "is not a run of ggslam (no run.json)")
+    if path.is_file():
+        more = "; `ggslam decode` makes one of it" if path.suffix in (".ggz", ".ggc") else ""
+        return NotARunError(path, f"is a file, and a run is a folder{more}")
+    if path.exists():
+        return RunFolderError(f"{path}: is neither a folder nor a regular file (a pipe or a device?)")
+    return RunFolderError(f"{path}: {why_missing(path, 'no such folder')}")

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ggslam.errors import FormatError, RunFolderError, SequenceError
+from ggslam.errors import ConfigError, FormatError, RunFolderError, SequenceError
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.sequence import OpenRecord, PartRecord, SequenceRecord
 from ggslam.scene.arrays import read_all_arrays
@@ -46,6 +47,25 @@ class SequenceRequest:
     depth_delay: str | None = None
     upright: bool = False
     void_id: int | None = None
+
+    @classmethod
+    def of(cls, path: str | Path, selection: Mapping[str, Any], caller: str) -> SequenceRequest:
+        """A request by arguments of `open_sequence`.
+
+        Args:
+            path: of the recording.
+            selection: the arguments.
+            caller: name of the function that was called with them, for its errors.
+
+        Raises:
+            ConfigError: `open_sequence` has no such argument.
+        """
+        paths = ("masks", "depth_camera", "camera")
+        given: dict[str, Any] = {k: Path(v) if k in paths and v is not None else v for k, v in selection.items()}
+        try:
+            return cls(Path(path), **given)
+        except TypeError:
+            raise ConfigError(f"{caller}: no such argument of open_sequence in {', '.join(given)}") from None
 
     def open(self, truth: bool = True) -> Sequence:
         """Opens the recording; `truth`: with its true poses.

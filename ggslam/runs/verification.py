@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ggslam.errors import RunFolderError
 from ggslam.runs.checkpoints import has_checkpoints
+from ggslam.runs.folder import no_run
 from ggslam.runs.manifest import Problem, files_in, names_in, sum_problems
 from ggslam.runs.records.run_json import RunRecord
 from ggslam.system.folder_lock import folder_lock, writer_of
@@ -71,7 +72,7 @@ def verify_run(path: Path) -> Verification:
     path = Path(path)
     if not (path / RunRecord.FILE).is_file():
         more = "; it was cut off before it was saved: `ggslam run --resume`" if has_checkpoints(path) else ""
-        raise RunFolderError(f"{path}: is not a run of ggslam (no run.json){more}")
+        raise RunFolderError(f"{path}: is not a run of ggslam (no run.json){more}") if more else no_run(path)
     if writer_of(path) is None:
         finish_saving(path, RunRecord.FILE)
     mark = RunRecord.read(path)
@@ -91,7 +92,7 @@ def accept_files(path: Path) -> Verification:
     """
     path = Path(path)
     if not (path / RunRecord.FILE).is_file():
-        raise RunFolderError(f"{path}: is not a run of ggslam (no run.json)")
+        raise no_run(path)
     with folder_lock(path):
         finish_saving(path, RunRecord.FILE)
         RunRecord.read(path).with_files(files_in(path)).write(path)

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 
-from ggslam.errors import SequenceError
+from ggslam.errors import NotARecordingError, SequenceError
 from ggslam.sequences.calibration import use_depth_camera
 from ggslam.sequences.depth_delay import delay_depth
 from ggslam.sequences.depth_kind import PLAIN, DepthKind, read_depth_kind
@@ -39,6 +39,7 @@ from ggslam.sequences.rig import NAME as RIG
 from ggslam.sequences.rig import open_rig
 from ggslam.sequences.rig_file import find_rig_file
 from ggslam.sequences.sequence import OnBadFrame, Sequence
+from ggslam.system.missing_paths import why_missing
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import given_path, refuse_links
 
@@ -236,9 +237,7 @@ def _check_kind(path: Path) -> None:
         if not os.path.isfile(path) and not os.path.isdir(path):  # noqa: PTH112, PTH113
             raise SequenceError(f"{path}: is neither a folder nor a regular file (a pipe, a socket or a device?)")
         return
-    if os.path.islink(path):  # noqa: PTH114
-        raise SequenceError(f"{path}: is a link to {os.readlink(path)}, which is not there")  # noqa: PTH115
-    raise SequenceError(f"{path}: no such folder or file")
+    raise SequenceError(f"{path}: {why_missing(path)}")
 
 
 def _check_places(recording: Recording) -> None:
@@ -309,8 +308,10 @@ def _find_format(folder: Path, name: str | None) -> RecordingFormat:
     if recognised is None:
         looked_for = "\n".join([*(f"  {f.name}: {f.layout}" for f in FORMATS), f"  {RIG}: {RIG_LAYOUT}"])
         if folder.is_file():
-            raise SequenceError(f"{folder}: expected a recording, found a file that is none. Looked for:\n{looked_for}")
-        raise SequenceError(f"{folder}: not a known recording; it holds {_contents(folder)}. Looked for:\n{looked_for}")
+            reason = f"expected a recording, found a file that is none. Looked for:\n{looked_for}"
+            raise NotARecordingError(folder, reason)
+        holds = f"not a known recording; it holds {_contents(folder)}. Looked for:\n{looked_for}"
+        raise NotARecordingError(folder, holds)
     return recognised
 
 

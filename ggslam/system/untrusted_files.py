@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from ggslam.errors import FormatError, GgslamError, MemoryFullError, SequenceError
+from ggslam.system.missing_paths import why_missing
 from ggslam.system.process_memory import most_memory_bytes
 from ggslam.system.tuning import Tuning
 
@@ -76,7 +77,7 @@ def open_untrusted(path: str | Path, error: type[GgslamError] = FormatError) -> 
         _refuse_other_kinds(path, Path(path).stat().st_mode, error)  # opening a device may already do something
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
-        raise error(f"{path}: file is missing") from None
+        raise error(f"{path}: {why_missing(path, 'file is missing')}") from None
     except (OSError, ValueError) as reason:  # ValueError: a name with a zero byte
         raise error(f"{path}: cannot be read: {getattr(reason, 'strerror', None) or reason}") from None
     try:

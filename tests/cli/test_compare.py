@@ -185,7 +185,7 @@ def test_a_mesh_is_sampled(tmp_path: Path) -> None:
 
 def test_faults_are_named(run: Path, tmp_path: Path) -> None:
     one_error(ggslam("compare", run, tmp_path / "nothing"), "nothing")
-    one_error(ggslam("compare", tmp_path, run), str(tmp_path), "not a run")
+    one_error(ggslam("compare", tmp_path, run), str(tmp_path), "is an empty folder")
     (tmp_path / "letter.ply").write_text("dear")
     one_error(ggslam("compare", run, tmp_path / "letter.ply"), "letter.ply")
     one_error(ggslam("compare", run, run, "--thresholds", "a,b"), "--thresholds")

@@ -216,8 +216,8 @@ def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
     write_point_cloud(plain, np.random.default_rng(0).random((9, 3)), {})
     for words, expected in (
         (("encode", tmp_path / "none.ply", stream), "none.ply"),
-        (("encode", stream, tmp_path / "b.bin"), "neither a PLY nor a PCD"),
-        (("encode", tmp_path, tmp_path / "b.bin"), "run.json"),
+        (("encode", stream, tmp_path / "b.bin"), "may be a coded cloud"),
+        (("encode", tmp_path, tmp_path / "b.bin"), "no run.json"),
         (("encode", points, tmp_path / "b.bin", "--preset", "splat"), "no Gaussians"),
         (("encode", points, tmp_path / "b.bin", "--voxel", "1e-8"), "voxels"),
         (("encode", points, tmp_path / "b.bin", "--sweep", "qp", "--preset", "splat"), "--sweep"),
@@ -233,7 +233,7 @@ def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
         (("decode", stream, tmp_path / "b.ply", "--box", "0 0 0 1 1"), "x0 y0 z0"),
         (("decode", stream, tmp_path / "b.ply", "--box", "50 50 50 60 60 60"), "no points in the box"),
         (("decode", stream, tmp_path / "b.ply", "--box", "0 0 0 1 1 1", "--slice", 0), "not both"),
-        (("inspect", points), "not a G-PCC stream"),
+        (("inspect", points), "is a point cloud"),
         (("inspect", tmp_path / "none.bin"), "file is missing"),
     ):
         code, _, err = ggslam(*words)

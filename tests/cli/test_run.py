@@ -237,7 +237,7 @@ def test_wrong_arguments(room: Path, finished: Path, tmp_path: Path) -> None:
     refuse(ggslam("run", room, "--config", "swift"), "swift", "default")
     refuse(ggslam("run", room, "--start", 100, "--out", tmp_path / "run"), "0 to 23")
     refuse(ggslam("run", room, "--scale", "0.01", "--out", tmp_path / "run"), "scale: 0.01 leaves images of")
-    refuse(ggslam("eval", tmp_path), "run.json")
+    refuse(ggslam("eval", tmp_path), "is an empty folder")
     refuse(ggslam("run", room, "--set", "mapping={", "--out", tmp_path / "run"), "mapping={")
     refuse(ggslam("run", room, "--set", "mapping.insertion.opacity=.nan", "--out", tmp_path / "run"), "opacity")
     refuse(ggslam("run", room, "--set", "mapping.pruning.every_keyframes=0", "--out", tmp_path / "r"), "every_keyf")

@@ -49,7 +49,7 @@ class BatchOutcome:
 def run_batch(
     manifest: Manifest, workers: int | None = None, retry: bool = False,
     changed: Callable[[Sequence[JobState]], None] = lambda states: None, engine: Engine = "local",
-    address: str | None = None,
+    address: str | None = None, baseline: str | None = None, by_rules: bool = False,
 ) -> BatchOutcome:  # fmt: skip
     """Makes what is not there yet, each run into a folder of its own, and writes the tables.
 
@@ -62,13 +62,17 @@ def run_batch(
         engine: "local": processes on this machine; "ray": tasks of a Ray cluster; "none": makes no run, for the table
             of those that are done.
         address: of the Ray cluster, see `run_on_ray`.
+        baseline: settings that the table compares the others with; None: those that the manifest names, or the first
+            of several.
+        by_rules: whether the table shows our figures by each paper's rules, beside published ones.
 
     Raises:
-        ConfigError: no worker.
+        ConfigError: no worker, or no settings of the baseline's name.
         RunFolderError: the folder cannot be written, or another batch is at work in it.
         MissingDependency, GgslamError: Ray is not installed, or there is no cluster at the address.
     """
     shares(workers)
+    compared = manifest.baseline_name(baseline)
     make_folder(manifest.out)
     with folder_lock(manifest.out):
         states = states_of(manifest, retry)
@@ -77,7 +81,7 @@ def run_batch(
             run_locally(states, workers, lambda: changed(states))
         elif engine == "ray":
             run_on_ray(states, address, lambda: changed(states))
-        found = ScoresTable.of(manifest.title, states, _machine())
+        found = ScoresTable.of(manifest.title, states, _machine(), compared, by_rules)
         files = []
         for name, make in found.files().items():
             write_text(manifest.out / name, make(), follow=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -67,8 +68,10 @@ class JobProcess:
 
     def end(self) -> None:
         """Notes what became of a process that has ended."""
-        code = self.process.returncode
-        self.state.end(code if code >= 0 else 128 - code, time.monotonic() - self.start, self.state.last_line())
+        code, line = self.process.returncode, self.state.last_line()
+        if code < 0:
+            line = f"{_signal_words(-code)}; it said last: {line}" if line else _signal_words(-code)
+        self.state.end(code if code >= 0 else 128 - code, time.monotonic() - self.start, line)
 
     def ask_to_stop(self) -> None:
         """Has a process that may still be at work save what it has done and end. To be called once: a second signal
@@ -81,6 +84,15 @@ class JobProcess:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(timeout=60)
         self.process.kill()
+
+
+def _signal_words(number: int) -> str:
+    """What ended a process, for people."""
+    try:
+        name = signal.Signals(number).name
+    except ValueError:
+        name = str(number)
+    return f"ended by signal {name}" + (", as when memory is full" if number == signal.SIGKILL else "")
 
 
 def make_job(state: JobState, processors: int, with_parent: bool = False) -> None:

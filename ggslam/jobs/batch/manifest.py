@@ -10,15 +10,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, NotABatchError
 from ggslam.sequences import recognise_format
 from ggslam.slam.config import load_config
+from ggslam.system.missing_paths import why_missing
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
-from ggslam.system.untrusted_files import given_path, is_plain_name, read_untrusted_text
+from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import given_path, is_plain_name, open_untrusted, read_untrusted_text
 
 REPLICA = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 """Replica's scenes in the order in which papers list them."""
-_KEYS = {"out", "options", "recordings", "settings", "seeds"}
+_KEYS = {"out", "options", "recordings", "settings", "seeds", "baseline"}
 ALLOWED = (
     "config", "set", "start", "stop", "stride", "scale", "format", "depth-scale", "pose-convention", "masks", "camera",
     "intrinsics", "depth-camera", "depth-kind", "depth-delay", "upright", "void-id", "min-confidence", "topic",
@@ -27,6 +29,13 @@ ALLOWED = (
 )  # fmt: skip
 """Options of `ggslam run` that a batch passes on: they say how a run is made. The others choose folders, write files of
 their own (`--log`, `--record`), run code of others (`--loss`), serve pages, or are the batch's own business."""
+
+
+class ManifestTuning(Tuning):
+    """How a manifest is told from other files."""
+
+    looked_at_bytes = 4096
+    """Bytes at its begin in which there is no zero byte."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +67,30 @@ class Manifest:
         title: of its table.
         out: folder of its runs and tables.
         jobs: its runs, in the order of the table.
+        baseline: settings that the file says to compare with.
     """
 
     title: str
     out: Path
     jobs: list[BatchJob] = field(default_factory=list)
+    baseline: str | None = None
+
+    def baseline_name(self, asked: str | None = None) -> str | None:
+        """Settings that the others are compared with: the ones asked for, or those of the file, or the first of
+        several.
+
+        Raises:
+            ConfigError: there are no settings of that name.
+        """
+        names = list(dict.fromkeys(job.settings for job in self.jobs))
+        name = asked or self.baseline
+        if name is None:
+            return names[0] if len(names) > 1 else None
+        if name not in names:
+            raise ConfigError(f"`baseline`: expected one of the settings {', '.join(names)}, found {name}")
+        return name
+
+
 FLAGS = {"upright", "loops", "no-loops", "skip-bad-frames", "no-skip-bad-frames", "check", "no-check", "strict"}
 """Those of them that take no value."""
 
@@ -82,12 +110,15 @@ def read_manifest(path: str | Path, out: Path | None = None, options: Sequence[s
         ConfigError: it is not there, no plain YAML, or says something impossible; names the place.
     """
     path = Path(path)
+    with open_untrusted(path, ConfigError) as file:
+        if b"\0" in file.read(ManifestTuning.looked_at_bytes):
+            raise NotABatchError(path, "is no manifest: it is not text")
     try:
         values = parse_yaml(read_untrusted_text(path, ConfigError))
     except PlainYamlError as error:
         raise ConfigError(f"{path}: {error}") from None
     if not isinstance(values, dict) or set(values) - _KEYS or "recordings" not in values:
-        raise ConfigError(f"{path}: expected recordings and no other keys than {', '.join(sorted(_KEYS))}")
+        raise NotABatchError(path, f"expected recordings and no other keys than {', '.join(sorted(_KEYS))}")
     asked = tuple(_check_words("`options`", options))
     common = _options(path, "options", values.get("options"))
     items = _take_list(path, "recordings", values["recordings"])
@@ -102,7 +133,10 @@ def read_manifest(path: str | Path, out: Path | None = None, options: Sequence[s
     folder = out or (_own_folder(path, str(values["out"])) if "out" in values else Path("runs") / path.stem)
     words = [(*common, *own, *chosen) for _, _, own in recordings for chosen in settings.values()]
     _refuse_models(str(path), asked, words)
-    return Manifest(path.stem, folder, _jobs(recordings, settings, seeds, (*asked, *common), str(path)))
+    baseline = values.get("baseline")
+    if baseline is not None and baseline not in settings:
+        raise ConfigError(f"{path}: baseline: expected one of the settings {', '.join(settings)}, found {baseline!r}")
+    return Manifest(path.stem, folder, _jobs(recordings, settings, seeds, (*asked, *common), str(path)), baseline)
 
 
 def manifest_of_folder(
@@ -123,12 +157,12 @@ def manifest_of_folder(
     """
     folder = Path(folder).absolute()
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such folder")
+        raise ConfigError(f"{folder}: {why_missing(folder, 'no such folder')}")
     wanted = sorted(path for path in folder.iterdir() if path.is_dir()) if only is None else [folder / n for n in only]
     found = [path for path in wanted if path.is_dir() and recognise_format(path)]
     if not found:
         names = "" if only is None else f" of the names {', '.join(wanted_name.name for wanted_name in wanted)}"
-        raise ConfigError(f"{folder}: holds no recording{names}")
+        raise NotABatchError(folder, f"holds no recording{names}")
     recordings = [(path.name, path, ()) for path in found]
     name = folder.resolve().name
     jobs = _jobs(recordings, {"default": ()}, seeds, tuple(_check_words(str(folder), options)), str(folder))

@@ -109,8 +109,8 @@ class Comparison:
         })  # fmt: skip
 
 
-def compare(
-    a: Path, b: Path, align: Alignment = "auto", max_distance: float = 0.05,
+def compare_maps(
+    a: str | Path, b: str | Path, align: Alignment = "auto", max_distance: float = 0.05,
     thresholds: Sequence[float] = GeometryScoreTuning.thresholds_m, seed: int = 0,
 ) -> Comparison:  # fmt: skip
     """Compares A with B, B being the reference. Each is the folder of a run, or a PLY or PCD file with a cloud or mesh.
@@ -132,7 +132,7 @@ def compare(
     """
     if not all(0 < d < np.inf for d in (max_distance, *thresholds)):
         raise ConfigError(f"expected positive distances in metres, found {max_distance} and {list(thresholds)}")
-    one, other = read_side(a, seed), read_side(b, seed)
+    one, other = read_side(Path(a), seed), read_side(Path(b), seed)
     pairs, cloud_a, cloud_b = common_poses(one, other), Cloud(one.points), Cloud(other.points)
     T_b_a = np.eye(4)
     if align == "trajectory":

@@ -43,6 +43,8 @@ class Extra:
 
     modules: tuple[str, ...]
     gives: str
+    for_users: bool = True
+    """Whether users of ggslam want it; the others are for working on ggslam."""
 
 
 EXTRAS = {
@@ -52,19 +54,21 @@ EXTRAS = {
     "usd": Extra(("pxr",), "export as OpenUSD"),
     "mesh": Extra(("trimesh",), "meshes as OBJ and GLB"),
     "octomap": Extra(("pyoctomap",), "occupancy in trees of OctoMap's own library"),
-    "formats": Extra(("gsply",), "SPZ in scripts/benchmarks/bench_splats.py"),
-    "bench": Extra(("pyoctomap", "open3d", "edt"), "what the benchmarks of volumes compare with"),
-    "conformance": Extra(("gsply", "gaussforge", "trimesh", "pycolmap", "open3d"), "readers of others for the tests"),
+    "formats": Extra(("gsply",), "SPZ in scripts/benchmarks/bench_splats.py", False),
+    "bench": Extra(("pyoctomap", "open3d", "edt"), "what the benchmarks of volumes compare with", False),
+    "conformance": Extra(
+        ("gsply", "gaussforge", "trimesh", "pycolmap", "open3d"), "readers of others for the tests", False
+    ),
     "cuda": Extra(("nvidia.cu13.nvvm",), "nvcc for run --device cuda, where no CUDA toolkit is installed"),
     "gsplat": Extra(("gsplat",), "an alternative renderer on an NVIDIA GPU"),
     "viewer": Extra(("viser",), "maps in the browser: ggslam view, ggslam run --view"),
-    "browser": Extra(("viser", "selenium"), "tests of the viewer in a browser (with chromium-driver)"),
+    "browser": Extra(("viser", "selenium"), "tests of the viewer in a browser (with chromium-driver)", False),
     "rerun": Extra(("rerun",), "ggslam run --log: a run streamed to rerun"),
     "phone": Extra(("liblzfse",), "recordings of Record3D (.r3d)"),
     "ros": Extra(("rosbags",), "ROS 1 and ROS 2 bags"),
     "ray": Extra(("ray",), "batches on a Ray cluster"),
     "realsense": Extra(("pyrealsense2",), "RealSense cameras and their .bag files"),
-    "docs": Extra(("material",), "building the pages of docs/"),
+    "docs": Extra(("zensical",), "building the pages of docs/", False),
 }
 """By their names in pyproject.toml."""
 
@@ -260,6 +264,8 @@ def _is_installed(module: str) -> bool:
 
 def _extras() -> Iterator[Finding]:
     for name, extra in EXTRAS.items():
+        if not extra.for_users:
+            continue
         lacking = [module for module in extra.modules if not _is_installed(module)]
         if lacking:
             advice = f"pip install 'ggslam[{name}]'"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
@@ -78,6 +79,9 @@ def _stage(
     source.timing().model_copy(update={"gaussians": len(scene.gaussians)}).write(staged)
     for name, picture in pictures.items():
         write_picture(staged / "renders" / name, picture)
-    write_objects(staged, scene)
+    if scene.table.objects or source.has_objects():
+        write_objects(staged, scene)
+    else:
+        write_gaussian_ply(staged / "map.ply", scene.gaussians, extra=("object_id", "identity"))
     if not named_only:
         save_points(staged)

@@ -32,7 +32,7 @@ from ggslam.coding.splats import (
     splat_settings,
 )
 from ggslam.coding.study import GridCloud, on_grid
-from ggslam.errors import ConfigError, FormatError
+from ggslam.errors import ConfigError, FormatError, NotAStreamError
 from ggslam.formats.gaussian_ply import write_gaussian_parts
 from ggslam.formats.gaussian_rows import GaussianRows
 from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_point_cloud
@@ -240,7 +240,8 @@ def list_stream(path: Path) -> StreamListing:
     """
     listing = list_units(read_untrusted(path))
     if not listing.units:
-        raise FormatError(f"{path}: not a G-PCC stream: {listing.problems[0] if listing.problems else 'it is empty'}")
+        reason = listing.problems[0] if listing.problems else "it is empty"
+        raise NotAStreamError(path, f"not a G-PCC stream: {reason}")
     return listing
 
 

@@ -55,19 +55,9 @@ def run_recording(
             raise ConfigError(f"run_recording: choose {', '.join(selection)} when the sequence is opened")
         sequence = request_of(recording)
     else:
-        sequence = _request(Path(recording), selection)
+        sequence = SequenceRequest.of(recording, selection, "run_recording")
     request = RunRequest(
         sequence, None if out is None else Path(out), None if config is None else str(config), list(overrides),
         evaluate, overwrite, None if map is None else Path(map), localize_only, check=check,
     )  # fmt: skip
     return execute(request, observer)
-
-
-def _request(path: Path, selection: dict[str, Any]) -> SequenceRequest:
-    for name in ("masks", "depth_camera", "camera"):
-        if selection.get(name) is not None:
-            selection[name] = Path(selection[name])
-    try:
-        return SequenceRequest(path, **selection)
-    except TypeError:
-        raise ConfigError(f"run_recording: no such argument of open_sequence in {', '.join(selection)}") from None
