@@ -56,8 +56,8 @@ def viewed_sides(gaussians: Gaussians, rows: np.ndarray, camera: Camera, poses: 
 
     Returns:
         uint8 [N, 4]: two of the direction on an octahedron (`octahedron_to_unit`), angle of the cone in 255ths of pi,
-        and the distance (`ViewedSidesTuning.nearest_m`). What no view saw counts as seen from the nearest one. All are 0
-        if there are no views.
+        and the distance (`ViewedSidesTuning.nearest_m`). What no view saw counts as seen from the nearest one. All
+        are 0 if there are no views.
     """
     means = gaussians.means.numpy()[rows].astype(np.float64)
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), ViewedSidesTuning.views)).round().astype(int))

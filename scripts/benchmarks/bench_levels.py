@@ -64,7 +64,7 @@ def draw(gaussians: GaussianMap, camera: Camera, pose: np.ndarray) -> np.ndarray
     return CpuRasterizer(low_pass=LOW_PASS).forward(gaussians, camera, pose).image.numpy().transpose(1, 2, 0)
 
 
-def viewed_sides(distance: float, camera: Camera, view: View, finer: int = 1) -> Camera:
+def seen_from(distance: float, camera: Camera, view: View, finer: int = 1) -> Camera:
     factor = SCREEN_FOCAL * view.depth / distance / camera.fx
     small = camera.resize(max(8, round(camera.width * factor)), max(8, round(camera.height * factor)))
     return small.resize(small.width * finer, small.height * finer)
@@ -72,8 +72,8 @@ def viewed_sides(distance: float, camera: Camera, view: View, finer: int = 1) ->
 
 def wanted(whole: GaussianMap, camera: Camera, view: View, distance: float) -> tuple[np.ndarray, np.ndarray]:
     """What is there to be seen from a distance, and what the whole map looks like from there."""
-    small = viewed_sides(distance, camera, view)
-    fine = draw(whole, viewed_sides(distance, camera, view, FINER), view.T_camera_world).clip(0, 1)
+    small = seen_from(distance, camera, view)
+    fine = draw(whole, seen_from(distance, camera, view, FINER), view.T_camera_world).clip(0, 1)
     there = cv2.resize(fine, (small.width, small.height), interpolation=cv2.INTER_AREA)
     return there, draw(whole, small, view.T_camera_world).clip(0, 1)
 
@@ -85,7 +85,7 @@ def psnr(
     """Against what is there to be seen and against the whole map, means over views, in dB."""
     gaussians, scores = map_of(columns), []
     for view, both in zip(views, images, strict=True):
-        found = draw(gaussians, viewed_sides(distance, camera, view), view.T_camera_world).clip(0, 1)
+        found = draw(gaussians, seen_from(distance, camera, view), view.T_camera_world).clip(0, 1)
         scores.append([-10 * np.log10(np.square(found - image).mean() + 1e-12) for image in both])
     there, same = np.mean(scores, 0)
     return float(there), float(same)

@@ -95,7 +95,7 @@ def test_faces_that_are_laid_upon_the_other_sides_are_where_they_cannot_be() -> 
     assert placing.cost(MOVED) < 0.3 * placing.cost(wrong)
 
 
-def test_a_face_is_not_where_it_would_be_viewed_sides_behind() -> None:
+def test_a_face_is_not_where_it_would_be_seen_from_behind() -> None:
     (front, _), (_, views) = visit((-90,), np.eye(4)), visit((90,), np.eye(4))
     upon = np.eye(4)
     upon[1, 3] = 2 * HALF[1]

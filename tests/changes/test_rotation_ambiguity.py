@@ -48,7 +48,7 @@ def patched(*rows: int) -> Shape:
 @pytest.mark.parametrize("azimuths, hidden", [
     (range(0, 360, 15), 0), ((5, 15, 35, 45), 300), ((5, 95, 185, 275), 60), ((5, 185), 150), ((), 360),
 ])  # fmt: skip
-def test_sides_that_a_thing_was_not_viewed_sides(azimuths: tuple[float, ...], hidden: float) -> None:
+def test_sides_that_a_thing_was_not_seen_from(azimuths: tuple[float, ...], hidden: float) -> None:
     assert hidden_sector(directions(*azimuths), UP) == hidden
 
 
@@ -170,7 +170,7 @@ class PatchedBox(Box):
 
 
 @pytest.mark.long("shapes are compared from starts all around")
-def test_a_plain_thing_with_a_patch_that_was_viewed_sides_opposite_sides_tells_no_turn() -> None:
+def test_a_plain_thing_with_a_patch_that_was_seen_from_opposite_sides_tells_no_turn() -> None:
     """Its front is laid upon its back; that is known only if it could not stand there turned otherwise."""
     old, new = PatchedBox(2, (-0.2, 0.0), (0.2, 0.1, 0.16)), PatchedBox(2, (0.2, 0.1), (0.2, 0.1, 0.16), turn=10)
     visits = SmallVisit([old], around=(230, 250, 270, 290, 310)), SmallVisit([new], around=(50, 70, 90, 110, 130))

@@ -31,7 +31,7 @@ def board(*faces: tuple[np.ndarray, np.ndarray]) -> Shape:
     return Shape.from_views(points, np.full(points.shape, 0.5, np.float32), toward)
 
 
-def test_normals_point_to_where_each_face_was_viewed_sides() -> None:
+def test_normals_point_to_where_each_face_was_seen_from() -> None:
     both = board(face(THICK_M / 2, 1.0), face(-THICK_M / 2, -1.0))
     up = both.points[:, 2] > 0
     assert np.allclose(both.normals[up], [0, 0, 1]) and np.allclose(both.normals[~up], [0, 0, -1])
@@ -41,7 +41,7 @@ def test_normals_point_to_where_each_face_was_viewed_sides() -> None:
 
 
 @pytest.mark.parametrize("faces", [True, False])
-def test_a_board_that_was_viewed_sides_the_other_side_stays_as_thick_as_it_is(faces: bool) -> None:
+def test_a_board_that_was_seen_from_the_other_side_stays_as_thick_as_it_is(faces: bool) -> None:
     before = board(face(THICK_M / 2, 1.0))
     after = board(face(-THICK_M / 2, -1.0), face(THICK_M / 2, 1.0, until=0.05))
     start = np.eye(4)

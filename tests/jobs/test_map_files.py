@@ -168,7 +168,7 @@ def test_what_was_left_out_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixt
     assert "7 of 800 Gaussians left out: opacity is no number" in caplog.text
 
 
-def test_a_map_made_to_be_sent_is_viewed_sides_where_the_run_was(room_run: RunFolder, tmp_path: Path) -> None:
+def test_a_map_made_to_be_sent_is_seen_from_where_the_run_was(room_run: RunFolder, tmp_path: Path) -> None:
     succeed("encode", room_run.path, tmp_path / "map.ggz", "--rate", "r04")
     folder = open_map(tmp_path / "map.ggz")
     assert isinstance(folder, MapFile) and folder.has_poses and folder.has_objects() == room_run.has_objects()

@@ -71,7 +71,7 @@ def test_what_is_behind_the_camera_is_not_drawn() -> None:
     assert (draw_mesh(*across, FRONT, cull=False) == 255).mean() > 0.8
 
 
-def test_surfaces_viewed_sides_the_side_are_darker() -> None:
+def test_surfaces_seen_from_the_side_are_darker() -> None:
     vertices, triangles, normals, colors = square(2.0, 0.4, (200, 200, 200))
     slanted = np.tile([np.sin(1.2), 0, -np.cos(1.2)], (4, 1))
     bright, dark = (draw_mesh(vertices, triangles, n, colors, FRONT)[44, 59, 0] for n in (normals, slanted))

@@ -75,7 +75,7 @@ def test_lines_of_frustums_and_boxes() -> None:
     assert np.allclose(edges.reshape(-1, 3).mean(axis=0), [1, 0, 0])
 
 
-def test_a_camera_is_viewed_sides_behind_and_above() -> None:
+def test_a_camera_is_seen_from_behind_and_above() -> None:
     T = se3_exp(np.array([0.3, -0.2, 1.0, 0.4, 0.1, -0.3]))
     view = view_from_behind(T, 2.0)
     seen = np.linalg.inv(T) @ np.append(view.position, 1)

@@ -68,7 +68,7 @@ def test_torus_has_a_hole() -> None:
     assert euler(mesh) == 0
 
 
-def test_room_is_viewed_sides_inside() -> None:
+def test_room_is_seen_from_inside() -> None:
     mesh = extract_mesh(field_map(box_room((0.4, 0.31, 0.27)), -3, 3, VOXEL))
     check_closed(mesh)
     assert euler(mesh) == 2

@@ -55,7 +55,7 @@ def test_sphere_is_seen_where_it_is(free_blocks: bool) -> None:
     assert not surface.normals[empty].any() and not surface.colors[empty].any()
 
 
-def test_room_is_viewed_sides_inside() -> None:
+def test_room_is_seen_from_inside() -> None:
     half = np.array([0.4, 0.31, 0.27])
     tsdf = field_map(box_room(tuple(half)), -3, 3, VOXEL)
     pose = se3_exp(np.array([0.1, 0.05, -0.1, 0.4, 0.7, -0.3]))
@@ -75,7 +75,7 @@ def test_plane_has_no_bias_at_any_offset() -> None:
         assert np.abs(surface.depth - exact)[seen].max() < 0.01 * VOXEL
 
 
-def test_surfaces_are_not_viewed_sides_behind() -> None:
+def test_surfaces_are_not_seen_from_behind() -> None:
     tsdf = field_map(plane(np.array([0, 0, 1.0]), 0.01), -3, 3, VOXEL)
     assert not render_depth(tsdf, CAMERA, POSE).depth.any()
 
