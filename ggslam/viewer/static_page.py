@@ -27,6 +27,7 @@ MAP_SCRIPTS = (
     "splat_rules.js", "unpack.js", "displacement.js", "seen_shapes.js", "sorter.js", "webgl_programs.js",
     "splat_textures.js", "webgl_renderer.js", "splat_projector.js", "tile_painter.js", "painting_worker.js",
     "painter_pool.js", "processor_renderer.js", "map_lines.js", "picker.js", "resolution.js", "map_view.js",
+    "chunk_levels.js",
 )  # fmt: skip
 """What `MapView` consists of, in the order in which a page needs it."""
 _PARTS = (*MAP_SCRIPTS, "camera.js", "page.js")

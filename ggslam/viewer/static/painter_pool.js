@@ -33,9 +33,10 @@ class PainterPool {
 
   // Paints; onstrip({top, bottom, values}) for each part that is ready. The promise is true when all are, false if a
   // later job came before.
-  paint(shot, { strips = 1, kind = "colors", least = SPLAT_RULES.minTransmittance, onstrip }) {
+  paint(shot, { strips = 1, kind = "colors", onstrip }) {
     for (const job of this.jobs.values()) job.resolve(false);
     this.jobs.clear();
+    const least = shot.sharp ? SPLAT_RULES.minTransmittance : SPLAT_RULES.movingMinTransmittance;
     const serial = ++this.serial, rows = Math.ceil(shot.height / TILE), ends = this.shares.map((share) => Math.round(share * rows));
     return new Promise((resolve) => {
       let left = 0, from = 0;

@@ -23,9 +23,10 @@ class SplatProjector {
     this.sort();
   }
 
-  projectChunk(chunk, states, displacement, moved, { view, focal, near, width, height }, top, bottom, asDepth) {
+  projectChunk(chunk, states, displacement, moved, { view, focal, near, width, height, sharp }, top, bottom, asDepth) {
     const { count, centers, covariances: s, alphas, ids, rgb, marks, radius, shapes } = chunk;
     const middleX = width / 2 - 0.5, middleY = height / 2 - 0.5, lowPass = SPLAT_RULES.lowPass;
+    const faint = sharp ? 0 : Math.log(SPLAT_RULES.movingMinAlpha / SPLAT_RULES.minAlpha);
     const limitX = SPLAT_RULES.slopeMargin * width / focal, limitY = SPLAT_RULES.slopeMargin * height / focal;
     const left = -(width / 2 + 2) / focal, right = -left, above = (top - middleY - 3) / focal, below = (bottom - middleY + 3) / focal;
     const stretchX = Math.sqrt(1 + right * right), stretchY = Math.sqrt(1 + Math.max(above * above, below * below));
@@ -57,7 +58,7 @@ class SplatProjector {
       const e0 = s0 * p0 + s1 * p1 + s2 * p2, e1 = s1 * p0 + s3 * p1 + s4 * p2, e2 = s2 * p0 + s4 * p1 + s5 * p2, square = scale * scale;
       const xx = square * (p0 * e0 + p1 * e1 + p2 * e2) + lowPass, xy = square * (q0 * e0 + q1 * e1 + q2 * e2);
       const yy = square * (q0 * (s0 * q0 + s1 * q1 + s2 * q2) + q1 * (s1 * q0 + s3 * q1 + s4 * q2) + q2 * (s2 * q0 + s4 * q1 + s5 * q2)) + lowPass;
-      const limit = LOGARITHMS[alphas[i]] + (fade < 1 ? Math.log(fade) : 0);
+      const limit = LOGARITHMS[alphas[i]] - faint + (fade < 1 ? Math.log(fade) : 0);
       if (!(limit > 0)) continue;
       const reachY = Math.sqrt(2 * limit * yy), sy = middleY + focal * v;
       if (sy + reachY < top || sy - reachY > bottom - 1) continue;
