@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One HTML file that shows a map without server and network: splats in 19 or 22 bytes each, compressed, with a small
-WebGL program of our own."""
+"""Splats as pages read them: 19 to 26 bytes each, column by column, compressed."""
 
 from __future__ import annotations
 
@@ -15,23 +14,19 @@ from ggslam.viewer.splats import DrawnSplatTuning, opacities_of
 
 STATIC = Path(__file__).with_name("static")
 MAP_SCRIPTS = (
-    "splat_rules.js", "unpack.js", "displacement.js", "sorter.js", "webgl_programs.js", "splat_textures.js",
-    "webgl_renderer.js", "splat_projector.js", "tile_painter.js", "painting_worker.js", "painter_pool.js",
-    "processor_renderer.js", "map_lines.js", "picker.js", "resolution.js", "map_view.js",
+    "splat_rules.js", "unpack.js", "displacement.js", "seen_shapes.js", "sorter.js", "webgl_programs.js",
+    "splat_textures.js", "webgl_renderer.js", "splat_projector.js", "tile_painter.js", "painting_worker.js",
+    "painter_pool.js", "processor_renderer.js", "map_lines.js", "picker.js", "resolution.js", "map_view.js",
+    "chunk_levels.js",
 )  # fmt: skip
 """What `MapView` consists of, in the order in which a page needs it."""
-_PARTS = (*MAP_SCRIPTS, "camera.js", "page.js")
 
 
 class StaticPageTuning(Tuning):
-    """What a page of one file holds."""
+    """How exactly splats are stored."""
 
     min_size_m = 1e-4
     """Smallest standard deviation that is stored, in metres."""
-    pictures = 24
-    """Most frames with pictures."""
-    max_path_points = 2000
-    """Most points of each path."""
 
 
 SCALES = (float(np.log(StaticPageTuning.min_size_m)), float(np.log(DrawnSplatTuning.max_size_m)))
@@ -41,8 +36,8 @@ SCALES = (float(np.log(StaticPageTuning.min_size_m)), float(np.log(DrawnSplatTun
 
 def pack_splats(
     gaussians: Gaussians, rows: np.ndarray, colors: np.ndarray, owners: np.ndarray, identity: np.ndarray | None,
-    level: int = 9,
-) -> tuple[bytes, np.ndarray, np.ndarray]:
+    seen: np.ndarray | None = None, level: int = 9,
+) -> tuple[bytes, np.ndarray, np.ndarray]:  # fmt: skip
     """Splats as compressed bytes, column by column.
 
     Args:
@@ -51,6 +46,7 @@ def pack_splats(
         colors: uint8 [N, 3], theirs.
         owners: object ids uint16 [N], theirs.
         identity: colours of their identity vectors uint8 [N, 3], or None.
+        seen: from where they were seen, uint8 [N, 4] of `viewed_sides`, or None.
         level: effort of compression, 1 to 9.
 
     Returns:
@@ -70,6 +66,7 @@ def pack_splats(
     ]
     columns += [colors.T, np.rint(255 * opacities_of(gaussians)[rows]).astype(np.uint8), _halves(owners)]
     columns += [] if identity is None else [identity.T]
+    columns += [] if seen is None else [seen.T]
     return zlib.compress(b"".join(np.ascontiguousarray(column).tobytes() for column in columns), level), low, high
 
 

@@ -24,6 +24,8 @@ def packed_rows(model: ViewedRun, rows: np.ndarray) -> tuple[dict[str, Any], byt
     owners = g.object_id.numpy()[rows].astype(np.uint16)
     colors = colors_to_uint8(0.5 + SH_C0 * g.sh.numpy()[rows, 0])
     identity = model.identity_colors(rows)
-    packed, low, high = pack_splats(g, rows, colors, owners, identity)
+    seen = model.viewed_sides(rows)
+    packed, low, high = pack_splats(g, rows, colors, owners, identity, seen)
     header = {"count": len(rows), "low": low, "high": high, "scales": SCALES, "identity": identity is not None}
+    header["seen"] = seen is not None
     return header, packed

@@ -42,6 +42,7 @@ from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted
 from ggslam.viewer.model import Box, ListedObject, ShownChange, ShownMover
 from ggslam.viewer.splats import most_visible
+from ggslam.viewer.viewed_sides import viewed_sides
 from ggslam.volumes.map_upright import upright_of
 
 
@@ -193,10 +194,6 @@ class ViewedRun:
         with self._lock:
             return self._gaussians
 
-    def shown_poses(self) -> np.ndarray:
-        """T_world_camera [K, 4, 4] of the views that saw the map: keyframes, or where there are none, frames."""
-        return self.keyframe_poses if len(self.keyframe_poses) else np.stack(list(self.frame_poses.values()))
-
     def objects(self) -> list[ListedObject]:
         """See `ViewedMap`."""
         with self._lock:
@@ -225,6 +222,12 @@ class ViewedRun:
         """See `ViewedMap`."""
         with self._lock:
             return self._pictures.picture(camera, T_world_camera, hidden)
+
+    def viewed_sides(self, rows: np.ndarray) -> np.ndarray | None:
+        """See `viewed_sides`; None where the poses are none of a recording."""
+        if not self.folder.has_poses:
+            return None
+        return viewed_sides(self._gaussians, rows, self.camera, list(self.frame_poses.values()))
 
     def identity_colors(self, rows: np.ndarray) -> np.ndarray | None:
         """Colours uint8 [N, 3] of the identity vectors of some rows; None if they have none."""
