@@ -16,6 +16,7 @@ from ggslam.runs.copied_files import copy_files
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.publishing import publish_run
+from ggslam.runs.records.annotations import AnnotationsRecord, CameraKeysRecord
 from ggslam.runs.records.movers import MOVER_FILES
 from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.saving_parts import save_points
@@ -24,7 +25,7 @@ from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import make_folder
 
-RECORDS = (STEPS_FILE, TRUTH_FILE, *MOVER_FILES)
+RECORDS = (STEPS_FILE, TRUTH_FILE, *MOVER_FILES, AnnotationsRecord.FILE, CameraKeysRecord.FILE)
 """Files that stay true, too, but older runs have none."""
 COPIED = ("trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "loops.json", *RECORDS)
 """Files that stay true of an edited run."""
