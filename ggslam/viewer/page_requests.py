@@ -80,7 +80,8 @@ class PageRequests(BaseHTTPRequestHandler):
         try:
             answer()
         except GgslamError as error:
-            self._send_json({"error": str(error)}, 409)
+            status = 409 if self.command == "GET" else 200  # browsers log other answers as if the page were at fault
+            self._send_json({"error": str(error)}, status)
         except (ConnectionError, TimeoutError):  # the page is gone
             self.close_connection = True
         except Exception:

@@ -83,9 +83,17 @@ class Viewer {
 
   setFrame(k) {
     this.frame = k; const frame = this.scene.frames[k];
-    if (frame?.T) this.map.setLines("now", frustumSegments(frame.T, this.scene.camera, 0.1), [255, 235, 60], 2);
+    this.showNow();
     if (this.coloring === "depth") this.color("depth", false);
     this.drawLines(); this.remember();
+  }
+
+  // The camera of the frame that is looked at, unless the view is from there.
+  showNow() {
+    const T = this.scene.frames[this.frame]?.T;
+    if (!T) return;
+    if (length(minus([T[3], T[7], T[11]], this.camera.position)) < 0.15) this.map.dropLines("now");
+    else this.map.setLines("now", frustumSegments(T, this.scene.camera, 0.1), [255, 235, 60], 2);
   }
 
   colorings() {
@@ -284,7 +292,7 @@ class Viewer {
 
   // --- links, pictures, words
 
-  moved() { this.map?.redraw(); this.redrawOverlay(); this.remember(); }
+  moved() { if (this.map) { this.showNow(); this.map.redraw(); } this.redrawOverlay(); this.remember(); }
 
   remember() {
     if (this.remembering || !this.map) return;

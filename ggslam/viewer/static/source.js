@@ -35,7 +35,10 @@ class ServerSource {
   async post(action, values, method = "POST") {
     const answer = await fetch(action, { method, headers: { "Content-Type": "application/json" }, body: JSON.stringify(values) });
     if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).error || `the program answered ${answer.status}`);
-    return answer.headers.get("Content-Type") === "application/json" ? answer.json() : answer.blob();
+    if (answer.headers.get("Content-Type") !== "application/json") return answer.blob();
+    const values = await answer.json();
+    if (values.error) throw new Error(values.error);
+    return values;
   }
 
   // news: {what: [...], version, text, T_world_camera}; lost(true) while the program is not there.
