@@ -36,9 +36,9 @@ class ServerSource {
     const answer = await fetch(action, { method, headers: { "Content-Type": "application/json" }, body: JSON.stringify(values) });
     if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).error || `the program answered ${answer.status}`);
     if (answer.headers.get("Content-Type") !== "application/json") return answer.blob();
-    const values = await answer.json();
-    if (values.error) throw new Error(values.error);
-    return values;
+    const found = await answer.json();
+    if (found.error) throw new Error(found.error);
+    return found;
   }
 
   // news: {what: [...], version, text, T_world_camera}; lost(true) while the program is not there.
