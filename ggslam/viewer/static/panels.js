@@ -498,7 +498,13 @@ function filmPanel(viewer) {
       ...keys.map((key, k) =>
         make(
           "li",
-          { tabIndex: 0, onclick: () => viewer.film.go(k) },
+          {
+            tabIndex: 0,
+            onclick: () => viewer.film.go(k),
+            onkeydown: (event) => {
+              if (event.key === "Enter" && event.target.tagName === "LI") viewer.film.go(k);
+            },
+          },
           make("input", {
             type: "number",
             step: 0.5,
@@ -510,6 +516,14 @@ function filmPanel(viewer) {
             onchange: (event) => viewer.film.setTime(k, Number(event.target.value)),
           }),
           make("span", { className: "label", textContent: `s · key ${k + 1}` }),
+          button(
+            "↑",
+            (event) => {
+              event.stopPropagation();
+              viewer.film.swap(k, k - 1);
+            },
+            { "aria-label": `Key ${k + 1} earlier`, disabled: k === 0 },
+          ),
           button(
             "×",
             (event) => {
