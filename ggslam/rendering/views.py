@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ def check_kinds(gaussians: object, camera: object) -> None:
     for name in PARAMETERS:
         if not isinstance(getattr(gaussians, name, None), torch.Tensor):
             raise RenderError(
-                f"gaussians: expected a GaussianMap, a GaussianModel or what has their tensors ({', '.join(PARAMETERS)})"
+                f"gaussians: expected a GaussianMap, GaussianModel or what has their tensors {', '.join(PARAMETERS)}"
                 f", found {type(gaussians).__name__} without a tensor {name!r}"
             )
     listed = isinstance(camera, Sequence) and not isinstance(camera, str)
@@ -86,14 +86,25 @@ def pairs(
     sizes = {(one.width, one.height) for one in cameras}
     if len(sizes) > 1:
         raise RenderError(f"render: a batch needs cameras of one size, found {sorted(sizes)}")
-    cameras, matrices = (full if len(full) == count else full * count for full in (cameras, matrices))
+    cameras = cameras if len(cameras) == count else cameras * count
+    matrices = matrices if len(matrices) == count else matrices * count
     return list(zip(cameras, matrices, strict=True))
 
 
 def stacked(views: list[RenderBuffers]) -> RenderBuffers:
     """The views of a batch as one, all images beginning with their number."""
-    columns = {f.name: [getattr(view, f.name) for view in views] for f in fields(RenderBuffers)}
-    return RenderBuffers(**{name: None if c[0] is None else torch.stack(c) for name, c in columns.items()})
+    return RenderBuffers(
+        torch.stack([view.image for view in views]),
+        torch.stack([view.depth for view in views]),
+        torch.stack([view.alpha for view in views]),
+        _stacked_if_all([view.features for view in views]),
+        _stacked_if_all([view.median_depth for view in views]),
+    )
+
+
+def _stacked_if_all(images: list[torch.Tensor | None]) -> torch.Tensor | None:
+    there = [image for image in images if image is not None]
+    return torch.stack(there) if there else None
 
 
 def over(view: RenderBuffers, background: torch.Tensor | np.ndarray | Sequence[float]) -> RenderBuffers:

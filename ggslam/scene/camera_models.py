@@ -67,7 +67,8 @@ class DistortedCamera:
         points = np.asarray(points, np.float64).reshape(-1, 3)
         if not self.fisheye:
             zero = np.zeros(3)
-            return cv2.projectPoints(points[:, None], zero, zero, self.pinhole.matrix(), np.array(self.distortion))[0][:, 0]
+            lens = self.pinhole.matrix(), np.array(self.distortion)
+            return cv2.projectPoints(points[:, None], zero, zero, *lens)[0][:, 0]
         across = np.linalg.norm(points[:, :2], axis=1)
         bent = _bend(np.arctan2(across, points[:, 2]), self.distortion)
         scale = np.divide(bent, across, out=np.zeros_like(across), where=across > 1e-12)

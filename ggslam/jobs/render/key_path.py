@@ -21,6 +21,7 @@ import pydantic
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.render.shots import Shot, Size, film_times, looking_at
+from ggslam.runs.records.record import explain
 from ggslam.scene.camera import Camera
 from ggslam.system.untrusted_files import read_untrusted_text
 
@@ -57,9 +58,7 @@ def read_camera_keys(path: str | Path) -> CameraKeys:
             values = {"keys": values}
         found = CameraKeys.model_validate(values)
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        place = " ".join(str(part) for part in first["loc"])
-        raise ConfigError(f"{path}: no camera keys: {place}: {first['msg']}".replace("::", ":")) from None
+        raise ConfigError(f"{path}: no camera keys: {explain(error).split(': ', 1)[-1]}") from None
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: no camera keys: not JSON: {error}") from None
     times = [key.time for key in found.keys]

@@ -85,18 +85,18 @@ def orbit_shots(
     if folder.has_poses:
         poses = folder.keyframes().poses()
         camera = fill_size(folder.sequence().camera_of(min(poses)), size)
-        swing = find_swing(_sample(folder), np.stack([poses[frame] for frame in sorted(poses)]))
+        swing = find_swing(map_sample(folder), np.stack([poses[frame] for frame in sorted(poses)]))
         seen = [swing.pose(k / count) for k in range(count)]
     else:
-        camera = _plain_camera(size or (1280, 720))
-        seen = list(orbit(_sample(folder).means.numpy(), camera, count))
+        camera = plain_camera(size or (1280, 720))
+        seen = list(orbit(map_sample(folder).means.numpy(), camera, count))
     return [Shot(k / fps, T, camera) for k, T in enumerate(seen)]
 
 
 def find_swing(gaussians: GaussianMap, poses: np.ndarray) -> Swing:
     """The way round a map by the poses [N, 4, 4] of the frames that it was made of, in their order."""
     up = upright_of(gaussians, poses).up
-    axes = _level_axes(up, poses[0, :3, 2])
+    axes = level_axes(up, poses[0, :3, 2])
     positions, forward = poses[:, :3, 3], poses[:, :3, 2]
     focus = _focus(positions, forward)
     level = forward @ axes.T
@@ -133,7 +133,7 @@ def _range_of(azimuths: np.ndarray) -> tuple[float, float]:
     return float(first), float(last)
 
 
-def _level_axes(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
+def level_axes(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """[3, 3], rows: the level direction nearest to `forward`, the one to its left, and `up`."""
     ahead = forward - (forward @ up) * up
     if np.linalg.norm(ahead) < 1e-3:
@@ -142,12 +142,13 @@ def _level_axes(up: np.ndarray, forward: np.ndarray) -> np.ndarray:
     return np.stack([ahead, np.cross(up, ahead), up])
 
 
-def _plain_camera(size: Size) -> Camera:
+def plain_camera(size: Size) -> Camera:
+    """A camera for maps without one, with its axis in the middle of the picture."""
     focal = min(size) / 2 / np.tan(np.radians(OrbitPathTuning.fov_deg) / 2)
     return Camera(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
 
 
-def _sample(folder: RunFolder) -> GaussianMap:
+def map_sample(folder: RunFolder) -> GaussianMap:
     """Some of the Gaussians, of all parts of the map."""
     rows = folder.map_in_parts().rows
     out = GaussianMap(rows.like.sh_degree, rows.like.feature_channels, with_moments=False)

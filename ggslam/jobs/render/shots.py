@@ -49,7 +49,7 @@ def parse_size(text: str) -> Size:
     parts = text.lower().replace("×", "x").split("x")
     if len(parts) == 2 and all(part.strip().isdecimal() for part in parts):
         width, height = int(parts[0]), int(parts[1])
-        if 16 <= min(width, height) and max(width, height) <= ShotTuning.max_side:
+        if min(width, height) >= 16 and max(width, height) <= ShotTuning.max_side:
             return width, height
     raise ConfigError(f"`size`: expected WIDTHxHEIGHT from 16x16 to 8192x8192, like 1280x720, found {text!r}")
 
