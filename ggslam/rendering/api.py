@@ -16,7 +16,7 @@ from ggslam.rendering.cuda.autograd import render_cuda
 from ggslam.rendering.gsplat_backend import render_gsplat
 from ggslam.rendering.reference import render_reference
 from ggslam.rendering.types import LOW_PASS, Gaussians, RenderBuffers, check_pose
-from ggslam.rendering.views import AnyCamera, check_kinds, over, pairs, render_view, stacked
+from ggslam.rendering.views import AnyCamera, check_kinds, over, pairs, render_view, stack_views
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import is_valid_pose
 
@@ -109,7 +109,7 @@ def render(
     draw = _BACKENDS[backend]
     if isinstance(camera, Sequence) or isinstance(poses, list):
         views = [render_view(draw, gaussians, one, T, **options) for one, T in pairs(camera, poses)]
-        view = stacked(views)
+        view = stack_views(views)
     else:
         view = render_view(draw, gaussians, camera, poses, **options)
     return view if background is None else over(view, background)

@@ -72,7 +72,7 @@ def render_distorted(camera: DistortedCamera, render_pinhole: RenderPinhole) -> 
         grid, factors = (torch.as_tensor(a, device=device).to(view.image) for a in (face.grid, face.depth_factors))
         for name, image in _images(view).items():
             nearest = name == "median_depth"
-            found = _looked_up(image, grid, "nearest" if nearest else "bilinear")
+            found = _sample_image(image, grid, "nearest" if nearest else "bilinear")
             found = found * factors if name.endswith("depth") else found
             if name not in out:
                 out[name] = image.new_zeros(len(found), camera.height * camera.width)
@@ -90,7 +90,7 @@ def _images(view: RenderBuffers) -> dict[str, torch.Tensor]:
     return {name: i if i.ndim == 3 else i[None] for name, i in found.items() if i is not None}
 
 
-def _looked_up(image: torch.Tensor, grid: torch.Tensor, mode: str) -> torch.Tensor:
+def _sample_image(image: torch.Tensor, grid: torch.Tensor, mode: str) -> torch.Tensor:
     """Values [C, n] of an image [C, H, W] at places [n, 2]."""
     found = torch.nn.functional.grid_sample(
         image[None], grid[None, None], mode=mode, padding_mode="border", align_corners=True
@@ -105,7 +105,7 @@ def faces_of(camera: DistortedCamera) -> tuple[Face, ...]:
     seen = np.flatnonzero(np.isfinite(rays).all(1))
     if not len(seen):
         raise RenderError(f"no direction falls on a pixel of {camera}")
-    spacing = _spacing(camera)
+    spacing = _pixel_angle(camera)
     if np.degrees(np.arccos(np.clip(rays[seen, 2], -1, 1))).max() <= ONE_PICTURE_DEG:
         return (_face(rays, seen, np.eye(3), spacing),)
     turns = [np.eye(3), *(rotation_about(np.array([0.0, 1.0, 0.0]), d) for d in (90.0, -90.0, 180.0)),
@@ -114,7 +114,7 @@ def faces_of(camera: DistortedCamera) -> tuple[Face, ...]:
     return tuple(_face(rays, seen[nearest == i], turn, spacing) for i, turn in enumerate(turns) if (nearest == i).any())
 
 
-def _spacing(camera: DistortedCamera) -> float:
+def _pixel_angle(camera: DistortedCamera) -> float:
     """Median angle between neighbouring rays in radians."""
     rays = camera.rays()
     steps = [np.linalg.norm(np.diff(rays, axis=axis), axis=-1) for axis in (0, 1) if rays.shape[axis] > 1]

@@ -29,12 +29,12 @@ STRETCH: Final = 1e3
 
 
 def pinhole_like(camera: OrthographicCamera) -> Camera:
-    """The pinhole camera that `narrowed` Gaussians are rendered with, from the world's origin along z."""
+    """The pinhole camera that `narrow_gaussians` Gaussians are rendered with, from the world's origin along z."""
     focal = camera.scale * NARROWING
     return Camera(camera.width, camera.height, focal, focal, camera.cx, camera.cy)
 
 
-def narrowed(gaussians: Gaussians, T_camera_world: np.ndarray, active_sh_degree: int | None) -> GaussianTensors:
+def narrow_gaussians(gaussians: Gaussians, T_camera_world: np.ndarray, active_sh_degree: int | None) -> GaussianTensors:
     """Gaussians whose pinhole picture by `pinhole_like` is the orthographic picture of `gaussians`; depths are
     `STRETCH` times as large.
 
@@ -56,12 +56,12 @@ def narrowed(gaussians: Gaussians, T_camera_world: np.ndarray, active_sh_degree:
         quaternions=gaussians.quaternions @ torch.as_tensor(turn).to(means).T,
         log_scales=gaussians.log_scales + torch.log(widening)[:, None],
         opacity_logits=gaussians.opacity_logits,
-        sh=_seen_along(gaussians, T, active_sh_degree)[:, None],
+        sh=_colors_along(gaussians, T, active_sh_degree)[:, None],
         features=gaussians.features,
     )
 
 
-def _seen_along(gaussians: Gaussians, T: torch.Tensor, active_sh_degree: int | None) -> torch.Tensor:
+def _colors_along(gaussians: Gaussians, T: torch.Tensor, active_sh_degree: int | None) -> torch.Tensor:
     """Coefficients [N, 3] of degree 0 of the colours seen along the camera's axis."""
     sh = gaussians.sh[:, : active_coefficients(gaussians, active_sh_degree)]
     # Directions are those from the camera to the means: at (0, 0, 1) in the camera frame, all are the axis.

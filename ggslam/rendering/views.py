@@ -12,7 +12,7 @@ import torch
 
 from ggslam.errors import RenderError
 from ggslam.rendering.distorted import render_distorted
-from ggslam.rendering.orthographic import STRETCH, narrowed, pinhole_like
+from ggslam.rendering.orthographic import STRETCH, narrow_gaussians, pinhole_like
 from ggslam.rendering.types import PARAMETERS, Gaussians, RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.camera_models import DistortedCamera, OrthographicCamera
@@ -62,7 +62,7 @@ def _render_orthographic(
     if T_world_camera.requires_grad:
         raise RenderError("an orthographic view has no gradient with respect to the pose: detach it")
     T_camera_world = np.linalg.inv(T_world_camera.cpu().double().numpy())
-    moved = narrowed(gaussians, T_camera_world, active_sh_degree)
+    moved = narrow_gaussians(gaussians, T_camera_world, active_sh_degree)
     origin = torch.eye(4, dtype=torch.float64)
     view = draw(moved, pinhole_like(camera), origin.to(gaussians.means.device),
                 near_plane=near_plane * STRETCH, active_sh_degree=None, **options)  # fmt: skip
@@ -91,18 +91,18 @@ def pairs(
     return list(zip(cameras, matrices, strict=True))
 
 
-def stacked(views: list[RenderBuffers]) -> RenderBuffers:
+def stack_views(views: list[RenderBuffers]) -> RenderBuffers:
     """The views of a batch as one, all images beginning with their number."""
     return RenderBuffers(
         torch.stack([view.image for view in views]),
         torch.stack([view.depth for view in views]),
         torch.stack([view.alpha for view in views]),
-        _stacked_if_all([view.features for view in views]),
-        _stacked_if_all([view.median_depth for view in views]),
+        _stack_if_there([view.features for view in views]),
+        _stack_if_there([view.median_depth for view in views]),
     )
 
 
-def _stacked_if_all(images: list[torch.Tensor | None]) -> torch.Tensor | None:
+def _stack_if_there(images: list[torch.Tensor | None]) -> torch.Tensor | None:
     there = [image for image in images if image is not None]
     return torch.stack(there) if there else None
 

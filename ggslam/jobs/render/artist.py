@@ -52,7 +52,7 @@ class Artist:
         self._rasterizer = CpuRasterizer()
         self._painters: dict[str, Painter] = {
             "color": lambda view, _: color_to_uint8(view.image.numpy()),
-            "depth": lambda view, _: self.color_depth(_seen_depth(view)),
+            "depth": lambda view, _: self.color_depth(_surface_depth(view)),
             "alpha": lambda view, _: (255 * np.clip(view.alpha.numpy(), 0, 1) + 0.5).astype(np.uint8),
         }
         if self.objects is not None:
@@ -65,7 +65,7 @@ class Artist:
 
     def depth(self, camera: Camera, T_world_camera: np.ndarray) -> np.ndarray:
         """Depth of the surface, float32 [H, W] in metres, 0 where there is none."""
-        return _seen_depth(self._view(camera, T_world_camera)[0])
+        return _surface_depth(self._view(camera, T_world_camera)[0])
 
     def color_depth(self, depth: np.ndarray) -> np.ndarray:
         """Depth [H, W] in metres as colours, uint8 [H, W, 3]."""
@@ -89,5 +89,5 @@ class Artist:
         return {"ids": ids, "pca": lambda view, _: identity_picture(view, colors)}
 
 
-def _seen_depth(view: RenderBuffers) -> np.ndarray:
+def _surface_depth(view: RenderBuffers) -> np.ndarray:
     return np.where(view.alpha.numpy() > 0.5, view.expected_depth.numpy(), 0)

@@ -67,7 +67,7 @@ def render_film(
         size: (width, height) of each picture; None: as the run saw it, of keys 1280x720.
         what: of color, depth, alpha and, of a run with objects, ids and pca, which are put beside one another. With
             "side-by-side" the recorded picture is left of each, for color and depth along the recorded way.
-        smoothing: of the recorded way, a standard deviation in seconds. "side-by-side" is not smoothed.
+        smoothing: of the recorded way, a standard deviation in seconds. "side-by-side" is not smooth_poses.
         recording: where the recording is now, if it was moved; for "side-by-side".
 
     Returns:
@@ -122,10 +122,10 @@ def _depth_limits(artist: Artist, shots: list[Shot]) -> tuple[float, float]:
 
 def _sheet(pictures: dict[str, np.ndarray]) -> np.ndarray:
     """The pictures of a moment beside one another, uint8 [H, W, 3]."""
-    return side_by_side([_in_color(picture) for picture in pictures.values()], FilmJobTuning.gap)
+    return side_by_side([_as_color(picture) for picture in pictures.values()], FilmJobTuning.gap)
 
 
-def _in_color(picture: np.ndarray) -> np.ndarray:
+def _as_color(picture: np.ndarray) -> np.ndarray:
     return picture if picture.ndim == 3 else np.repeat(picture[..., None], 3, 2)
 
 

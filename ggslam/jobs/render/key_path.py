@@ -11,7 +11,6 @@ circle from key to key, `fov` (radians, along the shorter side as the page draws
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +19,7 @@ import numpy as np
 import pydantic
 
 from ggslam.errors import ConfigError
-from ggslam.jobs.render.shots import Shot, Size, film_times, looking_at
+from ggslam.jobs.render.shots import Shot, Size, film_times, look_at_pose
 from ggslam.runs.records.record import explain
 from ggslam.scene.camera import Camera
 from ggslam.system.untrusted_files import read_untrusted_text
@@ -52,15 +51,13 @@ def read_camera_keys(path: str | Path) -> CameraKeys:
     Raises:
         ConfigError: it cannot be read or is no such file; says which key and what was expected.
     """
+    text = read_untrusted_text(path, ConfigError)
+    if text.lstrip().startswith("["):  # the keys alone, as the page keeps them beside the run
+        text = f'{{"keys": {text}}}'
     try:
-        values = json.loads(read_untrusted_text(path, ConfigError))
-        if isinstance(values, list):  # as the page keeps them beside the run
-            values = {"keys": values}
-        found = CameraKeys.model_validate(values)
+        found = CameraKeys.model_validate_json(text)
     except pydantic.ValidationError as error:
         raise ConfigError(f"{path}: no camera keys: {explain(error).split(': ', 1)[-1]}") from None
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: no camera keys: not JSON: {error}") from None
     times = [key.time for key in found.keys]
     if any(later <= earlier for earlier, later in zip(times, times[1:], strict=False)):
         raise ConfigError(f"{path}: the times of the keys must rise, found {times}")
@@ -100,7 +97,7 @@ def view_at(keys: CameraKeys, time: float, size: Size) -> tuple[np.ndarray, Came
     look_at = _curve(np.array([key.look_at for key in keys.keys]), segment, share)
     before, after = keys.keys[segment], keys.keys[last]
     up = _great_circle(np.array(before.up), np.array(after.up), share)
-    T = looking_at(position, look_at, up)
+    T = look_at_pose(position, look_at, up)
     return T, page_camera(size, before.fov + (after.fov - before.fov) * share)
 
 

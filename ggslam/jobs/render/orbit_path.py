@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ggslam.geometry.orbits import orbit
-from ggslam.jobs.render.shots import Shot, Size, fill_size, looking_at, picture_count
+from ggslam.jobs.render.shots import Shot, Size, fill_size, look_at_pose, picture_count
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -65,7 +65,7 @@ class Swing:
             angle = first + (last - first) * (1 - np.cos(2 * np.pi * phase)) / 2
         along = np.cos(angle) * self.axes[0] + np.sin(angle) * self.axes[1]
         position = self.middle - self.radius * along
-        return looking_at(position, self.target if self.inward else position + along - self.dip * self.axes[2],
+        return look_at_pose(position, self.target if self.inward else position + along - self.dip * self.axes[2],
                           self.axes[2])  # fmt: skip
 
 

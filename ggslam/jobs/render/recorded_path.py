@@ -47,7 +47,7 @@ def recorded_shots(
     shown, taken = film_times(float(times[-1]), fps, seconds)
     last = np.clip(np.searchsorted(times, taken + 1e-6, side="right") - 1, 0, len(frames) - 1)
     camera = fill_size(folder.sequence().camera_of(frames[0]), size)
-    seen = poses[last] if at_frames else smoothed(times, poses, taken, smoothing)
+    seen = poses[last] if at_frames else smooth_poses(times, poses, taken, smoothing)
     return [Shot(float(t), T, camera, frames[i]) for t, T, i in zip(shown, seen, last, strict=True)]
 
 
@@ -67,7 +67,7 @@ def _longest_walk(folder: RunFolder) -> tuple[list[int], np.ndarray, np.ndarray]
     return frames, times - times[0], np.stack([poses[f] for f in frames])
 
 
-def smoothed(times: np.ndarray, poses: np.ndarray, at: np.ndarray, smoothing: float) -> np.ndarray:
+def smooth_poses(times: np.ndarray, poses: np.ndarray, at: np.ndarray, smoothing: float) -> np.ndarray:
     """Poses between poses.
 
     Args:
@@ -84,7 +84,7 @@ def smoothed(times: np.ndarray, poses: np.ndarray, at: np.ndarray, smoothing: fl
     if smoothing > 0:
         step = min(smoothing / 4, max(times[-1], 1e-6))
         grid = np.linspace(0, times[-1], int(np.ceil(times[-1] / step)) + 1)
-        poses, times = _filtered(smoothed(times, poses, grid, 0), smoothing / (grid[1] - grid[0])), grid
+        poses, times = _filter_poses(smooth_poses(times, poses, grid, 0), smoothing / (grid[1] - grid[0])), grid
     out = np.tile(np.eye(4), (len(at), 1, 1))
     at = np.clip(at, times[0], times[-1])
     out[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
@@ -93,7 +93,7 @@ def smoothed(times: np.ndarray, poses: np.ndarray, at: np.ndarray, smoothing: fl
     return out
 
 
-def _filtered(poses: np.ndarray, sigma: float) -> np.ndarray:
+def _filter_poses(poses: np.ndarray, sigma: float) -> np.ndarray:
     """Means of neighbouring poses [n, 4, 4] under a bell curve of `sigma` rows; rotations as means of quaternions."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     turned = np.cumprod(np.where((quaternions[1:] * quaternions[:-1]).sum(1) < 0, -1.0, 1.0))

@@ -70,7 +70,7 @@ def fill_size(camera: Camera, size: Size | None) -> Camera:
     return Camera(width, height, whole.fx, whole.fy, whole.cx - left, whole.cy - top)
 
 
-def looking_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+def look_at_pose(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """T_world_camera [4, 4] of a camera at `position` [3] whose axis meets `target` [3], the image's top to `up` [3].
 
     Raises:

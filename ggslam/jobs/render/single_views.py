@@ -12,7 +12,7 @@ from ggslam.errors import ConfigError
 from ggslam.jobs.render.artist import Artist
 from ggslam.jobs.render.orbit_path import map_sample, plain_camera
 from ggslam.jobs.render.outputs import write_beside
-from ggslam.jobs.render.shots import Size, fill_size, looking_at
+from ggslam.jobs.render.shots import Size, fill_size, look_at_pose
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import change_in_run
@@ -39,7 +39,7 @@ def parse_pose(text: str, up: np.ndarray | None = None) -> np.ndarray:
     if keys[:2] == ["from", "at"] and len(words) in (8, 12) and keys[2:] in ([], ["up"]):
         points = [_numbers(words[i + 1 : i + 4], text) for i in range(0, len(words), 4)]
         above = points[2] if len(points) == 3 else np.array([0.0, -1.0, 0.0]) if up is None else up
-        return looking_at(points[0], points[1], above)
+        return look_at_pose(points[0], points[1], above)
     if len(words) != 7:
         raise ConfigError(f"`pose`: expected {FORMS}, found {text!r}")
     numbers = _numbers(words, text)
