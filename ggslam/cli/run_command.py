@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -333,9 +332,5 @@ def go_on_command(run: Path) -> list[str]:
 
 def next_commands(run: Path) -> list[str]:
     """What to try next, in words that can be copied; only what works with the packages that are installed."""
-    path, page = shlex.quote(str(run)), shlex.quote(str(run / "map.html"))
-    if find_spec("viser") is not None:
-        view = f"next: ggslam view {path}"
-    else:
-        view = f"next: ggslam view {path} --html {page}     # one page; to browse live: pip install 'ggslam[viewer]'"
-    return [view, f"      ggslam export {path} --format mesh --out mesh.ply"]
+    path = shlex.quote(str(run))
+    return [f"next: ggslam view {path}", f"      ggslam export {path} --format mesh --out mesh.ply"]

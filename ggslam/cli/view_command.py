@@ -10,7 +10,6 @@ import typer
 
 from ggslam.cli import options
 from ggslam.cli.console import console
-from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.jobs.view.viewed_run import ViewedRun
@@ -22,7 +21,7 @@ EPILOG = """
 
   ggslam view runs/kitchen --port 9000
 
-  ggslam view runs/kitchen --html kitchen.html
+  ggslam view runs/kitchen --html kitchen.html --caption "The kitchen in May"
 
   ggslam view runs/monday --changes changes
 
@@ -44,28 +43,26 @@ def view(
         int, typer.Option(help="Most Gaussians to show; the most visible ones are chosen.", min=1000)
     ] = 400_000,
     sequence: options.MovedSequence = None,
+    caption: Annotated[str, typer.Option(help="A line that is shown below the map.")] = "",
     changes: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="What `ggslam changes RUN NEWER --out FOLDER` wrote, to step through."),
     ] = None,
 ) -> None:
-    """Look at a run in the browser: map, camera, frames; select, name, move, delete and export objects."""
+    """Look at a run in the browser: map, camera, frames; select, measure, edit, note, search, save what was edited."""
     from ggslam.jobs.view.serve import serve_run, wait_for_interrupt, write_page
     from ggslam.runs.map_file import open_map
-    from ggslam.viewer.server import address, close_server
 
     folder = open_map(run)
     if page is not None:
-        if changes is not None:
-            raise ConfigError("--changes: the page of --html does not show changes; ggslam report does")
-        model, size = write_page(folder, page, max_splats, sequence)
+        model, size = write_page(folder, page, max_splats, sequence, caption, changes)
         _say(model, f"wrote {page}: {size / 1e6:.1f} MB")
         return
-    server, model = serve_run(folder, host, port, max_splats, sequence, changes)
+    server, model = serve_run(folder, host, port, max_splats, sequence, changes, caption)
     try:
-        wait_for_interrupt(lambda: _say(model, f"{address(server)} (Ctrl-C ends)"))
+        wait_for_interrupt(lambda: _say(model, f"{server.address} (Ctrl-C ends)"))
     finally:
-        close_server(server)
+        server.close()
 
 
 def _say(model: ViewedRun, text: str) -> None:

@@ -7,7 +7,7 @@ those of names. An unknown id raises ConfigError before anything is changed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -76,9 +76,9 @@ def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     gone = members(scene.gaussians, scene.classifier, list(ids))
     before, left = copies_of(scene.gaussians, gone), _by_object(scene, gone, ids)
     keep_rows(scene, ~gone)
-    _forget(scene, ids)
+    forget(scene, ids)
     rebuild_table(scene)
-    return Change(f"removed {what}: {quantity(int(gone.sum()), 'Gaussian')}", before, _no_gaussians(scene), left)
+    return Change(f"removed {what}: {quantity(int(gone.sum()), 'Gaussian')}", before, no_gaussians(scene), left)
 
 
 def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
@@ -89,10 +89,10 @@ def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     before = copies_of(scene.gaussians, ~kept)
     _claim(scene, own)
     keep_rows(scene, kept)
-    _forget(scene, [i for i in scene.table.ids() if i not in ids])
+    forget(scene, [i for i in scene.table.ids() if i not in ids])
     rebuild_table(scene)
     text = f"kept {what}: {quantity(int(kept.sum()), 'Gaussian')}, {len(before.means)} removed"
-    return Change(text, before, _no_gaussians(scene))
+    return Change(text, before, no_gaussians(scene))
 
 
 def move_objects(
@@ -114,13 +114,13 @@ def move_objects(
     _check_near(scene, "move", ids, shift)
     rows, stray = _claimed_rows(scene, ids)
     before, left = copies_of(scene.gaussians, rows), _by_object(scene, rows, ids)
-    T = rigid_motion(_centroid(before), shift, rotate_degrees)
+    T = rigid_motion(opacity_centroid(before), shift, rotate_degrees)
     scene.gaussians.object_id[torch.from_numpy(stray)] = 0
     scene.gaussians.move(torch.from_numpy(rows), torch.from_numpy(T))
     rebuild_table(scene)
     rest = f", {int(stray.sum())} floaters stay unlabelled" if stray.any() else ""
-    text = f"moved {what} by {_numbers(shift)} m"
-    text += f", turned by {_numbers(rotate_degrees)} degrees" if any(rotate_degrees) else ""
+    text = f"moved {what} by {number_text(shift)} m"
+    text += f", turned by {number_text(rotate_degrees)} degrees" if any(rotate_degrees) else ""
     text += f": {quantity(int(rows.sum()), 'Gaussian')}{rest}"
     return Change(text, before, copies_of(scene.gaussians, rows), left, motion=T)
 
@@ -141,26 +141,24 @@ def duplicate_objects(scene: SegmentedMap, ids: Sequence[int], shift: Vector | N
         boxes = [scene.table.record(i).box for i in ids]
         shift = (round(1.2 * max(float(np.abs(np.array(b.axes)[:, 0]) @ b.size) for b in boxes), 3), 0.0, 0.0)
     _check_near(scene, "duplicate", ids, shift)
-    names, T, first = _names(scene.table), rigid_motion(np.zeros(3), shift), len(scene.gaussians)
+    names, T, first = names_of(scene.table), rigid_motion(np.zeros(3), shift), len(scene.gaussians)
     made: list[int] = []
     before: list[GaussianTensors] = []
     for object_id in ids:
         rows, _ = _claimed_rows(scene, [object_id])
         taken = {*scene.table.ids(), *scene.classifier.class_ids.tolist(), *made}
-        new_id = max(taken) + 1 if max(taken) < 65535 else next((i for i in range(1, 65536) if i not in taken), 0)
-        if not new_id:
-            raise ConfigError("no object id is left for a duplicate: ids end at 65535")
+        new_id = free_id(taken)
         before.append(copies_of(scene.gaussians, rows))
         copies = append_copies(scene, rows)
         scene.gaussians.move(torch.from_numpy(copies), torch.from_numpy(T))
-        _enrol(scene, copies, new_id)
+        enrol(scene, copies, new_id)
         if object_id in names:
             names[new_id] = f"{names[object_id]} copy"
         made.append(new_id)
     rebuild_table(scene, names)
     after = copies_of(scene.gaussians, np.arange(len(scene.gaussians)) >= first)
     copies_are = ", ".join(scene.table.record(i).label() for i in made)
-    text = f"duplicated {what} by {_numbers(shift)} m: {copies_are}"
+    text = f"duplicated {what} by {number_text(shift)} m: {copies_are}"
     return Change(text, join_gaussians(before), after, made=tuple(made))
 
 
@@ -187,7 +185,7 @@ def merge_objects(scene: SegmentedMap, kept: int, merged: int) -> Change:
     if kept == merged:
         raise ConfigError(f"object {kept} cannot be merged with itself")
     rows = scene.gaussians.object_id.numpy() == merged
-    names, seen = _names(scene.table), _observations(scene.table)
+    names, seen = names_of(scene.table), _observations(scene.table)
     both = [seen[i] for i in (kept, merged) if i in seen]
     if both:
         # Views in which both were seen cannot be told from the table: the larger number is a lower bound.
@@ -199,7 +197,7 @@ def merge_objects(scene: SegmentedMap, kept: int, merged: int) -> Change:
     if scene.votes is not None:
         scene.votes = merged_votes(scene.votes, merged, kept)
     rebuild_table(scene, names, seen)
-    nothing = _no_gaussians(scene)
+    nothing = no_gaussians(scene)
     return Change(f"merged {what}: {quantity(int(rows.sum()), 'Gaussian')}", nothing, nothing, merged=(kept, merged))
 
 
@@ -214,12 +212,12 @@ def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:
         raise ConfigError(f"name {name[:20]!r}...: {len(name)} characters, at most {EditingTuning.max_name_length}")
     if not name or name.isdecimal() or "," in name or name.casefold() == "all" or not name.isprintable():
         raise ConfigError(f"name {name!r}: expected a printable word that is no number, without commas, and not 'all'")
-    taken = [i for i, other in _names(scene.table).items() if other.casefold() == name.casefold() and i != object_id]
+    taken = [i for i, other in names_of(scene.table).items() if other.casefold() == name.casefold() and i != object_id]
     if taken:
         raise ConfigError(f"name {name!r}: object {taken[0]} has it already")
     records = [replace(r, name=name) if r.id == object_id else r for r in scene.table.objects]
     scene.table = replace(scene.table, objects=records)
-    return Change(f"renamed {what} to {name}", _no_gaussians(scene), _no_gaussians(scene))
+    return Change(f"renamed {what} to {name}", no_gaussians(scene), no_gaussians(scene))
 
 
 def rigid_motion(centre: np.ndarray, shift: Vector, rotate_degrees: Vector = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -246,7 +244,7 @@ def _check_near(scene: SegmentedMap, kind: str, ids: Sequence[int], shift: Vecto
         place = np.add(record.centroid, shift)
         if not np.abs(place).max() <= EditingTuning.max_distance_m:
             raise ConfigError(
-                f"--{kind} {record.label()} by {_numbers(shift)} m: it would be farther than "
+                f"--{kind} {record.label()} by {number_text(shift)} m: it would be farther than "
                 f"{EditingTuning.max_distance_m:g} m away, "
                 "and Gaussians are in single precision; large offsets belong to the program that shows the map"
             )
@@ -282,7 +280,16 @@ def _claim(scene: SegmentedMap, own: Mapping[int, np.ndarray]) -> None:
         assign(scene.gaussians, scene.classifier, rows & (scene.gaussians.object_id.numpy() != object_id), object_id)
 
 
-def _forget(scene: SegmentedMap, ids: Sequence[int]) -> None:
+def free_id(taken: Set[int]) -> int:
+    """The next id that no object has; raises ConfigError if there is none."""
+    highest = max(taken, default=0)
+    found = highest + 1 if highest < 65535 else next((i for i in range(1, 65536) if i not in taken), 0)
+    if not found:
+        raise ConfigError("no object id is left: ids end at 65535")
+    return found
+
+
+def forget(scene: SegmentedMap, ids: Sequence[int]) -> None:
     """Takes objects that are gone from the classifier, the votes and the labels."""
     scene.classifier = scene.classifier.without(list(ids))
     if scene.votes is not None:
@@ -297,7 +304,7 @@ def _forget(scene: SegmentedMap, ids: Sequence[int]) -> None:
         g.object_id[torch.from_numpy(stray)] = 0
 
 
-def _enrol(scene: SegmentedMap, rows: np.ndarray, object_id: int) -> None:
+def enrol(scene: SegmentedMap, rows: np.ndarray, object_id: int) -> None:
     """Gives Gaussians (bool [N]) a new object id, a class of it, and identity vectors of that class."""
     g = scene.gaussians
     g.object_id[torch.from_numpy(rows)] = object_id
@@ -312,11 +319,13 @@ def _enrol(scene: SegmentedMap, rows: np.ndarray, object_id: int) -> None:
 # --- small things ---------------------------------------------------------------------------------------------------
 
 
-def _no_gaussians(scene: SegmentedMap) -> GaussianTensors:
+def no_gaussians(scene: SegmentedMap) -> GaussianTensors:
+    """None of them."""
     return copies_of(scene.gaussians, np.zeros(len(scene.gaussians), bool))
 
 
-def _names(table: ObjectTable) -> dict[int, str]:
+def names_of(table: ObjectTable) -> dict[int, str]:
+    """By id, of those that have one."""
     return {record.id: record.name for record in table.objects if record.name}
 
 
@@ -334,15 +343,17 @@ def rebuild_table(
     """Lists the objects anew, with the names and observations of the former table unless others are given."""
     table = ObjectTable.build(
         scene.gaussians, scene.classifier, scene.table.supervision,
-        _names(scene.table) if names is None else names, _observations(scene.table) if seen is None else seen,
+        names_of(scene.table) if names is None else names, _observations(scene.table) if seen is None else seen,
     )  # fmt: skip
     scene.table = replace(table, history=scene.table.history)
 
 
-def _centroid(gaussians: GaussianTensors) -> np.ndarray:
+def opacity_centroid(gaussians: GaussianTensors) -> np.ndarray:
+    """The mean of the centres, weighted by opacity, float64 [3]."""
     weights = torch.sigmoid(gaussians.opacity_logits).double()
     return (weights @ gaussians.means.double() / weights.sum()).numpy()
 
 
-def _numbers(values: Vector) -> str:
+def number_text(values: Vector) -> str:
+    """Numbers for people."""
     return " ".join(f"{value:g}" for value in values)

@@ -23,7 +23,10 @@ NEEDED = (
 """Files that belong together: a run with one of them from elsewhere is not one run."""
 REPLACEABLE = ("places.npz", "points.ply", "points_grid.ply")
 """Those of them that a run may do without."""
-MADE_LATER = ("metrics.json", "frames.csv", "verdict.json", "report.html", "ground_truth.txt")
+MADE_LATER = (
+    "metrics.json", "frames.csv", "verdict.json", "report.html", "ground_truth.txt", "annotations.json",
+    "camera_keys.json",
+)  # fmt: skip
 """Files that are written into a finished run."""
 
 

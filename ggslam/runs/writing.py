@@ -18,6 +18,7 @@ from ggslam.objects.segmented_map import ObjectVotes, SegmentedMap
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.environment import environment
 from ggslam.runs.map_index import MAP_INDEX
+from ggslam.runs.records.annotations import AnnotationsRecord, CameraKeysRecord
 from ggslam.runs.records.keyframes import KeyframesRecord
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.movers import MOVER_FILES, MoversRecord
@@ -49,6 +50,7 @@ RUN_FILES = (
     *OBJECT_FILES, "map.ply", MAP_INDEX, "trajectory.txt", KeyframesRecord.FILE, LoopsRecord.FILE, SequenceRecord.FILE,
     TimingRecord.FILE, "config.yaml", "metrics.json", "frames.csv", RunVerdict.FILE, *POINTS, PLACES_FILE, STEPS_FILE,
     TRUTH_FILE, *MOVER_FILES, REPORT_FILE, "renders", "volumes", "plots", TRAJECTORIES, CHANGES_FOLDER,
+    AnnotationsRecord.FILE, CameraKeysRecord.FILE,
 )  # fmt: skip
 """Files and folders that a run may have besides run.json."""
 

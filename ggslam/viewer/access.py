@@ -8,14 +8,11 @@ address or the cookie that it was exchanged for.
 
 from __future__ import annotations
 
-import contextlib
 import hmac
 import ipaddress
-import logging
 import re
 import secrets
 import socket
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
@@ -27,15 +24,11 @@ from ggslam.system.tuning import Tuning
 class AccessTuning(Tuning):
     """Limits of what a page sends."""
 
-    max_message_bytes = 256 << 10
-    """Largest message, in bytes; clicks, poses and names take a few hundred."""
+    max_message_bytes = 1 << 20
+    """Largest message, in bytes; what is drawn on a screen takes the most."""
 
 
-_unheard = logging.getLogger(f"{__name__}.connections")
-_unheard.setLevel(logging.CRITICAL + 1)
 _ANYWHERE = ("0.0.0.0", "::", "")
-_REFUSAL = "403: open the address that ggslam printed; it ends with ?token=...\n"
-_MALFORMED = "400: the request cannot be read\n"
 _HOST = re.compile(r"(?:\[(?P<six>[0-9A-Fa-f:.]{2,45})\]|(?P<name>[A-Za-z0-9._-]{1,253}))(?::(?P<port>[0-9]{1,5}))?")
 _SCHEME = "http"
 """Of all our pages. One that a proxy serves under another name or scheme is not ours."""
@@ -143,40 +136,3 @@ def _name_and_port(host: str) -> tuple[str, int]:
 def _cookie_name(host: str) -> str:
     """Cookies do not tell ports apart; two viewers on one machine must not share one."""
     return f"ggslam-{_name_and_port(host)[1]}"
-
-
-@contextlib.contextmanager
-def guard(gate: Gate) -> Iterator[None]:
-    """Servers that are started in the block judge every request by `gate`; viser has no way to be told so."""
-    from websockets.asyncio import server as library
-
-    serve = library.serve
-
-    def guarded_serve(handler: Any, host: str, port: int, **options: Any) -> Any:
-        options["process_request"] = _process(gate, options.get("process_request"))
-        options["max_size"] = AccessTuning.max_message_bytes
-        options["logger"] = _unheard  # who sends what is no HTTP, as scanners of ports do, gets no traceback printed
-        return serve(handler, host, port, **options)
-
-    library.serve = guarded_serve  # type: ignore[assignment,misc]
-    try:
-        yield
-    finally:
-        library.serve = serve  # type: ignore[misc]
-
-
-def _process(gate: Gate, inner: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
-    def process(connection: Any, request: Any) -> Any:
-        try:
-            reason = gate.reason_to_refuse(request.path, request.headers)
-        except MalformedRequest:
-            return connection.respond(400, _MALFORMED)
-        if reason is not None:
-            return connection.respond(403, _REFUSAL)
-        answer = None if inner is None else inner(connection, request)
-        if answer is not None and gate.wants_cookie(request.path):
-            answer.headers["Set-Cookie"] = gate.cookie(request.headers["Host"])
-            answer.headers["Referrer-Policy"] = "no-referrer"
-        return answer
-
-    return process

@@ -4,21 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from ggslam.scene.camera import Camera
-from ggslam.viewer.splats import Splats
-
-Coloring = Literal["colour", "objects", "identity", "depth"]
-"""What splats are coloured by: as trained; by object; by the first three principal components of their identity
-vectors; by distance from the camera of the frame that is looked at."""
-COLORINGS: dict[Coloring, str] = {
-    "colour": "colour", "objects": "objects", "identity": "identity (PCA)", "depth": "depth from the frame",
-}  # fmt: skip
-
 
 Box = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Center [3], axes (rows of [3, 3]) and size [3], metres, world frame."""
@@ -111,14 +101,14 @@ class ViewedMap(Protocol):
         """Unit vector [3]."""
 
     @property
-    def colorings(self) -> tuple[Coloring, ...]:
-        """Those there are."""
+    def floor(self) -> float | None:
+        """Its height along `up`, metres from the world's origin; None: none was found."""
+
+    def centers(self) -> np.ndarray:
+        """Of the Gaussians that are shown, float32 [N, 3]."""
 
     def describe(self) -> str:
         """A line about the map."""
-
-    def splats(self, coloring: Coloring, frame: int) -> dict[int, Splats]:
-        """By object id; 0 holds those of no object. `frame` is the one that is looked at."""
 
     def objects(self) -> list[ListedObject]:
         """By rising id."""
@@ -133,42 +123,5 @@ class ViewedMap(Protocol):
         """Recorded and rendered images of a frame side by side, and what the frame's camera recorded (or, without
         the recording, renders), uint8 [H, W, 3] both."""
 
-    def object_at(self, origin: np.ndarray, direction: np.ndarray, focal: float, hidden: set[int]) -> int:
-        """The object seen along a ray from `origin` [3] by a camera of `focal` pixels when some are hidden; 0: none."""
-
     def picture(self, camera: Camera, T_world_camera: np.ndarray, hidden: set[int]) -> np.ndarray:
         """The map from there, as well as can be rendered, uint8 [H, W, 3]."""
-
-
-class EditableMap(ViewedMap, Protocol):
-    """A map whose objects can be edited. What is edited is a copy until it is saved.
-
-    Editing methods return a sentence about what was done and raise ConfigError if it cannot be done.
-    """
-
-    def rename(self, object_id: int, name: str) -> str:
-        """Names an object."""
-
-    def remove(self, object_id: int) -> str:
-        """Takes an object out."""
-
-    def move(self, object_id: int, T: np.ndarray) -> str:
-        """Moves an object by the rigid transform T [4, 4] of the world frame."""
-
-    def undo(self) -> str:
-        """Takes the last edit back."""
-
-    def edits(self) -> list[str]:
-        """What was done so far."""
-
-    def export(self, object_id: int) -> tuple[str, bytes]:
-        """Name and content of a PLY file of an object."""
-
-    def default_target(self) -> str:
-        """Name to save as, if nobody gives another."""
-
-    def save_folder(self) -> Path:
-        """Folder that edited maps are saved in."""
-
-    def save(self, target: str, inpaint: bool) -> str:
-        """Writes the edited map with all that belongs to it, as a folder of this name in `save_folder`."""

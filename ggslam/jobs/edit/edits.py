@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.edit.edit import KINDS, Edit
 from ggslam.jobs.edit.edited_file import edit_file
 from ggslam.jobs.edit.edited_run import save_edited
 from ggslam.jobs.edit.pictures import before_and_after
+from ggslam.jobs.edit.selected import apply_to_selection
+from ggslam.jobs.edit.vectors import read_vector
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.objects.displacement import Displacement
 from ggslam.objects.editing import (
@@ -35,6 +35,7 @@ from ggslam.objects.recoloring import parse_color
 from ggslam.objects.removal_artifacts import drop_artifacts, places
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import join_gaussians
+from ggslam.objects.splat_editing import scene_without_objects
 from ggslam.objects.table import ObjectTable
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import MapFile, open_map
@@ -127,7 +128,7 @@ def edit_run(
     source = _Source.of(folder)
     notes: list[str] = []
     recording = _open_recording(folder, sequence, notes) if inpainting else None
-    scene, original = folder.segmented_map(), folder.gaussians()
+    scene, original = scene_of(folder, edits), folder.gaussians()
     changes = _apply_all(scene, edits, source.displacement, apply)
     if in_place:
         target.check_writable()
@@ -145,6 +146,17 @@ def edit_run(
         written.discard()
         raise
     return outcome
+
+
+def scene_of(folder: RunFolder, edits: Sequence[Edit] = ()) -> SegmentedMap:
+    """A run's map with its objects; a map without any, too, if all edits are of selections.
+
+    Raises:
+        RunFolderError: there are no objects to edit, or the run is damaged.
+    """
+    if not folder.has_objects() and all(edit.selection for edit in edits):
+        return scene_without_objects(folder.gaussians())
+    return folder.segmented_map()
 
 
 def _target(folder: RunFolder, out: Path | None, in_place: bool) -> RunFolder:
@@ -216,6 +228,8 @@ def _apply_all(
 
 def _ids_of(table: ObjectTable, edit: Edit) -> list[int]:
     """Ids of an edit's objects by a table; none if it knows them not."""
+    if edit.selection:
+        return []
     try:
         return table.select(edit.objects)
     except ConfigError:
@@ -226,7 +240,7 @@ def _with_consent(confirm: Callable[[str], bool] | None) -> Apply:
     """`apply_edit` that asks before it removes most of the map: on flat ground one object may hold nearly all of it."""
 
     def apply(scene: SegmentedMap, edit: Edit) -> Change:
-        names, before = edit.objects, len(scene.gaussians)
+        names, before = edit.objects or "the selection", len(scene.gaussians)
         change = apply_edit(scene, edit)
         removed = len(change.before.means)
         if confirm is None or edit.kind != "remove" or removed <= EditTuning.confirmed_share * before:
@@ -248,6 +262,10 @@ def apply_edit(scene: SegmentedMap, edit: Edit) -> Change:
     """
     if edit.kind not in KINDS:
         raise ConfigError(f"edit {edit.kind!r}: expected one of {', '.join(KINDS)}")
+    if edit.selection:
+        return apply_to_selection(scene, edit)
+    if edit.kind == "assign":
+        raise ConfigError("`assign`: a selection is needed")
     ids = scene.table.select(edit.objects)
     if edit.kind == "remove":
         return remove_objects(scene, ids)
@@ -271,17 +289,6 @@ def _single(table: ObjectTable, argument: str, text: str) -> int:
     if len(ids) != 1:
         raise ConfigError(f"`{argument}`: expected one object, but {text!r} are {len(ids)}: {', '.join(map(str, ids))}")
     return ids[0]
-
-
-def read_vector(argument: str, text: str) -> tuple[float, float, float]:
-    """Three finite numbers of a text like "0.1 0 -0.2"; raises ConfigError, which names the argument, for others."""
-    try:
-        x, y, z = (float(part) for part in text.replace(",", " ").split())
-    except ValueError:
-        raise ConfigError(f'`{argument}`: expected three numbers like "0.1 0 -0.2", found {text!r}') from None
-    if not np.isfinite([x, y, z]).all():
-        raise ConfigError(f"`{argument}`: expected finite numbers, found {text!r}")
-    return x, y, z
 
 
 # --- the places that objects left -------------------------------------------------------------------------------------

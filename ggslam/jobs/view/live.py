@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
+from ggslam.errors import ConfigError
 from ggslam.jobs.view.pictures import FramePictureTuning, table_of
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
@@ -17,19 +18,18 @@ from ggslam.rendering.types import GaussianTensors
 from ggslam.reporting.pictures import color_of_depth, color_to_uint8, depth_range
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.scene.gaussian_map import SH_C0
 from ggslam.scene.poses import inverse
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
 from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
-from ggslam.viewer.cameras import vertical_fov, view_from_behind
-from ggslam.viewer.safe_text import plain
-from ggslam.viewer.scene_nodes import SceneNodes
-from ggslam.viewer.server import keep_fitting
-from ggslam.viewer.splats import most_visible, splats_of
-
-if TYPE_CHECKING:
-    import viser
+from ggslam.viewer.cameras import CameraTuning, top_view, vertical_fov, view_from_behind
+from ggslam.viewer.page_server import PageServer
+from ggslam.viewer.page_source import Download
+from ggslam.viewer.scene_values import jpeg, packed_chunk
+from ggslam.viewer.splats import colors_to_uint8, most_visible
+from ggslam.viewer.static_page import SCALES, pack_splats
 
 
 class LiveViewTuning(Tuning):
@@ -43,10 +43,10 @@ class LiveViewTuning(Tuning):
     """Most Gaussians that are shown: the most visible ones."""
     max_path_points = 2000
     """Most points of the camera's path."""
-    sending_factor = 2.0
+    sending_factor = 1.2
     """Processor time of a picture with sending it, over the time without."""
-    keyframe_size_m = 0.05
-    """Size of a keyframe's mark, in metres."""
+    compression = 1
+    """Effort of compression, 1 to 9: a picture of a growing map is read once, by a page nearby."""
 
 
 @dataclass
@@ -62,23 +62,19 @@ class _Snapshot:
 
 
 class LiveView:
-    """Follows a run (its `follow` is a `Follower` of `ggslam.jobs.run.pipeline.execute`).
+    """Follows a run (its `follow` is a `Follower` of `ggslam.jobs.run.pipeline.execute`); a `PageSource`.
 
-    Nothing is copied while no browser is connected. Otherwise the thread of the run copies the map now and then;
-    another thread makes pictures of the copy, and rests until it has used no more than
-    `LiveViewTuning.processor_share` of a processor.
+    Nothing is copied while no page is open. Otherwise the thread of the run copies the map now and then; another thread
+    packs the copy, and rests until it has used no more than `LiveViewTuning.processor_share` of a processor.
 
     Args:
-        server: with an empty page.
-        title: above the controls.
+        server: of the page.
+        title: of the page.
         max_splats: show no more.
     """
 
-    def __init__(self, server: viser.ViserServer, title: str, max_splats: int = LiveViewTuning.max_splats) -> None:
+    def __init__(self, server: PageServer, title: str, max_splats: int = LiveViewTuning.max_splats) -> None:
         self._server, self._title, self._max_splats = server, title, max_splats
-        self._nodes = SceneNodes(server)
-        self._text = server.gui.add_markdown(f"**{plain(title)}**  \nwaiting for the first frame")
-        self._image = server.gui.add_image(np.full((8, 16, 3), 36, np.uint8), format="jpeg", jpeg_quality=80)
         self._rasterizer: CpuRasterizer | None = None
         self._camera: Camera | None = None
         self._ready = threading.Event()
@@ -86,17 +82,20 @@ class LiveView:
         self._given = threading.Condition()
         self._snapshot: _Snapshot | None = None
         self._ended = False
+        self._scene: dict[str, Any] = {"title": title, "about": "waiting for the first frame", "waiting": True}
+        self._packed, self._picture = b"", b""
         self.updates = 0
-        """How many times the map was sent."""
+        """How many times the map was shown."""
+        server.show(self)
         self._thread = threading.Thread(target=self._work, name="viewer-live", daemon=True)
         self._thread.start()
 
     def follow(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         """After a frame, in the thread that tracks."""
-        if not self._ready.is_set() or not self._server.get_clients() or not slam.mapper.keyframes:
+        if not self._ready.is_set() or not self._server.watchers or not slam.mapper.keyframes:
             return
         self._ready.clear()
-        snapshot = _snapshot(slam, frame, report, self._title)
+        snapshot = _snapshot(slam, frame, report)
         with self._given:
             self._camera, self._snapshot = slam.camera, snapshot
             self._given.notify()
@@ -108,7 +107,29 @@ class LiveView:
             self._given.notify()
         self._thread.join(timeout=10.0)
 
-    # --- the viewer's own thread ------------------------------------------------------------------------------------
+    # --- as the page asks ---------------------------------------------------------------------------------------------
+
+    def scene(self) -> dict[str, Any]:
+        """See `PageSource`."""
+        return {**self._scene, "served": True, "live": True, "editable": False}
+
+    def splats(self, chunk: str, level: int) -> bytes:
+        """See `PageSource`."""
+        if not self._packed:
+            raise ConfigError("there is no map yet")
+        return self._packed
+
+    def frame_picture(self, frame: int) -> bytes:
+        """See `PageSource`; the newest frame, whichever is asked for."""
+        if not self._picture:
+            raise ConfigError("there is no frame yet")
+        return self._picture
+
+    def answer(self, action: str, values: Any) -> dict[str, Any] | Download:
+        """See `PageSource`."""
+        raise ConfigError("the map still grows; it can be edited when the run is done")
+
+    # --- the viewer's own thread --------------------------------------------------------------------------------------
 
     def _work(self) -> None:
         while True:
@@ -130,26 +151,21 @@ class LiveView:
     def _show(self, snapshot: _Snapshot) -> None:
         camera = self._camera
         assert camera is not None
-        if not self.updates:
-            start = view_from_behind(snapshot.poses[0], 2.0)
-            self._server.scene.set_up_direction("-y")
-            for client in self._server.get_clients().values():
-                client.camera.position, client.camera.look_at = start.position, start.look_at
-            first = self._server.initial_camera
-            first.position, first.look_at, first.fov = start.position, start.look_at, vertical_fov(camera)
-            keep_fitting(self._server, camera)
         rows = most_visible(snapshot.gaussians, self._max_splats)
-        picture = self._compare(snapshot, camera)
-        with self._server.atomic():
-            self._nodes.set_splats({0: splats_of(snapshot.gaussians, rows)})
-            self._nodes.set_path([snapshot.poses[:, :3, 3]])
-            self._nodes.set_keyframes(snapshot.keyframes, camera, LiveViewTuning.keyframe_size_m)
-            if snapshot.T_world_camera is not None:
-                self._nodes.set_frame(
-                    snapshot.T_world_camera, camera, 2 * LiveViewTuning.keyframe_size_m, snapshot.frame.color
-                )
-            self._text.content, self._image.image = snapshot.text, picture
+        g, owners = snapshot.gaussians, np.zeros(len(rows), np.uint16)
+        colors = colors_to_uint8(0.5 + SH_C0 * g.sh.numpy()[rows, 0])
+        packed, low, high = pack_splats(g, rows, colors, owners, None, level=LiveViewTuning.compression)
+        header = {"count": len(rows), "low": low, "high": high, "scales": SCALES, "identity": False}
+        scene = _scene_of(snapshot, camera, self._title, g.means.numpy()[rows])
+        scene["chunks"] = [{"id": "map", "count": len(rows), "levels": 1, "low": low, "high": high}]
+        picture = jpeg(self._compare(snapshot, camera))
+        first = not self.updates
         self.updates += 1
+        self._packed = packed_chunk({**header, "version": self.updates}, packed)
+        self._scene, self._picture = scene, picture
+        T = None if snapshot.T_world_camera is None else snapshot.T_world_camera.ravel().tolist()
+        what = ("scene", "splats", "camera") if first else ("path", "splats", "camera")
+        self._server.tell(*what, version=self.updates, text=snapshot.text, T_world_camera=T)
 
     def _compare(self, snapshot: _Snapshot, camera: Camera) -> np.ndarray:
         """The newest frame beside what the map shows there."""
@@ -172,7 +188,23 @@ class LiveView:
         return table_of(cells, size)
 
 
-def _snapshot(slam: Slam, frame: Frame, report: StepReport, title: str) -> _Snapshot:
+def _scene_of(snapshot: _Snapshot, camera: Camera, title: str, centers: np.ndarray) -> dict[str, Any]:
+    """What a page is told of a growing map, see `scene_values`."""
+    up, positions, fov = -snapshot.poses[0, :3, 1], snapshot.poses[:, :3, 3], vertical_fov(camera)
+    start = view_from_behind(snapshot.poses[0], CameraTuning.look_ahead_m)
+    top = top_view(centers, positions, snapshot.poses[0, :3, 2], up, fov)
+    return {
+        "title": title, "caption": "", "about": snapshot.text, "up": up, "fov": fov,
+        "floor": {"height": None, "found": False},
+        "camera": {"width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
+                   "cx": camera.cx, "cy": camera.cy},
+        "objects": [], "unlabelled": 0, "views": {"Start": asdict(start), "Top": asdict(top)},
+        "path": [positions.round(4)], "keyframes": [T.round(5).ravel() for T in snapshot.keyframes],
+        "frames": [], "movers": [], "changes": [], "annotations": [], "camera_keys": [], "edits": [], "redo": 0,
+    }  # fmt: skip
+
+
+def _snapshot(slam: Slam, frame: Frame, report: StepReport) -> _Snapshot:
     """Copies what is shown. In real time another thread trains the map meanwhile: rows of one copy may then be of
     different steps, which is gone with the next."""
     g = slam.map
@@ -187,7 +219,7 @@ def _snapshot(slam: Slam, frame: Frame, report: StepReport, title: str) -> _Snap
     pose = None if report.frame.status == "lost" else slam.pose_of(report.frame)
     psnr = f"{report.psnr:.1f} dB" if np.isfinite(report.psnr) else "-"
     text = (
-        f"**{plain(title)}**  \nframe {report.frame.frame_index} · {quantity(len(keyframes), 'keyframe')}"
-        f" · {report.gaussians:,} Gaussians · PSNR {psnr} · overlap {report.frame.overlap:.0%} · {report.frame.status}"
+        f"frame {report.frame.frame_index} · {quantity(len(keyframes), 'keyframe')} · {report.gaussians:,} Gaussians"
+        f" · PSNR {psnr} · overlap {report.frame.overlap:.0%} · {report.frame.status}"
     )
     return _Snapshot(copies, poses, keyframes, frame, pose, text)

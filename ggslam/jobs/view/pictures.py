@@ -11,7 +11,6 @@ import numpy as np
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.labels import vote_label_image
 from ggslam.rendering.types import GaussianTensors
 from ggslam.reporting.pictures import (
     IdentityColors,
@@ -26,7 +25,6 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.system.tuning import Tuning
-from ggslam.viewer.cameras import pose_along
 
 
 class FramePictureTuning(Tuning):
@@ -38,8 +36,6 @@ class FramePictureTuning(Tuning):
     """Pixels between pictures."""
     bar_height = 26
     """Height of the line of text above a picture, in pixels."""
-    patch = 5
-    """Width in pixels of the patch that is rendered to find the object at its middle."""
 
 
 class ViewPictures:
@@ -82,32 +78,22 @@ class ViewPictures:
             cells.append(("identity (PCA)", self.identity.picture(view.features.numpy(), alpha)))
         return table_of(cells, (camera.width, camera.height)), rendered if found is None else found.color
 
-    def object_at(self, origin: np.ndarray, direction: np.ndarray, focal: float, hidden: set[int]) -> int:
-        """See `ViewedMap.object_at`: of the Gaussians at that pixel, whose object has the largest rendering weight."""
-        patch = FramePictureTuning.patch
-        middle = (patch - 1) / 2
-        camera = Camera(patch, patch, focal, focal, middle, middle)
-        part, labels = self._visible(hidden)
-        view = self._rasterizer.forward(part, camera, inverse(pose_along(origin, direction)), features=False)
-        return int(vote_label_image(self._rasterizer, view, labels)[patch // 2, patch // 2])
-
     def picture(self, camera: Camera, T_world_camera: np.ndarray, hidden: set[int]) -> np.ndarray:
         """See `ViewedMap.picture`."""
-        part, _ = self._visible(hidden)
+        part = self._visible(hidden)
         view = self._rasterizer.forward(part, camera, inverse(T_world_camera), features=False)
         return color_to_uint8(view.image.numpy())
 
-    def _visible(self, hidden: set[int]) -> tuple[GaussianMap | GaussianTensors, np.ndarray]:
-        """The Gaussians that are not hidden, and their object ids uint16."""
-        g, labels = self._gaussians, self._gaussians.object_id.numpy()
+    def _visible(self, hidden: set[int]) -> GaussianMap | GaussianTensors:
+        """The Gaussians that are not hidden."""
+        g = self._gaussians
         if not hidden:
-            return g, labels.astype(np.uint16)
-        kept = np.flatnonzero(~np.isin(labels, list(hidden)))
-        part = GaussianTensors(
+            return g
+        kept = np.flatnonzero(~np.isin(g.object_id.numpy(), list(hidden)))
+        return GaussianTensors(
             g.means[kept], g.quaternions[kept], g.log_scales[kept], g.opacity_logits[kept], g.sh[kept],
             g.features[kept],
         )  # fmt: skip
-        return part, labels[kept].astype(np.uint16)
 
 
 def table_of(cells: list[tuple[str, np.ndarray]], size: tuple[int, int]) -> np.ndarray:

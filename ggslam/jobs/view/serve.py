@@ -7,84 +7,91 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ggslam.jobs.view.live import LiveView
+from ggslam.jobs.view.packing import packed_rows
+from ggslam.jobs.view.run_page import RunPage
 from ggslam.jobs.view.viewed_run import ViewedRun, ViewedRunTuning
 from ggslam.runs.folder import RunFolder
 from ggslam.system.atomic import make_folder, write_bytes
-from ggslam.viewer.page import Page
-from ggslam.viewer.server import DEFAULT_HOST, DEFAULT_PORT, address, clear_page, close_server, open_server
-
-if TYPE_CHECKING:
-    import viser
+from ggslam.viewer.page_server import DEFAULT_HOST, DEFAULT_PORT, PageServer
+from ggslam.viewer.page_text import file_page
+from ggslam.viewer.scene_values import SceneValuesTuning, jpeg_address
 
 
 def serve_run(
     folder: RunFolder, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, max_splats: int = ViewedRunTuning.max_splats,
-    sequence: Path | None = None, changes: Path | None = None,
-) -> tuple[viser.ViserServer, ViewedRun]:  # fmt: skip
-    """Serves a run's page until `close_server`.
+    sequence: Path | None = None, changes: Path | None = None, caption: str = "",
+) -> tuple[PageServer, ViewedRun]:  # fmt: skip
+    """Serves a run's page until the server is closed.
 
     Args:
         folder: the run.
-        host, port: see `open_server`.
+        host, port: see `PageServer`.
         max_splats: show no more of the map's Gaussians.
         sequence: where the recording is now, if it was moved.
         changes: see `ViewedRun`.
+        caption: a line below the map.
 
     Raises:
-        GgslamError: as `open_server` and `ViewedRun`.
+        GgslamError: as `PageServer` and `ViewedRun`.
     """
     model = ViewedRun(folder, max_splats, sequence, changes)
-    server = open_server(host, port)
-    try:
-        show_run(server, model)
-    except BaseException:
-        close_server(server)
-        raise
+    server = PageServer(host, port, _title(folder))
+    server.show(RunPage(model, _title(folder), caption, server.tell))
     return server, model
 
 
-def show_run(server: viser.ViserServer, model: ViewedRun) -> None:
-    """Shows a run on a server's page, in place of what was there."""
-    clear_page(server)
-    Page(server, model, model if model.has_objects else None, model.folder.path.resolve().name)
-
-
 def write_page(
-    folder: RunFolder, path: Path, max_splats: int = ViewedRunTuning.max_splats, sequence: Path | None = None
-) -> tuple[ViewedRun, int]:
+    folder: RunFolder, path: Path, max_splats: int = ViewedRunTuning.max_splats, sequence: Path | None = None,
+    caption: str = "", changes: Path | None = None,
+) -> tuple[ViewedRun, int]:  # fmt: skip
     """Writes a run's page as one HTML file that opens without server and network; returns the run and the file's
     size in bytes.
 
     Raises:
         GgslamError: as `ViewedRun`, or the file cannot be written.
     """
-    model = ViewedRun(folder, max_splats, sequence)
-    content = model.static_page(folder.path.resolve().name).encode()
+    model = ViewedRun(folder, max_splats, sequence, changes)
+    content = _file_page(model, _title(folder), caption).encode()
     make_folder(path.parent)
     write_bytes(path, content)
     return model, len(content)
+
+
+def _file_page(model: ViewedRun, title: str, caption: str) -> str:
+    scene = RunPage(model, title, caption).scene()
+    header, splats = packed_rows(model, model.shown_rows())
+    frames, most = scene["frames"], SceneValuesTuning.pictures_in_file
+    shown = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))]
+    for frame in shown:
+        frame["picture"] = jpeg_address(model.frame_picture(frame["frame"])[0])
+    return file_page(title, {**scene, "served": False, "editable": False, "frames": shown, "splats": header}, splats)
+
+
+def _title(folder: RunFolder) -> str:
+    return folder.path.resolve().name
 
 
 class LivePage:
     """A page that shows a run while it goes on and, afterwards, the run that was saved.
 
     Args:
-        server: with an empty page.
-        title: above the controls.
+        server: of the page.
+        title: of the page.
     """
 
-    def __init__(self, server: viser.ViserServer, title: str) -> None:
+    def __init__(self, server: PageServer, title: str) -> None:
         self._server, self._live = server, LiveView(server, title)
         self.follow = self._live.follow
-        self.address = address(server)
+        self.address = server.address
 
     def show_result(self, folder: RunFolder) -> None:
         """Shows a saved run from now on."""
         self._live.close()
-        show_run(self._server, ViewedRun(folder))
+        self._server.show(RunPage(ViewedRun(folder), _title(folder), tell=self._server.tell))
 
 
 @contextmanager
@@ -92,13 +99,13 @@ def live_page(host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, title: str = "
     """Serves a page for a run that is about to begin.
 
     Raises:
-        GgslamError: as `open_server`.
+        GgslamError: as `PageServer`.
     """
-    server = open_server(host, port)
+    server = PageServer(host, port, title)
     try:
         yield LivePage(server, title)
     finally:
-        close_server(server)
+        server.close()
 
 
 def wait_for_interrupt(announce: Callable[[], None]) -> None:

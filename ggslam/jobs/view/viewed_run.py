@@ -4,25 +4,29 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
+from collections.abc import Sequence as ListOf
+from contextlib import AbstractContextManager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.jobs.changes.saved_changes import ChangesShown, changes_of, read_changes, sentence_of
+from ggslam.jobs.edit.edit import Edit
 from ggslam.jobs.edit.edited_file import edited_name
-from ggslam.jobs.edit.edits import Edit, apply_edit, edit_run
+from ggslam.jobs.edit.edits import apply_edit, edit_run
+from ggslam.jobs.edit.selected import selected_rows
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.jobs.view.pictures import ViewPictures
-from ggslam.objects.editing import EditingTuning
+from ggslam.objects.editing import EditingTuning, opacity_centroid
 from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.objects.segmented_rows import copies_of
+from ggslam.objects.splat_editing import scene_without_objects
 from ggslam.objects.table import ObjectRecord
-from ggslam.reporting.pictures import color_of_depth, depth_range
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import MapFile
 from ggslam.runs.recordings import open_recording_of
@@ -36,9 +40,9 @@ from ggslam.sequences import Sequence
 from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted
-from ggslam.viewer.model import Box, Coloring, ListedObject, ShownChange, ShownMover
-from ggslam.viewer.splats import Splats, most_visible, splats_of
-from ggslam.viewer.static_page import static_page
+from ggslam.viewer.model import Box, ListedObject, ShownChange, ShownMover
+from ggslam.viewer.splats import most_visible
+from ggslam.viewer.viewed_sides import viewed_sides
 from ggslam.volumes.map_upright import upright_of
 
 
@@ -49,12 +53,12 @@ class ViewedRunTuning(Tuning):
     """Most Gaussians that are shown unless asked otherwise."""
     change_pictures = 1000
     """Most pictures of changes: one is shown at a time."""
-    digits = 4
-    """Decimals of a shift in metres and a rotation in degrees, as shown and as saved."""
+    max_edits = 500
+    """Most edits before they have to be saved."""
 
 
 class ViewedRun:
-    """A run (or a file of Gaussians) for the viewer; an `EditableMap`.
+    """A run (or a file of Gaussians) for the viewer; a `ViewedMap` that can be edited.
 
     The run itself is never changed: edits are done to what is shown, and done again, as `ggslam edit` does them, to the
     run's files when they are saved to another folder.
@@ -79,6 +83,7 @@ class ViewedRun:
         self._lock = threading.RLock()
         self._edits: list[Edit] = []
         self._texts: list[str] = []
+        self._undone: list[Edit] = []
         record = folder.keyframes()
         self._record = folder.sequence()
         self.camera: Camera = self._record.camera
@@ -90,7 +95,8 @@ class ViewedRun:
         self._changes = self._own_changes() if changes is None else self._given_changes(changes)
         self._recording = self._open_recording(sequence)
         self._read_map()
-        self.up = upright_of(self._gaussians, np.stack(list(self.frame_poses.values()))).up
+        upright = upright_of(self._gaussians, np.stack(list(self.frame_poses.values())))
+        self.up, self.floor = upright.up, upright.floor
 
     @property
     def walks(self) -> list[np.ndarray]:
@@ -135,9 +141,9 @@ class ViewedRun:
     def _map_changed(self) -> None:
         """What was worked out of the map before an edit holds no more."""
         self._pictures = ViewPictures(
-            self._gaussians, self._segmented, self._record.camera_of, self._recorded_frame
+            self._gaussians, self._segmented if self.has_objects else None, self._record.camera_of, self._recorded_frame
         )
-        self._shown: tuple[np.ndarray, Splats] | None = None
+        self._rows: np.ndarray | None = None
 
     def _recorded_frame(self, frame: int) -> Frame | None:
         if self._recording is None:
@@ -147,20 +153,16 @@ class ViewedRun:
         except GgslamError:  # one damaged frame is no reason to stop
             return None
 
+    def turn(self) -> AbstractContextManager[Any]:
+        """While it is held, no edit is done."""
+        return self._lock
+
     # --- to be looked at ---------------------------------------------------------------------------------------------
 
     @property
     def has_objects(self) -> bool:
         """Whether there are objects to select."""
-        return self._segmented is not None
-
-    @property
-    def colorings(self) -> tuple[Coloring, ...]:
-        """See `ViewedMap`."""
-        if not self.has_objects:
-            return ("colour", "depth")
-        known = self._pictures.identity is not None
-        return ("colour", "objects", "identity", "depth") if known else ("colour", "objects", "depth")
+        return self._segmented is not None and bool(self._segmented.table.objects)
 
     def describe(self) -> str:
         """See `ViewedMap`."""
@@ -174,33 +176,23 @@ class ViewedRun:
                 parts.append(quantity(len(self._segmented.table), "object"))
             return " · ".join(parts)
 
-    def splats(self, coloring: Coloring, frame: int) -> dict[int, Splats]:
+    def shown_rows(self) -> np.ndarray:
+        """Rows, rising, of the Gaussians that are shown, int [N]: the most visible ones."""
+        with self._lock:
+            if self._rows is None:
+                owners = self._gaussians.object_id.numpy()
+                self._rows = most_visible(self._gaussians, self._max_splats, owners)
+            return self._rows
+
+    def centers(self) -> np.ndarray:
         """See `ViewedMap`."""
         with self._lock:
-            if self._shown is None:
-                rows = self._most_visible()
-                self._shown = rows, splats_of(self._gaussians, rows)
-            rows, splats = self._shown
-            splats = replace(splats, colors=self._colors(coloring, frame, rows, splats))
-            owner = self._gaussians.object_id.numpy()[rows]
-            return {int(i): splats.rows(owner == i) for i in np.unique(owner)}
+            return self._gaussians.means.numpy()[self.shown_rows()]
 
-    def _most_visible(self) -> np.ndarray:
-        return most_visible(self._gaussians, self._max_splats, self._gaussians.object_id.numpy())
-
-    def _colors(self, coloring: Coloring, frame: int, rows: np.ndarray, splats: Splats) -> np.ndarray:
-        """uint8 [N, 3]."""
-        g = self._gaussians
-        if coloring == "objects" and self._segmented is not None:
-            return self._segmented.table.palette()[g.object_id.numpy()[rows]]
-        if coloring == "identity":
-            found = self._identity_colors(rows)
-            return splats.colors if found is None else found
-        if coloring == "depth":
-            T = self.frame_poses[frame]
-            distance = np.linalg.norm(splats.centers - T[:3, 3], axis=1)
-            return color_of_depth(distance[:, None], *depth_range(distance))[:, 0]
-        return splats.colors
+    def gaussians(self) -> GaussianMap:
+        """The map as it is after the edits; not to be changed."""
+        with self._lock:
+            return self._gaussians
 
     def objects(self) -> list[ListedObject]:
         """See `ViewedMap`."""
@@ -226,26 +218,19 @@ class ViewedRun:
         with self._lock:
             return self._pictures.compare(frame, self.frame_poses[frame])
 
-    def object_at(self, origin: np.ndarray, direction: np.ndarray, focal: float, hidden: set[int]) -> int:
-        """See `ViewedMap`."""
-        with self._lock:
-            return self._pictures.object_at(origin, direction, focal, hidden)
-
     def picture(self, camera: Camera, T_world_camera: np.ndarray, hidden: set[int]) -> np.ndarray:
         """See `ViewedMap`."""
         with self._lock:
             return self._pictures.picture(camera, T_world_camera, hidden)
 
-    def static_page(self, title: str) -> str:
-        """The map, up to the limit of splats, as one HTML file that needs neither server nor network."""
-        with self._lock:
-            rows = self._most_visible()
-            owners = self._gaussians.object_id.numpy()[rows].astype(np.uint16)
-            identity = self._identity_colors(rows)
-            return static_page(self, title, self._gaussians, rows, identity, owners)
+    def viewed_sides(self, rows: np.ndarray) -> np.ndarray | None:
+        """See `viewed_sides`; None where the poses are none of a recording."""
+        if not self.folder.has_poses:
+            return None
+        return viewed_sides(self._gaussians, rows, self.camera, list(self.frame_poses.values()))
 
-    def _identity_colors(self, rows: np.ndarray) -> np.ndarray | None:
-        """uint8 [N, 3] of the Gaussians' identity vectors; None if they have none."""
+    def identity_colors(self, rows: np.ndarray) -> np.ndarray | None:
+        """Colours uint8 [N, 3] of the identity vectors of some rows; None if they have none."""
         if self._pictures.identity is None:
             return None
         features = np.ascontiguousarray(self._gaussians.features.numpy()[rows].T)[:, :, None]
@@ -253,53 +238,94 @@ class ViewedRun:
 
     # --- to be edited ------------------------------------------------------------------------------------------------
 
-    def rename(self, object_id: int, name: str) -> str:
-        """See `EditableMap`."""
-        return self._do(Edit("rename", str(object_id), name))
+    def edit(self, edit: Edit) -> str:
+        """Does an edit to what is shown; returns a sentence about it.
 
-    def remove(self, object_id: int) -> str:
-        """See `EditableMap`."""
-        return self._do(Edit("remove", str(object_id)))
-
-    def move(self, object_id: int, T: np.ndarray) -> str:
-        """See `EditableMap`."""
+        Raises:
+            ConfigError: it cannot be done.
+        """
         with self._lock:
-            center = np.array(self._scene().table.record(object_id).centroid)
-        shift = T[:3, :3] @ center + T[:3, 3] - center
-        turn = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)  # about fixed x, then y, then z
-        rotation = _numbers(turn) if np.abs(turn).max() > 10.0**-ViewedRunTuning.digits else ""
-        return self._do(Edit("move", str(object_id), _numbers(shift), rotation))
+            if len(self._edits) >= ViewedRunTuning.max_edits:
+                raise ConfigError(f"there are {len(self._edits)} edits already; save them, and view the edited run")
+            text = self._do(edit)
+            self._undone = []
+            return text
 
     def _do(self, edit: Edit) -> str:
-        with self._lock:
-            change = apply_edit(self._scene(), edit)
-            self._edits.append(edit)
-            self._texts.append(change.text)
-            self._gaussians = self._scene().gaussians
-            self._map_changed()
-            return change.text
+        try:
+            change = apply_edit(self._scene_for(edit), edit)
+        except BaseException:
+            self._replay(self._edits)  # half an edit is none
+            raise
+        self._edits.append(edit)
+        self._texts.append(change.text)
+        self._gaussians = self._scene_for(edit).gaussians
+        self._map_changed()
+        return change.text
 
     def undo(self) -> str:
-        """See `EditableMap`."""
+        """Takes the last edit back.
+
+        Raises:
+            ConfigError: there is none.
+        """
         with self._lock:
             if not self._edits:
                 raise ConfigError("there is no edit to take back")
-            kept, text = self._edits[:-1], self._texts[-1]
-            self._edits, self._texts = [], []
-            self._read_map()
-            for edit in kept:
-                self._do(edit)
+            last, text = self._edits[-1], self._texts[-1]
+            self._replay(self._edits[:-1])
+            self._undone.append(last)
             return f"taken back: {text}"
 
+    def redo(self) -> str:
+        """Does again what was taken back last.
+
+        Raises:
+            ConfigError: there is nothing.
+        """
+        with self._lock:
+            if not self._undone:
+                raise ConfigError("there is no edit to do again")
+            return self._do(self._undone.pop())
+
+    def _replay(self, edits: ListOf[Edit]) -> None:
+        """Reads the map anew and does edits to it."""
+        kept = list(edits)
+        self._edits, self._texts = [], []
+        self._read_map()
+        for edit in kept:
+            self._do(edit)
+
     def edits(self) -> list[str]:
-        """See `EditableMap`."""
+        """Sentences on what was done so far."""
         with self._lock:
             return list(self._texts)
 
+    def undone(self) -> int:
+        """How many edits can be done again."""
+        return len(self._undone)
+
+    def rows_of(self, selection: str) -> np.ndarray:
+        """The Gaussians of a selection, bool [N] of all, also of those that are not shown.
+
+        Raises:
+            ConfigError: it is no selection.
+        """
+        with self._lock:
+            scene = self._segmented or scene_without_objects(self._gaussians)
+            return selected_rows(scene, selection)
+
+    def centroid_of(self, rows: np.ndarray) -> np.ndarray:
+        """About which Gaussians (bool [N]) turn, [3]."""
+        with self._lock:
+            return opacity_centroid(copies_of(self._gaussians, rows))
+
     def export(self, object_id: int) -> tuple[str, bytes]:
-        """See `EditableMap`."""
+        """Name and content of a PLY file of an object."""
         with self._lock, TemporaryDirectory() as folder:
-            record = self._scene().table.record(object_id)
+            if self._segmented is None:
+                raise ConfigError("this map has no objects")
+            record = self._segmented.table.record(object_id)
             g = self._gaussians
             part = GaussianMap(g.sh_degree, g.feature_channels, with_moments=False)
             part.append({k: v for k, v in g.take(torch.nonzero(g.object_id == object_id)[:, 0]).items()
@@ -309,7 +335,7 @@ class ViewedRun:
             return path.name, read_untrusted(path)
 
     def default_target(self) -> str:
-        """See `EditableMap`."""
+        """Name to save as, if nobody gives another."""
         path = self.folder.path.resolve()  # "." has no name
         return edited_name(path).name if isinstance(self.folder, MapFile) else f"{path.name}-edited"
 
@@ -318,7 +344,13 @@ class ViewedRun:
         return self.folder.path.resolve().parent
 
     def save(self, target: str, inpaint: bool) -> str:
-        """See `EditableMap`; an earlier run at `target` is not replaced."""
+        """Writes the edited map with all that belongs to it, as a folder of this name in `save_folder`; an earlier run
+        at `target` is not replaced.
+
+        Raises:
+            ConfigError: nothing was edited, or no name of a new folder.
+            GgslamError: as of `edit_run`.
+        """
         with self._lock:
             if not self._edits:
                 raise ConfigError("nothing was edited, so there is nothing to save")
@@ -334,7 +366,9 @@ class ViewedRun:
         outcome = edit_run(self.folder, edits, out, inpainting=inpaint, sequence=sequence)
         return "\n".join([f"saved to {outcome.folder.path}", *outcome.notes])
 
-    def _scene(self) -> SegmentedMap:
+    def _scene_for(self, edit: Edit) -> SegmentedMap:
+        if self._segmented is None and edit.selection:
+            self._segmented = scene_without_objects(self._gaussians)
         if self._segmented is None:
             raise ConfigError("this run has no objects to edit")
         return self._segmented
@@ -355,7 +389,3 @@ def _box_of(frame: MoverFrameRecord) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def _box_of_side(side: ChangedSide | None) -> Box | None:
     box = None if side is None else side.box
     return None if box is None else (np.array(box.center), np.array(box.axes), np.array(box.size))
-
-
-def _numbers(values: np.ndarray) -> str:
-    return " ".join(f"{value:.{ViewedRunTuning.digits}f}" for value in values)

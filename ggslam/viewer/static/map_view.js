@@ -14,6 +14,7 @@ class MapView {
     this.resolution = new Resolution(least, Math.min(devicePixelRatio, most), wanted);
     this.movedAt = -Infinity; this.drawnAt = -Infinity; this.times = [];
     this.ready = new Promise((resolve) => { this.becameReady = resolve; });
+    this.onrest = () => {}; // the camera has come to rest, and the picture is sharp
     this.renderer.onchange = () => this.request();
     this.renderer.onframe = (shot, complete) => this.shown(shot, complete);
     new ResizeObserver(() => this.redraw()).observe(canvas);
@@ -102,6 +103,7 @@ class MapView {
     if (!shot.sharp && gap < 500) this.resolution.took(shot.milliseconds || gap);
     this.times.push(now); while (this.times[0] < now - 1000) this.times.shift();
     if (complete && this.chunks.size) this.becameReady();
+    if (shot.sharp && this.restedAt !== this.movedAt) { this.restedAt = this.movedAt; this.onrest(); }
   }
 
   get stats() {

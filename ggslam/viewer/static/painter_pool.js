@@ -5,8 +5,8 @@ class PainterPool {
   constructor(workers = Math.max(1, Math.min(8, navigator.hardwareConcurrency || 2))) {
     this.workers = Array.from({ length: workers }, () => {
       const worker = startWorker(
-        paintInWorker, `const TILE = ${TILE}, FALL_STEPS = ${FALL_STEPS}; const LOGARITHMS = Float64Array.from({ length: 256 }, (_, k) => k ? Math.log(k) : -1);`,
-        SplatProjector, TilePainter, isDisplaced, multiply, rowsOf, countingSort, ellipseEdge);
+        paintInWorker, `const TILE = ${TILE}, FALL_STEPS = ${FALL_STEPS}; const SEEN_RULES = ${JSON.stringify(SEEN_RULES)}; const LOGARITHMS = Float64Array.from({ length: 256 }, (_, k) => k ? Math.log(k) : -1);`,
+        SplatProjector, TilePainter, isDisplaced, multiply, rowsOf, countingSort, ellipseEdge, SeenShapes, octahedralDirections, eyeOf);
       worker.onmessage = (event) => this.take(event.data);
       return worker;
     });
@@ -17,8 +17,8 @@ class PainterPool {
   tell(name, ...values) { for (const worker of this.workers) worker.postMessage({ [name]: values }); }
 
   addChunk(chunk, splats) {
-    const { count, centers, covariances, alphas, ids, rgb } = splats;
-    this.tell("addChunk", chunk, { count, centers, covariances, alphas, ids, rgb, radius: radii(splats) });
+    const { count, centers, covariances, alphas, ids, rgb, seen } = splats;
+    this.tell("addChunk", chunk, { count, centers, covariances, alphas, ids, rgb, seen, radius: radii(splats) });
   }
 
   removeChunk(chunk) { this.tell("removeChunk", chunk); }
@@ -33,9 +33,10 @@ class PainterPool {
 
   // Paints; onstrip({top, bottom, values}) for each part that is ready. The promise is true when all are, false if a
   // later job came before.
-  paint(shot, { strips = 1, kind = "colors", least = SPLAT_RULES.minTransmittance, onstrip }) {
+  paint(shot, { strips = 1, kind = "colors", onstrip }) {
     for (const job of this.jobs.values()) job.resolve(false);
     this.jobs.clear();
+    const least = shot.sharp ? SPLAT_RULES.minTransmittance : SPLAT_RULES.movingMinTransmittance;
     const serial = ++this.serial, rows = Math.ceil(shot.height / TILE), ends = this.shares.map((share) => Math.round(share * rows));
     return new Promise((resolve) => {
       let left = 0, from = 0;

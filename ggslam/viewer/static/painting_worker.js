@@ -50,7 +50,10 @@ function paintInWorker() {
   turns.port1.onmessage = strip;
 
   const handlers = {
-    addChunk: (chunk, splats) => chunks.set(chunk, { ...splats, marks: null }),
+    addChunk: (chunk, splats) => {
+      const shapes = splats.seen && new SeenShapes(splats.seen, splats.covariances);
+      chunks.set(chunk, { ...splats, shapes, marks: null });
+    },
     removeChunk: (chunk) => chunks.delete(chunk),
     setColors: (chunk, rgb) => { if (chunks.has(chunk)) chunks.get(chunk).rgb = rgb; },
     setMarks: (chunk, marks) => { if (chunks.has(chunk)) chunks.get(chunk).marks = marks; },

@@ -38,7 +38,8 @@ function outOfCamera(v, [x, y, z]) {
 }
 
 function splatsOnRay(splats, marks, states, displacement, { view, focal, near, width, height }, [u, w]) {
-  const { count, centers, covariances: s, alphas, ids } = splats;
+  const { count, centers, alphas, ids, covariances: all } = splats, shapes = shapesOf(splats);
+  const eyes = [view, displacement && multiply(view, displacement.T)].map((v) => v && eyeOf(v));
   const limitX = SPLAT_RULES.slopeMargin * width / focal, limitY = SPLAT_RULES.slopeMargin * height / focal, hits = [];
   const moved = displacement && multiply(view, displacement.T), floor = SPLAT_RULES.lowPass / (focal * focal);
   for (let i = 0; i < count; i++) {
@@ -49,14 +50,26 @@ function splatsOnRay(splats, marks, states, displacement, { view, focal, near, w
     if (z < near) continue;
     const px = (v[0] * x + v[4] * y + v[8] * c + v[12]) / z, py = (v[1] * x + v[5] * y + v[9] * c + v[13]) / z;
     const dx = u - px, dy = w - py, a = 6 * i, jx = Math.max(-limitX, Math.min(limitX, px)), jy = Math.max(-limitY, Math.min(limitY, py));
-    if (dx * dx + dy * dy > 12 * ((s[a] + s[a + 3] + s[a + 5]) / (z * z) * (1 + jx * jx + jy * jy) + floor)) continue;
-    const cov = inCamera(v, s, a), xx = cov[0] + jx * (jx * cov[5] - 2 * cov[2]), yy = cov[3] + jy * (jy * cov[5] - 2 * cov[4]);
+    if (dx * dx + dy * dy > 12 * ((all[a] + all[a + 3] + all[a + 5]) / (z * z) * (1 + jx * jx + jy * jy) + floor)) continue;
+    let s = all, at = a, share = 1;
+    if (shapes) {
+      const eye = eyes[v === moved ? 1 : 0];
+      share = shapes.look(i, eye[0] - x, eye[1] - y, eye[2] - c, Math.sqrt(all[a] + all[a + 3] + all[a + 5]));
+      s = shapes.shape; at = 0;
+    }
+    const cov = inCamera(v, s, at), xx = cov[0] + jx * (jx * cov[5] - 2 * cov[2]), yy = cov[3] + jy * (jy * cov[5] - 2 * cov[4]);
     const xy = cov[1] - jx * cov[4] - jy * cov[2] + jx * jy * cov[5], A = xx / (z * z) + floor, B = xy / (z * z), C = yy / (z * z) + floor;
-    const alpha = alphas[i] / 255 * Math.exp(-0.5 * (C * dx * dx - 2 * B * dx * dy + A * dy * dy) / (A * C - B * B));
+    const alpha = share * alphas[i] / 255 * Math.exp(-0.5 * (C * dx * dx - 2 * B * dx * dy + A * dy * dy) / (A * C - B * B));
     if (alpha < SPLAT_RULES.minAlpha) continue;
     hits.push({ row: i, id: ids[i], z, alpha: Math.min(alpha, SPLAT_RULES.maxAlpha) });
   }
   return hits;
+}
+
+// Made when something is picked first.
+function shapesOf(splats) {
+  if (splats.seen && !splats.shapes) splats.shapes = new SeenShapes(splats.seen, splats.covariances);
+  return splats.shapes || null;
 }
 
 // Covariance (xx xy xz yy yz zz) in the camera's frame.

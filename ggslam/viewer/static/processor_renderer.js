@@ -25,7 +25,7 @@ class ProcessorRenderer {
   async sketch(shot) {
     this.busy = true;
     const start = performance.now(), strips = [], complete = this.chunks.size > 0;
-    const whole = await this.pool.paint(shot, { least: 1 / 50, onstrip: (strip) => strips.push(strip) });
+    const whole = await this.pool.paint(shot, { onstrip: (strip) => strips.push(strip) });
     this.busy = false;
     if (whole) {
       this.resize(shot);

@@ -7,6 +7,7 @@ const SPLAT_RULES = Object.freeze({
   minAlpha: 1 / 255, // fainter contributions are left out
   maxAlpha: 0.999,
   minTransmittance: 1e-4, // a pixel takes no further splat once its transmittance is below
+  movingMinAlpha: 4 / 255, movingMinTransmittance: 0.05, // coarser, while the camera moves without a GPU
   slopeMargin: 0.65, // of the screen: slopes beyond are clamped in the Jacobian
   visible: 1, selected: 2, // bits of an object's state
   marked: 1, gone: 2, // bits of a splat's marks

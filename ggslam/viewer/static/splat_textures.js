@@ -20,11 +20,13 @@ class SplatTextures {
   add(splats) {
     const rows = Math.max(1, Math.ceil(splats.count / 1024)), first = this.take(rows);
     const words = new Uint32Array(rows * 3072 * 4), numbers = new Float32Array(words.buffer);
-    const { count, centers: c, covariances: s, ids } = splats;
+    const { count, centers: c, covariances: s, ids, seen } = splats;
     for (let i = 0; i < count; i++) {
       const k = 12 * i;
       numbers[k] = c[3 * i]; numbers[k + 1] = c[3 * i + 1]; numbers[k + 2] = c[3 * i + 2]; words[k + 3] = ids[i];
       for (let j = 0; j < 6; j++) numbers[k + 4 + j] = s[6 * i + j];
+      if (seen) words[k + 10] = (seen[4 * i] | seen[4 * i + 1] << 8 | seen[4 * i + 2] << 16 | seen[4 * i + 3] << 24) >>> 0;
+      words[k + 11] = seen ? 1 : 0;
     }
     const kept = { rows, words, colors: new Uint8Array(rows * 4096), marks: new Uint8Array(rows * 1024), alphas: splats.alphas };
     this.kept.set(1024 * first, kept);

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Splats from the bytes that ggslam/viewer/static_page.py packs.
 
-// buffer: ArrayBuffer, deflated; header: {count, low, high, scales, identity}. Gives {count, centers Float32 [3n],
+// buffer: ArrayBuffer, deflated; header: {count, low, high, scales, identity, seen}. Gives {count, centers Float32 [3n],
 // covariances Float32 [6n] (xx xy xz yy yz zz), alphas Uint8 [n], ids Uint16 [n], rgb Uint8 [3n], identity Uint8 [3n]
-// or null}.
+// or null, seen Uint8 [4n] or null (see `SeenShapes`)}.
 async function unpackSplats(buffer, header) {
   const stream = new Blob([buffer]).stream().pipeThrough(new DecompressionStream("deflate"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer()), n = header.count;
@@ -14,11 +14,12 @@ async function unpackSplats(buffer, header) {
   };
   const steps = [column(2), column(2), column(2)], scales = column(3), turns = column(4), colors = column(3);
   const alphas = column(1).slice(), owners = column(2), identity = header.identity ? column(3) : null;
+  const seen = header.seen ? column(4) : null;
   const ids = new Uint16Array(n);
   for (let i = 0; i < n; i++) ids[i] = owners[i] | owners[n + i] << 8; // low bytes, then high bytes
   return {
     count: n, centers: unpackCenters(n, steps, header), covariances: unpackCovariances(n, scales, turns, header.scales),
-    alphas, ids, rgb: interleaved(n, colors), identity: identity && interleaved(n, identity),
+    alphas, ids, rgb: interleaved(n, colors), identity: identity && interleaved(n, identity), seen: seen && interleaved(n, seen, 4),
   };
 }
 
@@ -52,8 +53,8 @@ function unpackCovariances(n, scales, turns, [least, greatest]) {
   return found;
 }
 
-function interleaved(n, column) {
-  const found = new Uint8Array(3 * n);
-  for (let i = 0; i < n; i++) for (let k = 0; k < 3; k++) found[3 * i + k] = column[k * n + i];
+function interleaved(n, column, width = 3) {
+  const found = new Uint8Array(width * n);
+  for (let i = 0; i < n; i++) for (let k = 0; k < width; k++) found[width * i + k] = column[k * n + i];
   return found;
 }
