@@ -78,7 +78,8 @@ MALFORMED = (
     "Host: localhost\r\nHost: localhost", "Host: localhost\r\nOrigin: http://a\r\nOrigin: http://b",
     "Host: localhost\r\nCookie: a=1\r\nCookie: b=2",
 )  # fmt: skip
-NO_HTTP = ("GET //[ HTTP/1.1\r\nHost: localhost\r\n\r\n", "garbage\r\n\r\n", "POST / HTTP/1.1\r\nHost: a\r\n\r\n", f"GET / HTTP/1.1\r\nX: {'a' * 20000}\r\n\r\n",
+NO_HTTP = ("GET //[ HTTP/1.1\r\nHost: localhost\r\n\r\n",
+           "garbage\r\n\r\n", "POST / HTTP/1.1\r\nHost: a\r\n\r\n", f"GET / HTTP/1.1\r\nX: {'a' * 20000}\r\n\r\n",
            "GET / HTTP/1.1\r\n" + "A: x\r\n" * 500 + "\r\n", "GET / HTTP/1.1\r\n\xff: a\r\n\r\n")  # fmt: skip
 GIVEN = [f"GET / HTTP/1.1\r\n{headers}\r\n\r\n" for headers in MALFORMED]
 

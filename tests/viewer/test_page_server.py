@@ -20,6 +20,7 @@ from urllib.parse import urlsplit
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.view.serve import serve_run
@@ -131,8 +132,10 @@ def test_edits_undo_redo_and_save(served: tuple[PageServer, ViewedRun]) -> None:
     said = page.post("save", {"target": "saved", "inpaint": False})["text"]
     saved = RunFolder.open(model.save_folder() / "saved")
     assert str(saved.path) in said and verify_run(saved.path).good
-    assert len(saved.gaussians()) == len(model.gaussians()) and saved.object_table().record(new["id"]).name == "odd"
-    assert np.allclose(saved.gaussians().means.numpy(), model.gaussians().means.numpy())
+    assert saved.object_table().record(new["id"]).name == "odd"
+    shown, kept = model.gaussians().means.numpy(), saved.gaussians().means.numpy()
+    distance = cKDTree(shown).query(kept)[0]
+    assert distance.max() < 1e-4 and 0 <= len(shown) - len(kept) < 0.01 * count  # traces of the object go, too
     assert len(saved.mark().edits) == 5
 
 
@@ -146,7 +149,8 @@ def test_a_crop_keeps_what_lies_in_the_box(served: tuple[PageServer, ViewedRun])
 
 
 WRONG: tuple[tuple[str, Any, str], ...] = (
-    ("edit", {}, "selection: expected"), ("edit", {"kind": "x", "selection": objects(1)}, "edit: expected"), ("edit", {"kind": "remove"}, "selection"), ("edit", [], "expected an object"),
+    ("edit", {}, "selection: expected"),
+    ("edit", {"kind": "x", "selection": objects(1)}, "edit: expected"), ("edit", {"kind": "remove"}, "selection"), ("edit", [], "expected an object"),
     ("edit", {"kind": "remove", "selection": sphere([99, 99, 99], 0.1)}, "nothing is selected"),
     ("edit", {"kind": "remove", "selection": [{"mode": "set", "shape": {"kind": "all"}}]}, "all of the map"),
     ("edit", {"kind": "rename", "object": 1}, "name: expected a text"),
