@@ -150,7 +150,8 @@ def test_a_crop_keeps_what_lies_in_the_box(served: tuple[PageServer, ViewedRun])
 
 WRONG: tuple[tuple[str, Any, str], ...] = (
     ("edit", {}, "selection: expected"),
-    ("edit", {"kind": "x", "selection": objects(1)}, "edit: expected"), ("edit", {"kind": "remove"}, "selection"), ("edit", [], "expected an object"),
+    ("edit", {"kind": "x", "selection": objects(1)}, "edit: expected"), ("edit", {"kind": "remove"}, "selection"),
+    ("edit", [], "expected an object"),
     ("edit", {"kind": "remove", "selection": sphere([99, 99, 99], 0.1)}, "nothing is selected"),
     ("edit", {"kind": "remove", "selection": [{"mode": "set", "shape": {"kind": "all"}}]}, "all of the map"),
     ("edit", {"kind": "rename", "object": 1}, "name: expected a text"),
