@@ -189,6 +189,20 @@ def test_nothing_is_drawn_before_the_order_or_while_nothing_changes(browser: Any
     assert seen[-1] == [True, True] and all(complete == bright for complete, bright in seen)
 
 
+def test_the_processor_goes_on_where_the_gpu_is_lost(
+    browser: Any, page: Path, gaussians: GaussianMap, poses: list[np.ndarray]
+) -> None:
+    m.open_map(browser, page, "webgl")
+    lost = """const count = map.chunks.get("even").count;
+      map.setMarks("even", new Uint8Array(count).fill(2));
+      map.renderer.gl.getExtension("WEBGL_lose_context").loseContext();
+      while (map.mode === "webgl") await new Promise((resolve) => setTimeout(resolve, 20));
+      return document.querySelectorAll("canvas").length"""
+    assert m.ask(browser, lost) == 2
+    assert decibels(m.picture(browser), expected(gaussians, poses[0], np.arange(1, len(gaussians), 2))) > 45
+    browser.get_log("browser")  # a lost context is told there
+
+
 def test_what_nobody_saw_fades(
     browser: Any, run: RunFolder, gaussians: GaussianMap, poses: list[np.ndarray], tmp_path: Path
 ) -> None:

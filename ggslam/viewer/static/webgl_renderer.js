@@ -18,6 +18,7 @@ class WebglRenderer {
     this.mode = "webgl";
     this.onchange = () => {};
     this.onframe = () => {};
+    canvas.addEventListener("webglcontextlost", () => this.onlost());
     this.least = 0.3;
     this.most = 1.5; // pixels per CSS pixel
     this.slots = new Map();
