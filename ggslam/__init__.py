@@ -48,6 +48,8 @@ if _TYPE_CHECKING:
     from ggslam.jobs.localize.localize_recording import localize_recording as localize_recording
     from ggslam.jobs.merge.merge import merge_runs as merge_runs
     from ggslam.jobs.refine.refine_run import refine_run as refine_run
+    from ggslam.jobs.render.film import render_film as render_film
+    from ggslam.jobs.render.plan import render_plan as render_plan
     from ggslam.jobs.render.render_run import render_run as render_run
     from ggslam.jobs.run.evaluate_run import evaluate_run as evaluate_run
     from ggslam.jobs.run.pipeline import RunOutcome as RunOutcome
@@ -67,6 +69,8 @@ if _TYPE_CHECKING:
     from ggslam.runs.opened_points import surface_points as surface_points
     from ggslam.runs.saving import save_run as save_run
     from ggslam.scene.camera import Camera as Camera
+    from ggslam.scene.camera_models import DistortedCamera as DistortedCamera
+    from ggslam.scene.camera_models import OrthographicCamera as OrthographicCamera
     from ggslam.scene.frame import Frame as Frame
     from ggslam.scene.gaussian_map import GaussianMap as GaussianMap
     from ggslam.sequences import Sequence as Sequence
@@ -124,6 +128,8 @@ _HOMES = {
     "ggslam.jobs.refine.refine_run": ("refine_run",),
     "ggslam.jobs.update.update": ("update_run",),
     "ggslam.jobs.volumes.fuse_volumes": ("fuse_volumes",),
+    "ggslam.jobs.render.film": ("render_film",),
+    "ggslam.jobs.render.plan": ("render_plan",),
     "ggslam.jobs.render.render_run": ("render_run",),
     "ggslam.jobs.run.pipeline": ("RunOutcome",),
     "ggslam.jobs.run.run_recording": ("run_recording",),
@@ -142,6 +148,7 @@ _HOMES = {
     "ggslam.runs.folder": ("RunFolder",),
     "ggslam.runs.saving": ("save_run",),
     "ggslam.scene.camera": ("Camera",),
+    "ggslam.scene.camera_models": ("DistortedCamera", "OrthographicCamera"),
     "ggslam.scene.frame": ("Frame",),
     "ggslam.scene.gaussian_map": ("GaussianMap",),
     "ggslam.sequences": ("Sequence", "collate_frames", "open_sequence"),

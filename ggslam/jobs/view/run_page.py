@@ -107,8 +107,9 @@ class RunPage:
             own = {"undo": self.model.undo, "redo": self.model.redo}.get(action)
             text = self._actions.edit(values) if own is None else own()
             self._version += 1
-        self._tell("scene", "splats", version=self._version)
-        return {"text": text, **self._state()}
+            state = self._state()
+        self._tell("scene", "splats", version=state["version"])
+        return {"text": text, **state}
 
     # --- what is kept beside the run ----------------------------------------------------------------------------------
 
