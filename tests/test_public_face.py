@@ -24,7 +24,8 @@ NAMES = """
     identity_loss load_config neighbour_loss objects_at open_sequence read_gaussian_ply read_point_cloud read_splats
     read_trajectory render render_run run_recording sample_points save_run score_cloud score_image
     score_trajectory surface_points write_gaussian_ply write_point_cloud write_synthetic_sequence write_tum
-    DistortedCamera OrthographicCamera render_film render_plan compare_maps find_changes fuse_volumes localize_recording merge_runs refine_run update_run
+    DistortedCamera OrthographicCamera render_film render_plan
+    compare_maps find_changes fuse_volumes localize_recording merge_runs refine_run update_run
 """
 PUBLIC = NAMES.split()
 
