@@ -10,7 +10,12 @@ function cameraAt(keys, time) {
   const a = keys[k];
   const b = keys[Math.min(k + 1, keys.length - 1)];
   const share = b === a ? 0 : clamp((time - a.time) / (b.time - a.time), 0, 1);
-  const curve = (name) => curvePoint(keys.map((key) => key[name]), k, share);
+  const curve = (name) =>
+    curvePoint(
+      keys.map((key) => key[name]),
+      k,
+      share,
+    );
   return {
     time,
     position: curve("position"),
@@ -91,7 +96,10 @@ class Film {
   swap(k, other) {
     const { keys } = this;
     if (!keys[k] || !keys[other]) return;
-    [keys[k], keys[other]] = [{ ...keys[other], time: keys[k].time }, { ...keys[k], time: keys[other].time }];
+    [keys[k], keys[other]] = [
+      { ...keys[other], time: keys[k].time },
+      { ...keys[k], time: keys[other].time },
+    ];
     this.changed();
   }
 

@@ -17,6 +17,7 @@ const KEYS = [
   ["W A S D, Q E, arrows", "fly; with Shift faster; left and right arrows turn"],
   ["1 to 9", "tools: look, box, lasso, brush, sphere, crop, move, measure, note"],
   ["Shift, Alt, Ctrl + click", "add to the selection, take from it, keep what is in both"],
+  ["Enter", "on the map: the tool works in the middle of the view"],
   ["Space + drag", "turn while a tool is chosen"],
   ["Ctrl+A, Ctrl+I, Escape", "select all, invert, nothing"],
   ["H, U", "hide the selected objects, show all"],
@@ -68,6 +69,7 @@ function startKeyboard(viewer) {
     i: () => viewer.invert(),
   };
   addEventListener("keydown", (event) => {
+    if (typing(event) && event.key === "Escape") event.target.blur();
     if (typing(event) || document.querySelector("dialog[open]")) return;
     const run =
       event.ctrlKey || event.metaKey
@@ -80,6 +82,11 @@ function startKeyboard(viewer) {
       return;
     }
     if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.key === "Enter" && document.activeElement === viewer.canvas) {
+      viewer.tools.useMiddle(event);
+      event.preventDefault();
+      return;
+    }
     if (event.code === "Space" && onMap) {
       viewer.spaceDown = true;
       event.preventDefault();

@@ -3,7 +3,7 @@
 
 const rounded = (numbers) => numbers.map((value) => +value.toFixed(4)).join(",");
 
-// state: {position, look_at, up, near, coloring, hidden: [ids], selected: [ids], frame} as the part after #.
+// state: {position, look_at, up, near, coloring, hidden: [ids], selected: [ids], tool, frame} as the part after #.
 function addressOf(state) {
   const parts = [
     ["p", rounded(state.position)],
@@ -14,6 +14,7 @@ function addressOf(state) {
   if (state.coloring !== "colour") parts.push(["c", state.coloring]);
   if (state.hidden.length) parts.push(["h", rangesOf(state.hidden)]);
   if (state.selected.length) parts.push(["s", rangesOf(state.selected)]);
+  if (state.tool !== "look") parts.push(["m", state.tool]);
   if (state.frame) parts.push(["f", String(state.frame)]);
   return new URLSearchParams(parts).toString();
 }
@@ -39,6 +40,7 @@ function stateOf(address) {
     coloring: given.get("c") || "colour",
     hidden: idsOf(given.get("h")),
     selected: idsOf(given.get("s")),
+    tool: given.get("m") || "look",
     frame: Number.isInteger(frame) && frame > 0 ? frame : 0,
   };
 }

@@ -19,6 +19,15 @@ function part(viewer, title, open, ...content) {
   return whole;
 }
 
+// Shows a piece of the panel while it is needed.
+function reveal(piece, needed) {
+  const was = piece.hidden;
+  piece.hidden = !needed;
+  if (!needed || !was) return;
+  piece.closest("details").open = true;
+  piece.scrollIntoView({ block: "nearest" });
+}
+
 function viewPanel(viewer) {
   const coloring = make("select", { id: "coloring", onchange: () => viewer.color(coloring.value) }),
     places = row(make("span", { className: "name", textContent: "Camera" }));
@@ -55,6 +64,11 @@ function viewPanel(viewer) {
     places.replaceChildren(
       places.firstChild,
       ...Object.entries(viewer.scene.views).map(([name, view]) => button(name, () => viewer.camera.glide(view))),
+      viewer.scene.frames.length
+        ? button("Frame", () => viewer.camera.glide(viewer.scene.frames[viewer.frame].view), {
+            title: "From where the frame was taken",
+          })
+        : "",
       button("Selected", () => viewer.lookAtSelected(), { title: "What is selected (F)" }),
     );
     following.hidden = !viewer.scene.live;
@@ -254,7 +268,10 @@ function selectionPanel(viewer) {
     ),
     row(color, recolor, name, rename, assign),
     row(give, whose),
-    row(button("Save selection", () => viewer.saveSelection(), { title: "For `ggslam edit --remove @FILE`" })),
+    row(
+      button("Export PLY", () => viewer.exportObject(), { id: "do-export", title: "The object's Gaussians as a file" }),
+      button("Save selection", () => viewer.saveSelection(), { title: "For `ggslam edit --remove @FILE`" }),
+    ),
     movePanel(viewer),
     cropPanel(viewer),
   );
@@ -264,7 +281,7 @@ function selectionPanel(viewer) {
       box = total ? boxOfSelected(viewer) : null,
       one = objects.length === 1 && viewer.objectOf(objects[0]);
     whole.count(total ? total.toLocaleString() : "");
-    const size = one ? one.size : box?.size;
+    const size = one ? one.size : box?.size || [0, 0, 0];
     told.textContent = total
       ? `${one ? `${one.id} · ${one.name || "object"}: ` : ""}${total.toLocaleString()} Gaussians, box ${size.map(metres).join(" × ")}`
       : "nothing is selected";
@@ -272,6 +289,7 @@ function selectionPanel(viewer) {
     remove.disabled = !total || !viewer.edits.can("remove");
     keep.disabled = !total || !viewer.edits.can("keep");
     recolor.disabled = assign.disabled = give.disabled = !total || !viewer.edits.can("recolor");
+    document.getElementById("do-export").disabled = !one || !viewer.source.served;
     rename.disabled = !one || !viewer.edits.can("rename");
     if (one && document.activeElement !== name) name.value = one.name || "";
     whose.replaceChildren(
@@ -291,6 +309,7 @@ function movePanel(viewer) {
       value: 0,
       "aria-label": `Move: ${words}`,
       title: words,
+      className: "axis",
     }),
   );
   const tool = () => viewer.tools.tools.get("move").tool,
@@ -308,10 +327,11 @@ function movePanel(viewer) {
   });
   const update = () => {
     const numbers = viewer.tools.name === "move" && tool().numbers();
-    whole.hidden = !numbers;
+    reveal(whole, numbers);
     if (numbers)
       numbers.forEach((value, k) => {
-        if (document.activeElement !== inputs[k]) inputs[k].value = value.toFixed(k === 3 ? 1 : 3);
+        if (document.activeElement !== inputs[k])
+          inputs[k].value = value.toFixed(k === 3 ? 1 : 3).replace(/^-(0\.0+)$/, "$1");
       });
   };
   viewer.on("moved", update);
@@ -322,9 +342,15 @@ function movePanel(viewer) {
 function cropPanel(viewer) {
   const tool = () => viewer.tools.tools.get("crop").tool,
     sizes = [0, 1, 2].map((k) =>
-      make("input", { type: "number", step: 0.05, min: 0.02, "aria-label": `Crop: size ${k + 1}` }),
+      make("input", { type: "number", step: 0.05, min: 0.02, className: "axis", "aria-label": `Crop: size ${k + 1}` }),
     );
-  const yaw = make("input", { type: "number", step: 5, value: 0, "aria-label": "Crop: turn in degrees" }),
+  const yaw = make("input", {
+      type: "number",
+      step: 5,
+      value: 0,
+      className: "axis",
+      "aria-label": "Crop: turn in degrees",
+    }),
     whole = make(
       "div",
       { id: "cropping", hidden: true },
@@ -350,7 +376,8 @@ function cropPanel(viewer) {
   yaw.onchange = () => tool().setYaw(Number(yaw.value) || 0);
   const update = () => {
     const box = viewer.tools.name === "crop" && tool().box;
-    whole.hidden = !box;
+    reveal(whole, box);
+    if (box && document.activeElement !== yaw) yaw.value = tool().yaw;
     if (box)
       box.size.forEach((value, k) => {
         if (document.activeElement !== sizes[k]) sizes[k].value = value.toFixed(3);
@@ -401,6 +428,14 @@ function notePanel(viewer) {
         ),
       ),
     );
+  viewer.on("searched", () => {
+    const words = viewer.objectList.search.value.trim().toLowerCase().split(/\s+/);
+    [...list.children].forEach((item, k) => {
+      const text = (viewer.notes.list[k]?.text || "").toLowerCase();
+      item.hidden = !words.every((word) => text.includes(word));
+      if (words[0] && !item.hidden) whole.open = true;
+    });
+  });
   viewer.on("notes", () => {
     whole.count(viewer.notes.list.length ? String(viewer.notes.list.length) : "");
     list.replaceChildren(
@@ -539,6 +574,7 @@ function filmPanel(viewer) {
 }
 
 function editPanel(viewer) {
+  const progress = make("progress", { hidden: true, "aria-label": "saving" });
   const list = make("ol", { id: "edits" }),
     target = make("input", { type: "text", id: "target", value: viewer.scene.target || "", maxLength: 200 }),
     inpaint = make("input", { type: "checkbox", id: "inpaint" });
@@ -557,7 +593,7 @@ function editPanel(viewer) {
       inpaint,
       make("span", { className: "soft", textContent: "close those that objects leave" }),
     ),
-    row(save),
+    row(save, progress),
   );
   const other = make("p", { textContent: "`ggslam view RUN` serves a page that moves, recolours and saves, too." }),
     whole = part(viewer, "Edits", false, list, row(undo, redo), saving, other);
@@ -569,6 +605,7 @@ function editPanel(viewer) {
     undo.disabled = !texts.length;
     redo.disabled = !redoCount;
     save.disabled = !texts.length || viewer.saving;
+    progress.hidden = !viewer.saving;
     saving.hidden = !viewer.scene.editable;
     other.hidden = !!viewer.source.served;
     whole.count(texts.length ? String(texts.length) : "");

@@ -15,9 +15,12 @@ function make(name, attributes = {}, ...content) {
 }
 
 function draw(name, attributes = {}) {
-  const made = document.createElementNS(SVG, name);
-  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-  return made;
+  return setAttributes(document.createElementNS(SVG, name), attributes);
+}
+
+function setAttributes(element, attributes) {
+  for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+  return element;
 }
 
 const ICONS = {

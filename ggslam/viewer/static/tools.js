@@ -18,6 +18,9 @@ class Tool {
   up() {}
   click() {}
   redraw() {}
+  cancel() {
+    this.stop(); // what is being drawn
+  }
   escape() {
     return false;
   }
@@ -222,7 +225,9 @@ class ToolBar {
     camera.taken = (event) => this.take(event);
     camera.onclick = (x, y, event) => this.current.click(x, y, event);
     canvas.addEventListener("pointermove", (event) => {
-      if (event.pointerId === this.stroke) this.current.move(event.offsetX, event.offsetY, event);
+      if (event.pointerId !== this.stroke) return;
+      this.pressed = [event.clientX, event.clientY];
+      this.current.move(event.offsetX, event.offsetY, event);
     });
     for (const name of ["pointerup", "pointercancel"])
       canvas.addEventListener(name, (event) => {
@@ -234,8 +239,10 @@ class ToolBar {
   }
 
   take(event) {
+    if (this.stroke !== null && event.pointerType === "touch") return this.giveBack();
     if (this.stroke !== null || !this.current.wants(event)) return this.stroke !== null;
     this.stroke = event.pointerId;
+    this.pressed = [event.clientX, event.clientY];
     try {
       this.viewer.canvas.setPointerCapture(event.pointerId);
     } catch {
@@ -243,6 +250,23 @@ class ToolBar {
     }
     this.current.down(event.offsetX, event.offsetY, event);
     return true;
+  }
+
+  // A second finger has come: both are for the camera, and nothing is drawn.
+  giveBack() {
+    this.viewer.camera.pointers.set(this.stroke, this.pressed);
+    this.stroke = null;
+    this.current.cancel();
+    return false;
+  }
+
+  // What a press in the middle of the view does, for people without a pointer.
+  useMiddle(event) {
+    const { clientWidth, clientHeight } = this.viewer.canvas;
+    const at = [Math.round(clientWidth / 2), Math.round(clientHeight / 2), event];
+    if (!this.current.wants({ button: 0 })) return this.current.click(...at);
+    this.current.down(...at);
+    return this.current.up(...at);
   }
 
   // name, tool, words for people, key.
@@ -273,6 +297,7 @@ class ToolBar {
     this.viewer.space.classList.toggle("drawing", !["look"].includes(name));
     this.current.start();
     this.viewer.emit("tool");
+    this.viewer.remember();
   }
 
   byKey(key) {
