@@ -17,15 +17,15 @@ import ggslam
 
 ROOT = Path(__file__).parents[1]
 NAMES = """
-    Camera CodecSettings Config ConfigError DistanceField Edit FormatError Frame GaussianMap GaussianModel
-    GgslamError InputError LiveSequence MissingDependency ObjectTable OccupancyMap RenderBuffers RenderError
-    RunFolder RunFolderError RunOutcome SegmentationCounts Sequence SequenceError Slam SlamResult StepReport Trajectory
-    TsdfMap collate_frames color_loss decode_cloud depth_loss edit_run encode_cloud evaluate_run export_run
-    identity_loss load_config neighbour_loss objects_at open_sequence read_gaussian_ply read_point_cloud read_splats
-    read_trajectory render render_run run_recording sample_points save_run score_cloud score_image
-    score_trajectory surface_points write_gaussian_ply write_point_cloud write_synthetic_sequence write_tum
-    DistortedCamera OrthographicCamera render_film render_plan
-    compare_maps find_changes fuse_volumes localize_recording merge_runs refine_run update_run
+    Camera CodecSettings Config ConfigError DistanceField DistortedCamera Edit FormatError Frame GaussianMap
+    GaussianModel GgslamError InputError LiveSequence MissingDependency ObjectTable OccupancyMap OrthographicCamera
+    RenderBuffers RenderError RunFolder RunFolderError RunOutcome SegmentationCounts Sequence SequenceError Slam
+    SlamResult StepReport Trajectory TsdfMap collate_frames color_loss compare_maps decode_cloud depth_loss edit_run
+    encode_cloud evaluate_run export_run find_changes fuse_volumes identity_loss load_config localize_recording
+    merge_runs neighbour_loss objects_at open_sequence read_gaussian_ply read_point_cloud read_splats
+    read_trajectory refine_run render render_film render_plan render_run run_recording sample_points save_run
+    score_cloud score_image score_trajectory surface_points update_run write_gaussian_ply write_point_cloud
+    write_synthetic_sequence write_tum
 """
 PUBLIC = NAMES.split()
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import logging
 from http.server import BaseHTTPRequestHandler
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 from urllib.parse import parse_qs, quote, urlsplit
 
 from ggslam.errors import GgslamError
@@ -15,9 +15,6 @@ from ggslam.system.tuning import Tuning
 from ggslam.viewer.access import AccessTuning, MalformedRequest
 from ggslam.viewer.page_source import Download
 from ggslam.viewer.page_text import SERVED_POLICY, served_page
-
-if TYPE_CHECKING:
-    from ggslam.viewer.page_server import HttpServer
 
 
 class RequestTuning(Tuning):
@@ -52,22 +49,23 @@ class _Once:
 class PageRequests(BaseHTTPRequestHandler):
     """Answers the requests of one connection."""
 
-    server: HttpServer
+    server: Any
+    """The `page_server.HttpServer` that it belongs to."""
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "ggslam", ""
     timeout = RequestTuning.timeout_s
 
     def do_GET(self) -> None:
         """Page, scene, splats, pictures, events."""
-        self._guarded(self._get)
+        self._through_gate(self._get)
 
     def do_POST(self) -> None:
         """Edits and what needs more words than an address has."""
-        self._guarded(self._post)
+        self._through_gate(self._post)
 
     do_PUT = do_POST
 
-    def _guarded(self, answer: Any) -> None:
+    def _through_gate(self, answer: Any) -> None:
         """Answers if the gate lets the request in."""
         try:
             reason = self.server.gate.reason_to_refuse(self.path, _Once(self.headers))

@@ -27,7 +27,7 @@ const camera = {{ pose: {pose}, near: 0.05, pixels: {focal}, view() {{ return Fl
   focal(width) {{ return this.pixels * width / {width}; }} }};
 const map = new MapView(document.getElementById("top"), camera, {{ background: [0, 0, 0] }});
 const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
-(async () => {{
+const loaded = (async () => {{
   for (const [id, header, packed] of {chunks}) map.setChunk(id, await unpackSplats(bytes(packed), header));
 }})();
 </script>"""
@@ -67,7 +67,7 @@ def write_map_page(
 def open_map(browser: Any, page: Path, renderer: str) -> None:
     """Opens it and waits until the map is shown."""
     browser.get(f"{page.as_uri()}?renderer={renderer}")
-    assert ask(browser, "await map.ready; return map.mode") == renderer
+    assert ask(browser, "await loaded; await map.ready; return map.mode") == renderer
 
 
 def ask(browser: Any, code: str, *values: Any) -> Any:

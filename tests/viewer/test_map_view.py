@@ -24,7 +24,7 @@ from . import browser as b
 from . import map_page as m
 
 pytestmark = pytest.mark.browser
-SIZE, FOCAL = (480, 360), 400.0
+SIZE, FOCAL = (320, 240), 270.0
 CAMERA = Camera(*SIZE, FOCAL, FOCAL, SIZE[0] / 2 - 0.5, SIZE[1] / 2 - 0.5)
 
 
@@ -101,7 +101,7 @@ def test_what_is_picked_is_there(
     m.open_map(browser, page, "processor")
     frame = next(iter(run.keyframes().poses()))
     recorded, camera = open_recording_of(run).frame(frame).depth, run.sequence().camera_of(frame)
-    places = [[x, y] for x in range(20, SIZE[0], 40) for y in range(20, SIZE[1], 40)]
+    places = [[x, y] for x in range(15, SIZE[0], 30) for y in range(15, SIZE[1], 30)]
     found = m.ask(browser, "return values[0].map(([x, y]) => map.pick(x, y))", places)
     rasterizer = CpuRasterizer()
     view = rasterizer.forward(gaussians, CAMERA, inverse(poses[0]), features=False)
@@ -119,10 +119,9 @@ def test_what_is_picked_is_there(
             errors.append(abs(hit["depth"] - recorded[row, column]))
     assert len(errors) > 60 and np.median(errors) < 0.02
     assert np.mean(same) > 0.95
-    assert (
-        m.ask(browser, "map.setObject(values[0].id, { visible: false }); return map.pick(240, 180)?.id", found[0])
-        != (found[0]["id"])
-    )
+    hide = "const { id } = map.pick(160, 120); map.setObject(id, { visible: false }); return [id, map.pick(160, 120)]"
+    hidden, behind = m.ask(browser, hide)
+    assert hidden > 0 and (behind is None or behind["id"] != hidden)
 
 
 def test_depth_images_are_those_of_the_rasterizer(
@@ -190,6 +189,20 @@ def test_nothing_is_drawn_before_the_order_or_while_nothing_changes(browser: Any
     assert seen[-1] == [True, True] and all(complete == bright for complete, bright in seen)
 
 
+def test_the_processor_goes_on_where_the_gpu_is_lost(
+    browser: Any, page: Path, gaussians: GaussianMap, poses: list[np.ndarray]
+) -> None:
+    m.open_map(browser, page, "webgl")
+    lost = """const count = map.chunks.get("even").count;
+      map.setMarks("even", new Uint8Array(count).fill(2));
+      map.renderer.gl.getExtension("WEBGL_lose_context").loseContext();
+      while (map.mode === "webgl") await new Promise((resolve) => setTimeout(resolve, 20));
+      return document.querySelectorAll("canvas").length"""
+    assert m.ask(browser, lost) == 2
+    assert decibels(m.picture(browser), expected(gaussians, poses[0], np.arange(1, len(gaussians), 2))) > 45
+    browser.get_log("browser")  # a lost context is told there
+
+
 def test_what_nobody_saw_fades(
     browser: Any, run: RunFolder, gaussians: GaussianMap, poses: list[np.ndarray], tmp_path: Path
 ) -> None:
@@ -210,7 +223,7 @@ def test_what_nobody_saw_fades(
             m.look_from(browser, pose)
             found.append(m.picture(browser))
             if pose is behind:
-                places = [[x, y] for x in range(40, SIZE[0], 80) for y in range(40, SIZE[1], 80)]
+                places = [[x, y] for x in range(30, SIZE[0], 60) for y in range(30, SIZE[1], 60)]
                 picked = m.ask(browser, "return values[0].map(([x, y]) => map.pick(x, y) !== null)", places)
         assert decibels(found[0], expected(gaussians, poses[0])) > 45
         whole = expected(gaussians, behind).image.numpy()

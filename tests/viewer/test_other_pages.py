@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 
 from ggslam.viewer.access import Gate
-from ggslam.viewer.server import address, close_server, open_server
+from ggslam.viewer.page_server import PageServer
 
 from . import browser as b
 
-pytest.importorskip("viser")
 pytestmark = pytest.mark.browser
 BENT_NAME = "attacker.example"
 """A name of somebody else's that the browser finds at this machine."""
@@ -23,9 +22,8 @@ PAGE = """<!doctype html><title>other</title><body><script>
 const target = "http://localhost:PORT/", said = window.said = {};
 function note(name, promise) { promise.then((ok) => said[name] = ok, (error) => said[name] = "refused"); }
 note("socket", new Promise((yes, no) => {
-  const socket = new WebSocket("ws://localhost:PORT/");
-  socket.binaryType = "arraybuffer";
-  socket.onopen = () => yes("open"); socket.onmessage = () => yes("message"); socket.onerror = no;
+  const events = new EventSource("http://localhost:PORT/events", { withCredentials: true });
+  events.onopen = () => yes("open"); events.onmessage = () => yes("message"); events.onerror = no;
 }));
 note("fetch", fetch(target, { credentials: "include" }).then((answer) => answer.text()));
 note("post", fetch(target, { method: "POST", credentials: "include", body: "x" }).then((answer) => answer.text()));
@@ -55,9 +53,9 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def server() -> Iterator[Any]:
-    opened = open_server(port=0, title="my map")
+    opened = PageServer(port=0, title="my map")
     yield opened
-    close_server(opened)
+    opened.close()
 
 
 @pytest.fixture
@@ -69,7 +67,7 @@ def other_port(server: Any) -> Iterator[int]:
             self.send_response(200)
             self.send_header("Content-Type", "text/html")
             self.end_headers()
-            self.wfile.write(PAGE.replace("PORT", str(server.get_port())).encode())
+            self.wfile.write(PAGE.replace("PORT", str(server.port)).encode())
 
         def log_message(self, *arguments: object) -> None:
             pass
@@ -86,9 +84,8 @@ def other_port(server: Any) -> Iterator[int]:
 def test_a_page_of_another_origin_gets_nothing(
     browser: Any, server: Any, other_port: int, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    browser.get(address(server))  # the cookie is in the browser from now on
-    b.wait_for(lambda: server.get_clients())
-    own = set(server.get_clients())
+    browser.get(server.address)  # the cookie is in the browser from now on
+    b.wait_for(lambda: server.watchers)
     judged: list[str | None] = []
     real = Gate.reason_to_refuse
 
@@ -102,12 +99,11 @@ def test_a_page_of_another_origin_gets_nothing(
         "return window.said"))  # fmt: skip
     assert {said[what] for what in ("socket", "fetch", "post", "image")} == {"refused"}, said
     assert len(judged) >= 5 and all(judged), judged  # what a page cannot see of an answer was refused as well
-    assert set(server.get_clients()) <= own
-    browser.get(f"http://localhost:{server.get_port()}/")  # and its own page still opens
-    b.wait_for(lambda: set(server.get_clients()) - own)
+    browser.get(f"http://localhost:{server.port}/")  # and its own page still opens
+    b.wait_for(lambda: "my map" in b.said(browser))
 
 
 def test_a_bent_name_shows_nothing(browser: Any, server: Any) -> None:
-    browser.get(address(server).replace("localhost", BENT_NAME))
+    browser.get(server.address.replace("localhost", BENT_NAME))
     assert "403: open the address that ggslam printed" in b.said(browser)
-    assert not server.get_clients() and not browser.get_cookies()
+    assert not server.watchers and not browser.get_cookies()

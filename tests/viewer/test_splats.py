@@ -5,8 +5,7 @@ import numpy as np
 import torch
 
 from ggslam.rendering.types import GaussianTensors
-from ggslam.scene.poses import quaternion_to_matrix
-from ggslam.viewer.splats import most_visible, splats_of
+from ggslam.viewer.splats import most_visible
 
 
 def some(count: int, seed: int = 0) -> GaussianTensors:
@@ -19,23 +18,6 @@ def some(count: int, seed: int = 0) -> GaussianTensors:
     return GaussianTensors(
         tensor(count, 3), tensor(count, 4), scales, tensor(count), tensor(count, 1, 3), tensor(count, 0)
     )
-
-
-def test_covariances_are_those_of_the_gaussians() -> None:
-    gaussians = some(20)
-    splats = splats_of(gaussians)
-    for row in range(20):
-        R = quaternion_to_matrix(gaussians.quaternions[row].double().numpy())
-        expected = R @ np.diag(np.exp(2 * gaussians.log_scales[row].double().numpy())) @ R.T
-        assert np.allclose(splats.covariances[row], expected, rtol=1e-4, atol=1e-9)
-    assert np.allclose(splats.opacities, torch.sigmoid(gaussians.opacity_logits).numpy(), atol=1e-6)
-    expected_colors = np.clip(0.5 + 0.28209479177387814 * gaussians.sh[:, 0].numpy(), 0, 1) * 255
-    assert np.abs(splats.colors - expected_colors).max() <= 0.5 + 1e-3
-
-
-def test_rows_are_taken_in_their_order() -> None:
-    gaussians, index = some(9), np.array([7, 2, 5])
-    assert np.array_equal(splats_of(gaussians, index).centers, splats_of(gaussians).centers[index])
 
 
 def test_the_most_visible_are_kept() -> None:

@@ -39,7 +39,8 @@ def test_packed_splats_are_near_the_map() -> None:
 
 def test_the_program_of_the_page_names_no_address() -> None:
     for path in STATIC.iterdir():
-        assert not re.search(r"https?://|wss?://|\bimport\b|@import", path.read_text()), path
+        text = path.read_text().replace("http://www.w3.org/2000/svg", "")  # a name, which nothing is fetched from
+        assert not re.search(r"https?://|wss?://|\bimport\b|@import|innerHTML|outerHTML|insertAdjacentHTML", text), path
 
 
 def test_the_command_writes_a_page(run: RunFolder, tmp_path: Path) -> None:
@@ -47,7 +48,7 @@ def test_the_command_writes_a_page(run: RunFolder, tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["view", str(run.path), "--html", str(path), "--max-splats", "2000"])
     assert result.exit_code == 0 and "MB" in result.output, result.output
     text = path.read_text()
-    assert "@SPLATS@" not in text and "http://" not in text and "https://" not in text
+    assert "@SPLATS@" not in text and not re.search(r"https?://(?!www.w3.org/2000/svg)", text)
     scene = json.loads(re.search(r'id="scene">(.*?)</script>', text, re.S).group(1))  # type: ignore[union-attr]
-    assert scene["count"] == 2000 and len(scene["objects"]) == len(run.object_table())
-    assert len(scene["frames"]) == len(run.keyframes().poses()) and set(scene["views"]) == {"Start", "Top"}
+    assert scene["splats"]["count"] == 2000 and len(scene["objects"]) == len(run.object_table())
+    assert len(scene["frames"]) == min(24, len(run.keyframes().poses())) and set(scene["views"]) == {"Start", "Top"}

@@ -5,31 +5,55 @@ class PainterPool {
   constructor(workers = Math.max(1, Math.min(8, navigator.hardwareConcurrency || 2))) {
     this.workers = Array.from({ length: workers }, () => {
       const worker = startWorker(
-        paintInWorker, `const TILE = ${TILE}, FALL_STEPS = ${FALL_STEPS}; const SEEN_RULES = ${JSON.stringify(SEEN_RULES)}; const LOGARITHMS = Float64Array.from({ length: 256 }, (_, k) => k ? Math.log(k) : -1);`,
-        SplatProjector, TilePainter, isDisplaced, multiply, rowsOf, countingSort, ellipseEdge, SeenShapes, octahedralDirections, eyeOf);
+        paintInWorker,
+        { TILE, FALL_STEPS, SEEN_RULES },
+        SplatProjector,
+        TilePainter,
+        isDisplaced,
+        multiply,
+        rowsOf,
+        countingSort,
+        ellipseEdge,
+        SeenShapes,
+        octahedralDirections,
+        eyeOf,
+      );
       worker.onmessage = (event) => this.take(event.data);
       return worker;
     });
     this.shares = this.workers.map((_, i) => (i + 1) / workers); // where bands end
-    this.serial = 0; this.jobs = new Map();
+    this.serial = 0;
+    this.jobs = new Map();
   }
 
-  tell(name, ...values) { for (const worker of this.workers) worker.postMessage({ [name]: values }); }
+  tell(name, ...values) {
+    for (const worker of this.workers) worker.postMessage({ [name]: values });
+  }
 
   addChunk(chunk, splats) {
     const { count, centers, covariances, alphas, ids, rgb, seen } = splats;
     this.tell("addChunk", chunk, { count, centers, covariances, alphas, ids, rgb, seen, radius: radii(splats) });
   }
 
-  removeChunk(chunk) { this.tell("removeChunk", chunk); }
+  removeChunk(chunk) {
+    this.tell("removeChunk", chunk);
+  }
 
-  setColors(chunk, rgb) { this.tell("setColors", chunk, rgb); }
+  setColors(chunk, rgb) {
+    this.tell("setColors", chunk, rgb);
+  }
 
-  setMarks(chunk, bytes) { this.tell("setMarks", chunk, bytes); }
+  setMarks(chunk, bytes) {
+    this.tell("setMarks", chunk, bytes);
+  }
 
-  setStates(states) { this.tell("setStates", states); }
+  setStates(states) {
+    this.tell("setStates", states);
+  }
 
-  displace(displacement) { this.tell("displace", displacement); }
+  displace(displacement) {
+    this.tell("displace", displacement);
+  }
 
   // Paints; onstrip({top, bottom, values}) for each part that is ready. The promise is true when all are, false if a
   // later job came before.
@@ -37,14 +61,19 @@ class PainterPool {
     for (const job of this.jobs.values()) job.resolve(false);
     this.jobs.clear();
     const least = shot.sharp ? SPLAT_RULES.minTransmittance : SPLAT_RULES.movingMinTransmittance;
-    const serial = ++this.serial, rows = Math.ceil(shot.height / TILE), ends = this.shares.map((share) => Math.round(share * rows));
+    const serial = ++this.serial,
+      rows = Math.ceil(shot.height / TILE),
+      ends = this.shares.map((share) => Math.round(share * rows));
     return new Promise((resolve) => {
-      let left = 0, from = 0;
+      let left = 0,
+        from = 0;
       ends.forEach((end, i) => {
-        const top = from * TILE, bottom = Math.min(shot.height, end * TILE);
+        const top = from * TILE,
+          bottom = Math.min(shot.height, end * TILE);
         from = Math.max(from, end);
         if (bottom <= top) return;
-        left++; this.workers[i].postMessage({ job: [{ serial, shot, top, bottom, strips, kind, least }] });
+        left++;
+        this.workers[i].postMessage({ job: [{ serial, shot, top, bottom, strips, kind, least }] });
       });
       this.jobs.set(serial, { left, onstrip, resolve, times: [], drawn: 0 });
     });
@@ -55,9 +84,13 @@ class PainterPool {
     if (!job) return;
     job.onstrip(strip);
     if (!strip.last) return;
-    job.times.push([strip.bottom, strip.milliseconds]); job.drawn += strip.drawn;
+    job.times.push([strip.bottom, strip.milliseconds]);
+    job.drawn += strip.drawn;
     if (--job.left) return;
-    this.jobs.delete(strip.serial); this.drawn = job.drawn; this.balance(job.times); job.resolve(true);
+    this.jobs.delete(strip.serial);
+    this.drawn = job.drawn;
+    this.balance(job.times);
+    job.resolve(true);
   }
 
   // Moves the ends of bands so that all workers need the same time.
@@ -65,13 +98,15 @@ class PainterPool {
     if (times.length !== this.workers.length || times.length < 2) return;
     times.sort((one, other) => one[0] - other[0]);
     const mean = times.reduce((sum, [, time]) => sum + time, 0) / times.length;
-    let before = 0, end = 0;
+    let before = 0,
+      end = 0;
     const wanted = times.map(([, time], i) => {
-      const share = this.shares[i] - before; before = this.shares[i];
-      return share * (1 + 0.4 * (mean - time) / Math.max(mean, time));
+      const share = this.shares[i] - before;
+      before = this.shares[i];
+      return share * (1 + (0.4 * (mean - time)) / Math.max(mean, time));
     });
     const sum = wanted.reduce((one, other) => one + other, 0);
-    this.shares = wanted.map((share) => end += share / sum);
+    this.shares = wanted.map((share) => (end += share / sum));
     this.shares[this.shares.length - 1] = 1;
   }
 

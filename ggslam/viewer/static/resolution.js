@@ -3,7 +3,9 @@
 
 class Resolution {
   // least, most: pixels of the picture per CSS pixel; wanted: milliseconds a picture.
-  constructor(least, most, wanted) { Object.assign(this, { least, most, wanted, scale: most, frameMs: 0 }); }
+  constructor(least, most, wanted) {
+    Object.assign(this, { least, most, wanted, scale: most, frameMs: 0 });
+  }
 
   // A picture took so many milliseconds. The share of the work that pixels make is not known, so steps are small.
   took(milliseconds) {

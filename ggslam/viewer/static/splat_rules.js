@@ -7,16 +7,25 @@ const SPLAT_RULES = Object.freeze({
   minAlpha: 1 / 255, // fainter contributions are left out
   maxAlpha: 0.999,
   minTransmittance: 1e-4, // a pixel takes no further splat once its transmittance is below
-  movingMinAlpha: 4 / 255, movingMinTransmittance: 0.05, // coarser, while the camera moves without a GPU
+  movingMinAlpha: 4 / 255,
+  movingMinTransmittance: 0.05, // coarser, while the camera moves without a GPU
   slopeMargin: 0.65, // of the screen: slopes beyond are clamped in the Jacobian
-  visible: 1, selected: 2, // bits of an object's state
-  marked: 1, gone: 2, // bits of a splat's marks
-  tint: [255, 217, 26], tintShare: 0.45, // of what is selected
+  visible: 1,
+  selected: 2, // bits of an object's state
+  marked: 1,
+  gone: 2, // bits of a splat's marks
+  tint: [255, 217, 26],
+  tintShare: 0.45, // of what is selected
 });
 
-// A worker from functions and classes of this page: `main` runs in it and sees `parts` by their names.
-function startWorker(main, ...parts) {
-  const text = [`"use strict"; const SPLAT_RULES = ${JSON.stringify(SPLAT_RULES)};`, ...parts.map(String), `(${main})();`];
+// A worker from functions and classes of this page: `main` runs in it and sees `parts` and constants by their names.
+function startWorker(main, constants, ...parts) {
+  const text = [
+    `"use strict"; const SPLAT_RULES = ${JSON.stringify(SPLAT_RULES)};`,
+    ...Object.entries(constants).map(([name, value]) => `const ${name} = ${JSON.stringify(value)};`),
+    ...parts.map(String),
+    `(${main})();`,
+  ];
   const address = URL.createObjectURL(new Blob([text.join("\n")], { type: "text/javascript" }));
   const worker = new Worker(address);
   URL.revokeObjectURL(address);

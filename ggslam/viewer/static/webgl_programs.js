@@ -5,7 +5,8 @@
 const SPLAT_VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D shapes, colors, marks; uniform sampler2D states;
-uniform mat4 view, displacement; uniform vec2 focal, size; uniform float near; uniform int displaced; // id, or -1: marked
+uniform mat4 view, displacement; uniform vec2 focal, size; uniform float near;
+uniform int displaced; // id, or -1: marked
 in vec2 corner; in uint which;
 out vec2 place; out vec4 color;
 vec3 octahedral(vec2 code) {
@@ -25,7 +26,8 @@ float look(uint seen, vec3 eye, float size, inout mat3 sigma) {
   if (share <= 0.0 || far == 0.0) return share;
   vec3 d = octahedral(vec2(seen & 255u, (seen >> 8) & 255u)); float cosine = dot(d, eye) / distance;
   float along = dot(d, sigma * d), beside = sigma[0][0] + sigma[1][1] + sigma[2][2] - along;
-  float strength = 1.0 - fall(cosine, cone + ${SEEN_RULES.shortenBeside.toFixed(1)}, ${SEEN_RULES.shortenOver.toFixed(1)});
+  float beginning = cone + ${SEEN_RULES.shortenBeside.toFixed(1)};
+  float strength = 1.0 - fall(cosine, beginning, ${SEEN_RULES.shortenOver.toFixed(1)});
   if (along > beside && strength > 0.0) {
     mat3 S = mat3(1) + strength * (sqrt(max(0.0, beside / along)) - 1.0) * outerProduct(d, d);
     sigma = S * sigma * S;
@@ -42,7 +44,8 @@ void main() {
   vec4 state = texelFetch(states, ivec2(int(a.w) & 255, int(a.w) >> 8), 0);
   if (state.r < 0.5 || (mark & ${SPLAT_RULES.gone}u) != 0u || rgba.a == 0u) return;
   mat4 camera = view;
-  if (displaced == int(a.w) && displaced > 0 || displaced == -1 && (mark & ${SPLAT_RULES.marked}u) != 0u) camera = view * displacement;
+  bool marked = (mark & ${SPLAT_RULES.marked}u) != 0u;
+  if (displaced == int(a.w) && displaced > 0 || displaced == -1 && marked) camera = view * displacement;
   vec3 p = (camera * vec4(uintBitsToFloat(a.xyz), 1)).xyz;
   if (p.z < near) return;
   vec4 s = uintBitsToFloat(b); vec2 t = uintBitsToFloat(c.xy);
@@ -62,9 +65,10 @@ void main() {
   color = vec4(rgba) / 255.0 * vec4(1, 1, 1, share);
   float reach = sqrt(2.0 * log(max(255.0 * color.a, 1.001)));
   vec2 axis = abs(xy) < 1e-6 ? (xx >= yy ? vec2(1, 0) : vec2(0, 1)) : normalize(vec2(xy, large - xx));
-  vec2 shift = reach * (corner.x * min(sqrt(large), 1024.0) * axis + corner.y * min(sqrt(small), 1024.0) * vec2(axis.y, -axis.x));
+  vec2 sides = reach * corner * min(sqrt(vec2(large, small)), 1024.0);
+  vec2 shift = sides.x * axis + sides.y * vec2(axis.y, -axis.x);
   vec2 pixel = focal * p.xy / p.z + shift;
-  if (state.g > 0.5 || (mark & ${SPLAT_RULES.marked}u) != 0u)
+  if (state.g > 0.5 || marked)
     color.rgb = mix(color.rgb, vec3(${SPLAT_RULES.tint}) / 255.0, ${SPLAT_RULES.tintShare});
   place = reach * corner;
   gl_Position = vec4(2.0 * pixel.x / size.x, -2.0 * pixel.y / size.y, 0, 1);
@@ -80,8 +84,13 @@ void main() {
 
 function buildProgram(gl, vertex, fragment) {
   const program = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(kind); gl.shaderSource(shader, text); gl.compileShader(shader);
+  for (const [kind, text] of [
+    [gl.VERTEX_SHADER, vertex],
+    [gl.FRAGMENT_SHADER, fragment],
+  ]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, text);
+    gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
     gl.attachShader(program, shader);
   }
