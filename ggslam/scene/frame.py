@@ -9,6 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
+from ggslam.errors import InputError
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ColorImage, DepthImage, Form, Mask, Pose
 from ggslam.system.savable import savable
@@ -58,6 +59,21 @@ class Frame:
     camera_number: int = 0
     instant: int | None = None
 
+    def __post_init__(self) -> None:
+        """Raises InputError for images of another type or size than the attributes say, or a time that is no number."""
+        if not isinstance(self.camera, Camera):
+            raise InputError(f"camera: expected a Camera, found {type(self.camera).__name__}")
+        if isinstance(self.timestamp, bool) or not isinstance(self.timestamp, (int, float, np.number)):
+            raise InputError(f"timestamp: expected seconds, found {type(self.timestamp).__name__}")
+        size = (self.camera.height, self.camera.width)
+        _check_image("color", self.color, np.uint8, (*size, 3))
+        _check_image("depth", self.depth, np.float32, size)
+        for name, dtype in (("mask", np.uint16), ("valid", np.bool_), ("moving", np.bool_), ("no_return", np.bool_)):
+            if getattr(self, name) is not None:
+                _check_image(name, getattr(self, name), dtype, size)
+        if self.T_world_camera is not None and np.shape(self.T_world_camera) != (4, 4):
+            raise InputError(f"T_world_camera: expected [4, 4], found {list(np.shape(self.T_world_camera))}")
+
     def depth_or_infinity(self) -> np.ndarray:
         """Depth float32 [H, W], metres: 0 where unknown, +inf where the sensor found nothing."""
         return self.depth if self.no_return is None else np.where(self.no_return, np.float32(np.inf), self.depth)
@@ -71,3 +87,12 @@ class Frame:
         if self.mask is not None or self.mask_loader is None:
             return self.mask
         return self.mask_loader()
+
+
+def _check_image(name: str, image: object, dtype: type, shape: tuple[int, ...]) -> None:
+    """Raises InputError unless it is an array of this type and shape, which is that of the camera's images."""
+    wanted = f"{name}: expected {np.dtype(dtype).name} {list(shape)}"
+    if not isinstance(image, np.ndarray):
+        raise InputError(f"{wanted} (numpy), found {type(image).__name__}")
+    if image.dtype != dtype or image.shape != shape:
+        raise InputError(f"{wanted}, found {image.dtype.name} {list(image.shape)}")
