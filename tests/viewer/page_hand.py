@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -133,6 +134,7 @@ class Hand:
 
         def still() -> bool:
             nonlocal last
+            time.sleep(0.15)
             before, last = last, self.eye()
             return bool(np.abs(last - before).max() < 1e-9)
 

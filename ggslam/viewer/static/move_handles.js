@@ -74,6 +74,7 @@ class MoveTool extends Tool {
     this.angle = 0;
     this.who = this.viewer.movedWho();
     this.makeHandles();
+    if (!this.viewer.inView(box.center)) this.viewer.say("the handles are out of sight; F looks at them");
     this.viewer.emit("moved");
     this.viewer.redrawOverlay();
   }
