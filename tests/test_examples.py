@@ -66,6 +66,17 @@ def test_train_gaussians(run: Program, room: Path, tmp_path: Path) -> None:
     assert len(read_gaussian_ply(tmp_path / "trained.ply")) > 1000
 
 
+@pytest.mark.long("two trainings that have to get somewhere")
+def test_densify_gaussians(run: Program, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(EXAMPLES))  # as Python does for the program itself
+    said = run("densify_gaussians.py", room, "dense.ply", 4, 40)
+    rows = re.findall(r"densification: (\d+) to (\d+) Gaussians, ([\d.]+) dB", said)
+    (first, same, sparse), (_, more, dense) = [tuple(map(float, row)) for row in rows]
+    assert same == first and more > 3 * first
+    assert dense > sparse + 0.5
+    assert len(read_gaussian_ply(tmp_path / "dense.ply")) == more
+
+
 def test_own_camera(run: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run("own_camera.py", 4).count("ok,") == 3
     monkeypatch.syspath_prepend(str(EXAMPLES))

@@ -65,7 +65,8 @@ def render(
     film: Annotated[Path | None, typer.Option(help="Write a film: .mp4, .gif or .webp.", metavar="FILE")] = None,
     path: Annotated[
         str | None,
-        typer.Option(help="Way of the film: recorded (default), orbit, or a JSON file of camera keys.", metavar="PATH"),
+        typer.Option(help="Way of the film: recorded (default), orbit, keys (set on the run's page), or a JSON file of "
+                     "camera keys.", metavar="PATH"),
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Pictures a second; default 30, of a .gif 15.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Length of the film; default: as recorded; orbit 12.")] = None,

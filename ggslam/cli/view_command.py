@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,9 +11,12 @@ import typer
 
 from ggslam.cli import options
 from ggslam.cli.console import console
+from ggslam.errors import ConfigError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
+    from ggslam.jobs.view.store_page import StorePage
     from ggslam.jobs.view.viewed_run import ViewedRun
+    from ggslam.viewer.page_server import PageServer
 
 EPILOG = """
 [bold]Examples[/]
@@ -29,8 +33,14 @@ EPILOG = """
 """
 
 
+Viewed = Annotated[
+    Path,
+    typer.Argument(metavar="MAP", help="Folder that `ggslam run` wrote, file of Gaussians, or store of submaps."),
+]
+
+
 def view(
-    run: options.MapPath,
+    run: Viewed,
     host: options.Host = "127.0.0.1",
     port: options.Port = 8080,
     page: Annotated[
@@ -50,21 +60,32 @@ def view(
     ] = None,
 ) -> None:
     """Look at a run in the browser: map, camera, frames; select, measure, edit, note, search, save what was edited."""
-    from ggslam.jobs.view.serve import serve_run, wait_for_interrupt, write_page
+    from ggslam.jobs.submaps.stores import is_store
+    from ggslam.jobs.view.serve import serve_run, serve_store, write_page
     from ggslam.runs.map_file import open_map
 
+    if is_store(run):
+        if page is not None:
+            raise ConfigError("--html: a store has no end; it can be served only")
+        opened, store = serve_store(run, host, port, caption)
+        return _wait(opened, lambda: _say(store, [], f"{opened.address} (Ctrl-C ends)"))
     folder = open_map(run)
     if page is not None:
         model, size = write_page(folder, page, max_splats, sequence, caption, changes)
-        _say(model, f"wrote {page}: {size / 1e6:.1f} MB")
-        return
+        return _say(model, model.notes, f"wrote {page}: {size / 1e6:.1f} MB")
     server, model = serve_run(folder, host, port, max_splats, sequence, changes, caption)
+    _wait(server, lambda: _say(model, model.notes, f"{server.address} (Ctrl-C ends)"))
+
+
+def _wait(server: PageServer, announce: Callable[[], None]) -> None:
+    from ggslam.jobs.view.serve import wait_for_interrupt
+
     try:
-        wait_for_interrupt(lambda: _say(model, f"{server.address} (Ctrl-C ends)"))
+        wait_for_interrupt(announce)
     finally:
         server.close()
 
 
-def _say(model: ViewedRun, text: str) -> None:
-    for line in [*(f"note: {note}" for note in model.notes), f"{model.describe()}", text]:
+def _say(model: ViewedRun | StorePage, notes: list[str], text: str) -> None:
+    for line in [*(f"note: {note}" for note in notes), model.describe(), text]:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -139,7 +139,7 @@ class ObjectTable:
             means, opacities = np.concatenate(own.means), np.concatenate(own.opacities)
             records.append(
                 ObjectRecord(
-                    name, known.get(name), _color(name), len(means), own.confidence(len(means)),
+                    name, known.get(name), object_color(name), len(means), own.confidence(len(means)),
                     middle_of(means, opacities), oriented_box(means), **observed,
                 )
             )  # fmt: skip
@@ -250,7 +250,7 @@ class ObjectTable:
         return table
 
 
-def _color(object_id: int) -> tuple[int, int, int]:
+def object_color(object_id: int) -> tuple[int, int, int]:
     red, green, blue = id_palette()[object_id].tolist()
     return red, green, blue
 

@@ -178,12 +178,37 @@ class GaussianModel(torch.nn.Module):
         return out
 
     def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        """Makes room for as many Gaussians as the state has; the rest is torch's."""
+        """Makes room for as many Gaussians as the state has; the rest is torch's. A state that does not fit is told of
+        and changes nothing: torch itself would have loaded the arrays before the first wrong one."""
+        strict, problems = args[1], args[4]
+        found = self._state_problem(state_dict, prefix, strict)
+        if found is not None:
+            problems.append(f"{found}; nothing was loaded")
+            return
         for name, own in self._rows():
             given = state_dict.get(prefix + name)
-            if isinstance(given, torch.Tensor) and given.shape[1:] == own.shape[1:] and given.shape != own.shape:
+            if given is not None and given.shape != own.shape:
                 own.data = own.data.new_empty(given.shape)
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def _state_problem(self, state_dict: Mapping[str, Any], prefix: str, strict: bool) -> str | None:
+        """Why a state cannot be loaded; None: it can."""
+        counts: dict[int, str] = {}
+        for name, own in self._rows():
+            given = state_dict.get(prefix + name)
+            if given is None:
+                if strict:
+                    return f"{prefix}{name} is missing"
+                counts.setdefault(len(own), f"{name} of this model")
+                continue
+            if not isinstance(given, torch.Tensor) or given.ndim != own.ndim or given.shape[1:] != own.shape[1:]:
+                shape = list(given.shape) if isinstance(given, torch.Tensor) else type(given).__name__
+                return f"{prefix}{name}: expected shape {['N', *own.shape[1:]]}, found {shape}".replace("'N'", "N")
+            counts.setdefault(len(given), name)
+        if len(counts) > 1:
+            told = ", ".join(f"{count} by {name}" for count, name in counts.items())
+            return f"{prefix.rstrip('.') or 'state'}: arrays of different numbers of Gaussians: {told}"
+        return None
 
     def _rows(self) -> Iterable[tuple[str, torch.Tensor]]:
         return [(name, getattr(self, name)) for name in (*PARAMETERS, *_LABELS)]

@@ -32,8 +32,9 @@ class ViewedSidesTuning(Tuning):
     margin = Margin(least=0.1, share=0.03)
     """A Gaussian so far behind the surface still belongs to it."""
     nearest_m = 0.05
-    """Distance that byte 1 means; each further one is 3 % farther, so that 255 is 93 m."""
+    """Distance that byte 1 means, in metres."""
     step = 1.03
+    """Each further byte means a distance so many times as far, so that 255 is 93 m."""
     reach = 2
     """Normals are taken from pixels so far to all sides."""
     gap = 0.15

@@ -7,11 +7,11 @@
 
 Writes the run as pages of one file with the most visible Gaussians, opens each in headless chromium at 1280 x 800 CSS
 pixels, and drags the mouse over the map through CDP events, 60 a second, around a circle. Pictures of the map that
-reached the canvas during the drag are counted. Each number of splats is measured twice: as the page draws without a GPU
-(workers), and by WebGL that the processor emulates (SwiftShader) at half resolution, the reference of the ratio; there,
-reading back a pixel after each picture makes sure that it is complete. `pixels` is what a CSS pixel had in the
-middle of the drag, `sharp` the time from
-its last coarse picture to the sharp one.
+reached the canvas during the drag are counted. Each number of splats is measured three times: by WebGL that the
+processor emulates (SwiftShader) at half resolution, the reference of the ratio, where reading back a pixel after each
+picture makes sure that it is complete; by the page's workers in the same browser (`emulated`: SwiftShader still puts
+the page together); and by the workers in a browser that was started without any GPU (`none`). `pixels` is what a CSS
+pixel had when the drag ended, `sharp` the time from its last coarse picture to the sharp one.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from ggslam.runs.folder import RunFolder
 from tests.viewer.browser import open_browser, wait_for
 
 EVENTS_PER_S = 60
+CASES = [("webgl", "emulated"), ("processor", "emulated"), ("processor", "none")]
 _COUNT = """
 const map = window.ggslam.map, shown = map.renderer.onframe, gl = map.renderer.gl;
 window.counted = { coarse: 0, coarseAt: 0, sharpAt: 0 };
@@ -82,8 +83,8 @@ def drag(browser: Any, seconds: float) -> Result:
     return Result(1000 * (count - first) / (until - since), stats["frameMs"], stats["scale"], sharp / 1000)
 
 
-def measured(page: Path, renderer: str, seconds: float) -> Result:
-    browser = open_browser(1280, 890)
+def measured(page: Path, renderer: str, gpu: str, seconds: float) -> Result:
+    browser = open_browser(1280, 890, *(["--disable-gpu"] if gpu == "none" else []))
     try:
         inner = browser.execute_script("return [innerWidth, innerHeight]")
         browser.set_window_size(1280 + 1280 - inner[0], 890 + 800 - inner[1])
@@ -102,19 +103,22 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="for the pages")
     parser.add_argument("--splats", type=int, nargs="+", default=[10_000, 64_000, 100_000])
     parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--only", choices=("processor", "webgl"), help="measure one renderer")
+    parser.add_argument("--only", action="store_true", help="measure the workers without a GPU only")
     arguments = parser.parse_args()
     folder = RunFolder.open(arguments.run)
-    print(f"{'splats':>8}  {'renderer':<10}{'pictures/s':>11}{'ms each':>9}{'pixels':>8}{'sharp s':>9}{'ratio':>8}")
+    print(
+        f"{'splats':>8}  {'renderer':<11}{'GPU':<9}{'pictures/s':>11}{'ms each':>9}{'pixels':>8}{'sharp s':>9}  ratio"
+    )
     for count in arguments.splats:
         page = arguments.folder.resolve() / f"page-{count}.html"
         write_page(folder, page, max_splats=count)
         reference = None
-        for renderer in ("webgl", "processor") if arguments.only is None else (arguments.only,):
-            found = measured(page, renderer, arguments.seconds)
+        for renderer, gpu in CASES if not arguments.only else [CASES[-1]]:
+            found = measured(page, renderer, gpu, arguments.seconds)
             reference = reference or found.pictures_per_s
-            print(f"{count:>8}  {renderer:<10}{found.pictures_per_s:>11.1f}{found.frame_ms:>9.1f}{found.scale:>8.2f}"
-                  f"{found.sharp_s:>9.2f}{found.pictures_per_s / max(reference, 1e-3):>8.1f}", flush=True)  # fmt: skip
+            numbers = f"{found.pictures_per_s:>11.1f}{found.frame_ms:>9.1f}{found.scale:>8.2f}{found.sharp_s:>9.2f}"
+            ratio = found.pictures_per_s / max(reference, 1e-3)
+            print(f"{count:>8}  {renderer:<11}{gpu:<9}{numbers}{ratio:>7.1f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ a page is open, by turns.
     python scripts/benchmarks/bench_view.py ../shared/data/redkitchen --rounds 3 --folder /tmp/view
     python scripts/benchmarks/bench_view.py ../shared/data/redkitchen --stop 30 --rounds 1 --folder /tmp/view
 
-The page is a client that receives everything and draws nothing, as a browser on another machine is to this one: a
+The page is a client that fetches everything and draws nothing, as a browser on another machine is to this one: a
 browser that draws in software on the same processors takes these away from the run, whoever sends the splats. Prints
 for each run frames/s (reading the recording included, scoring not), against the run without `--view` of the same
 round, and how often and how much the client was sent while the run went on.
@@ -23,52 +23,45 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.request import urlopen
 
-import msgspec
-import viser
 from commands import ROOT
-from websockets.exceptions import WebSocketException
-from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Subprotocol
 
 from ggslam.runs.records.timing import TimingRecord
 
 KINDS = ("without --view", "nobody looks", "a page is open")
-_CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1.0, 0.0, 0.0, 0.0], "position": [0.0, 0.0, 0.0], "fov": 1.0, "near": 0.01,
-    "far": 1000.0, "image_height": 800, "image_width": 1280, "look_at": [0.0, 0.0, 1.0],
-    "up_direction": [0.0, -1.0, 0.0],
-}  # fmt: skip
-"""What a page says first. Only then is it one that looks."""
 
 
 class Looker(threading.Thread):
-    """A client of the page at a port; counts what it is sent.
+    """A page at an address, with its token; counts what it is sent.
 
     Attributes:
         megabytes: received until `ended`.
-        maps: messages of more than 100 kB, which the map is sent in.
+        maps: how often the map was fetched.
     """
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, address: str) -> None:
         super().__init__(daemon=True)
-        self._socket: ClientConnection = connect(
-            f"ws://localhost:{port}", subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None,
-            compression=None,
-        )  # fmt: skip
-        self._socket.send(msgspec.msgpack.encode(_CAMERA))
+        self._base, self._query = address.split("?")
         self.ended = threading.Event()
         self.megabytes, self.maps = 0.0, 0
         self.start()
 
     def run(self) -> None:
         try:
-            for message in self._socket:
-                if not self.ended.is_set():
-                    self.megabytes += len(message) / 1e6
-                    self.maps += len(message) > 100_000
-        except WebSocketException:  # the server has ended
+            with urlopen(f"{self._base}events?{self._query}", timeout=600) as events:
+                for line in events:
+                    if line.startswith(b"data:") and b"splats" in line and not self.ended.is_set():
+                        for part in ("scene", "splats?chunk=map", "frame?number=0"):
+                            self._fetch(part)
+                        self.maps += 1
+        except OSError:  # the server has ended
             pass
+
+    def _fetch(self, part: str) -> None:
+        separator = "&" if "?" in part else "?"
+        with urlopen(f"{self._base}{part}{separator}{self._query}", timeout=60) as answer:
+            self.megabytes += len(answer.read()) / 1e6
 
 
 @dataclass(frozen=True)
@@ -97,7 +90,7 @@ def measured(kind: str, words: list[str], out: Path) -> Result:
     for line in process.stdout:
         said.append(line)
         if "the map as it grows" in line and kind == KINDS[2]:
-            looker = Looker(port)
+            looker = Looker(line.split()[-1] if "token=" in line else "")
         if "frames/s" in line and looker is not None:
             looker.ended.set()
         if "shows the run" in line:

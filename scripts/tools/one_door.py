@@ -47,7 +47,7 @@ ALLOWED = {
     "ggslam.coding.energy:_is_package": "/sys",
     "ggslam.coding.energy:_number": "/sys",
     "ggslam.reporting.page:_file": "a file of this package",
-    "ggslam.viewer.static_page:static_page": "files of this package",
+    "ggslam.viewer.page_text:_page": "files of this package",
     "ggslam.cuda.compiler:library_path": "sources of this package",
     "ggslam.native.loader:source_hash": "sources of this package",
     "ggslam.abi.headers:__init__": "headers of this package",

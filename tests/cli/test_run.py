@@ -20,7 +20,7 @@ import torch
 from command_line import ggslam, refuse
 from kept import points_in_voxels_of
 
-from ggslam.cli import main, run_command
+from ggslam.cli import main
 from ggslam.cli.run_command import _print
 from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.formats.point_ply import read_points
@@ -88,15 +88,6 @@ def test_the_commands_that_a_run_suggests_can_be_copied(tmp_path: Path, capsys: 
     view, export = (shlex.split(line.removeprefix("next:"), comments=True) for line in shown)
     assert view[:3] == ["ggslam", "view", str(folder.path)]
     assert export == ["ggslam", "export", str(folder.path), "--format", "mesh", "--out", "mesh.ply"]
-
-
-def test_what_a_run_suggests_needs_no_package_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_command, "find_spec", lambda name: None)
-    view = run_command.next_commands(Path("my runs/room"))[0]
-    words = shlex.split(view.removeprefix("next:"), comments=True)
-    assert words == ["ggslam", "view", "my runs/room", "--html", "my runs/room/map.html"] and "ggslam[viewer]" in view
-    monkeypatch.setattr(run_command, "find_spec", lambda name: SimpleNamespace())
-    assert run_command.next_commands(Path("r"))[0] == "next: ggslam view r"
 
 
 def test_held_out_frames_are_never_keyframes(finished: Path) -> None:

@@ -11,12 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ggslam.errors import ConfigError
-from ggslam.jobs.render.key_path import CameraKeys, key_shots, page_camera, read_camera_keys, view_at
+from ggslam.jobs.render.film import shots_along
+from ggslam.jobs.render.key_path import key_shots, page_camera, page_fov, read_camera_keys, view_at
 from ggslam.jobs.render.orbit_path import find_swing, orbit_shots
 from ggslam.jobs.render.recorded_path import recorded_shots, smooth_poses
 from ggslam.jobs.render.shots import fill_size, film_times, look_at_pose, parse_size
 from ggslam.jobs.render.single_views import parse_pose
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.records.annotations import CameraKeysRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import turning_angle
@@ -97,7 +99,7 @@ def test_times_of_a_film() -> None:
             film_times(1.0, fps, seconds)
 
 
-KEYS = CameraKeys.model_validate({"fps": 10, "keys": [
+KEYS = CameraKeysRecord.model_validate({"fps": 10, "keys": [
     {"time": 1, "position": [0, 0, 0], "look_at": [0, 0, 2], "up": [0, -1, 0], "fov": 1.0},
     {"time": 2, "position": [1, 0, 0], "look_at": [0, 0, 2], "up": [0, -1, 0], "fov": 0.8},
     {"time": 4, "position": [1, 1, 0], "look_at": [0, 1, 3], "up": [1, -1, 0], "fov": 0.6},
@@ -110,7 +112,9 @@ def test_keys_are_met_at_their_times() -> None:
     for key in KEYS.keys:
         shot = shots[round(10 * (key.time - 1))]
         np.testing.assert_allclose(shot.T_world_camera, look_at_pose(key.position, key.look_at, key.up), atol=1e-9)
+        assert key.fov is not None
         assert shot.camera == page_camera((320, 200), key.fov)
+        assert page_fov(shot.camera) == pytest.approx(key.fov)
         half = np.arctan2(99.5 + 0.5, shot.camera.fy)
         assert 2 * half == pytest.approx(key.fov)
 
@@ -144,6 +148,18 @@ def test_damaged_keys_are_told(text: str, problem: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=rf"keys\.json: no camera keys: .*{problem}") as told:
         read_camera_keys(tmp_path / "keys.json")
     assert "pydantic" not in str(told.value)
+
+
+def test_keys_of_the_page_and_without_angles(room_run: RunFolder, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no file"):
+        shots_along(room_run, "keys", None, None, None)
+    (tmp_path / "camera_keys.json").write_text(
+        json.dumps({"keys": [{**key.model_dump(), "fov": None} for key in KEYS.keys]})
+    )
+    shots = shots_along(room_run, tmp_path / "camera_keys.json", None, None, (320, 240))
+    assert len(shots) == 121  # 4 s at 30 pictures a second, the page's
+    camera = room_run.sequence().camera
+    assert shots[0].camera.fy / 240 == pytest.approx(camera.fy / camera.height, rel=1e-6)
 
 
 def test_keys_in_a_list_and_in_disorder(tmp_path: Path) -> None:

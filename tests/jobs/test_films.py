@@ -67,7 +67,7 @@ def test_what_does_not_go_together_is_told(room_run: RunFolder, tmp_path: Path) 
     for options, problem in (
         ({"what": ["side-by-side"], "path": "orbit"}, "goes with `path` recorded"),
         ({"what": ["side-by-side", "alpha"]}, "goes with color and depth"),
-        ({"what": ["colour"]}, "found 'colour'"), ({"path": "somewhere"}, "found 'somewhere'"),
+        ({"what": ["colour"]}, "found 'colour'"), ({"path": "somewhere"}, "found no file 'somewhere'"),
         ({"fps": 1000}, "`fps`"), ({"seconds": -1}, "`seconds`"), ({"smoothing": -1}, "`smoothing`"),
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=problem):

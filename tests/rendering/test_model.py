@@ -132,7 +132,7 @@ def test_state_of_another_number_of_gaussians() -> None:
     large.load_state_dict(small.state_dict())
     assert len(large) == 30 and large.object_id[2] == 9
     assert all(torch.equal(getattr(large, name), getattr(small, name)) for name in PARAMETERS)
-    with pytest.raises(RuntimeError, match="size mismatch for sh"):
+    with pytest.raises(RuntimeError, match="sh: expected shape .N, 4, 3., found .30, 1, 3.; nothing was loaded"):
         large.load_state_dict(model_of(30, coefficients=1).state_dict())
 
 
@@ -162,3 +162,19 @@ def test_unknown_learning_rate() -> None:
         model_of().parameter_groups(scales=0.1)
     names = [group["name"] for group in model_of(features=0).parameter_groups(quaternions=0)]
     assert names == ["means", "log_scales", "opacity_logits", "sh"]
+
+
+@pytest.mark.parametrize("broken", ["missing", "shape", "count", "kind"])
+@pytest.mark.parametrize("strict", [True, False])
+def test_a_state_that_does_not_fit_changes_nothing(broken: str, strict: bool) -> None:
+    model, state = model_of(20), dict(model_of(30).state_dict())
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    if broken == "missing":
+        del state["sh"]
+    else:
+        state["sh"] = {"shape": state["sh"][:, :0], "count": state["sh"][:7], "kind": [1, 2]}[broken]
+    with pytest.raises(RuntimeError, match=r"sh.*nothing was loaded"):
+        model.load_state_dict(state, strict=strict)
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    assert len(model) == 20

@@ -37,6 +37,11 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     page.quit()
 
 
+def test_levels_may_be_counted_or_listed(browser: Any) -> None:
+    code = "return [ChunkLevels.counts({ count: 1001, levels: 3 }), ChunkLevels.counts({ count: 9, levels: [9, 2] })]"
+    assert m.ask(browser, code) == [[1001, 251, 63], [9, 2]]
+
+
 @pytest.mark.parametrize("budget", [100_000, 400_000, 1_000_000, 10_000_000])
 def test_the_budget_goes_to_what_is_near_and_in_sight(browser: Any, budget: int) -> None:
     levels, splats = m.ask(

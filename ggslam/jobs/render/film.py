@@ -12,7 +12,7 @@ import numpy as np
 from ggslam.errors import ConfigError, SequenceError
 from ggslam.formats.film_files import film_ending, write_film
 from ggslam.jobs.render.artist import Artist
-from ggslam.jobs.render.key_path import key_shots, read_camera_keys
+from ggslam.jobs.render.key_path import DEFAULT_FOV, key_shots, page_fov, read_camera_keys
 from ggslam.jobs.render.orbit_path import orbit_shots
 from ggslam.jobs.render.outputs import write_beside
 from ggslam.jobs.render.recorded_path import RecordedPathTuning, recorded_shots
@@ -21,6 +21,7 @@ from ggslam.reporting.pictures import depth_range, side_by_side
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import open_map
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.annotations import CameraKeysRecord
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.sequences.sequence import Sequence as Recording
@@ -61,7 +62,8 @@ def render_film(
     Args:
         run: the run, or its folder; or a file of Gaussians, for which `path` is orbit or a file of keys.
         out: the film, .mp4, .gif or .webp. It appears when it is whole.
-        path: "recorded", the camera's own way; "orbit", round the map; or a JSON file of camera keys, see `key_path`.
+        path: "recorded", the camera's own way; "orbit", round the map; "keys", through those set on the run's page; or
+            a JSON file of camera keys, see `key_path`.
         fps: pictures a second; None: 30, of a .gif 15, of keys as they say.
         seconds: that the film takes; None: as long as the recording or the keys, of an orbit 12 s.
         size: (width, height) of each picture; None: as the run saw it, of keys 1280x720.
@@ -106,9 +108,12 @@ def shots_along(
         return recorded_shots(folder, rate, seconds, size, smoothing, at_frames)
     if str(path) == "orbit":
         return orbit_shots(folder, rate, seconds, size)
-    if not Path(path).is_file():
-        raise ConfigError(f"`path`: expected recorded, orbit or a JSON file of camera keys, found {str(path)!r}")
-    return key_shots(read_camera_keys(path), fps, seconds, size)
+    file = folder.path / CameraKeysRecord.FILE if str(path) == "keys" and folder.path.is_dir() else Path(path)
+    if not file.is_file():
+        expected = "expected recorded, orbit, keys (set on the run's page) or a JSON file of camera keys"
+        raise ConfigError(f"`path`: {expected}, found no file {str(file)!r}")
+    fov = page_fov(folder.sequence().camera) if folder.has_poses else DEFAULT_FOV
+    return key_shots(read_camera_keys(file), fps, seconds, size, fov)
 
 
 def _depth_limits(artist: Artist, shots: list[Shot]) -> tuple[float, float]:

@@ -13,39 +13,23 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Final
 
 import numpy as np
 import pydantic
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.render.shots import Shot, Size, film_times, look_at_pose
+from ggslam.runs.records.annotations import CameraKeysRecord
 from ggslam.runs.records.record import explain
 from ggslam.scene.camera import Camera
 from ggslam.system.untrusted_files import read_untrusted_text
 
-_Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
-_Point = tuple[_Number, _Number, _Number]
+DEFAULT_FOV: Final = 1.0
+"""Radians along the shorter side, for keys that tell no angle of maps without a camera."""
 
 
-class CameraKey(pydantic.BaseModel):
-    """Where the camera is at a time, in seconds and metres; `fov` in radians."""
-
-    time: _Number
-    position: _Point
-    look_at: _Point
-    up: _Point
-    fov: Annotated[float, pydantic.Field(gt=0.01, lt=3.0)] = 1.0
-
-
-class CameraKeys(pydantic.BaseModel):
-    """Camera keys in the order of their times, and the pictures a second that they were made for."""
-
-    fps: Annotated[float, pydantic.Field(gt=0, le=240)] = 30.0
-    keys: Annotated[list[CameraKey], pydantic.Field(min_length=1, max_length=10_000)]
-
-
-def read_camera_keys(path: str | Path) -> CameraKeys:
+def read_camera_keys(path: str | Path) -> CameraKeysRecord:
     """Reads a file of camera keys.
 
     Raises:
@@ -55,9 +39,11 @@ def read_camera_keys(path: str | Path) -> CameraKeys:
     if text.lstrip().startswith("["):  # the keys alone, as the page keeps them beside the run
         text = f'{{"keys": {text}}}'
     try:
-        found = CameraKeys.model_validate_json(text)
+        found = CameraKeysRecord.model_validate_json(text)
     except pydantic.ValidationError as error:
         raise ConfigError(f"{path}: no camera keys: {explain(error).split(': ', 1)[-1]}") from None
+    if not found.keys:
+        raise ConfigError(f"{path}: no camera keys: keys: there are none")
     times = [key.time for key in found.keys]
     if any(later <= earlier for earlier, later in zip(times, times[1:], strict=False)):
         raise ConfigError(f"{path}: the times of the keys must rise, found {times}")
@@ -65,8 +51,9 @@ def read_camera_keys(path: str | Path) -> CameraKeys:
 
 
 def key_shots(
-    keys: CameraKeys, fps: float | None = None, seconds: float | None = None, size: Size | None = None
-) -> list[Shot]:
+    keys: CameraKeysRecord, fps: float | None = None, seconds: float | None = None, size: Size | None = None,
+    fov: float = DEFAULT_FOV,
+) -> list[Shot]:  # fmt: skip
     """A film through camera keys.
 
     Args:
@@ -74,6 +61,7 @@ def key_shots(
         fps: pictures a second; None: those of the keys.
         seconds: that the film shall take; None: from the first key to the last one as they say.
         size: of the pictures; None: 1280x720.
+        fov: of keys that tell none, radians.
 
     Raises:
         ConfigError: numbers that make no film, or a camera that looks along its up direction.
@@ -81,12 +69,12 @@ def key_shots(
     times = np.array([key.time for key in keys.keys])
     shown, taken = film_times(float(times[-1] - times[0]), fps or keys.fps, seconds)
     return [
-        Shot(float(t), *view_at(keys, float(times[0] + at), size or (1280, 720)))
+        Shot(float(t), *view_at(keys, float(times[0] + at), size or (1280, 720), fov))
         for t, at in zip(shown, taken, strict=True)
     ]
 
 
-def view_at(keys: CameraKeys, time: float, size: Size) -> tuple[np.ndarray, Camera]:
+def view_at(keys: CameraKeysRecord, time: float, size: Size, fov: float = DEFAULT_FOV) -> tuple[np.ndarray, Camera]:
     """T_world_camera [4, 4] and the camera at a time in seconds; before the first key and after the last, theirs."""
     times = np.array([key.time for key in keys.keys])
     segment = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, max(0, len(times) - 2)))
@@ -98,7 +86,8 @@ def view_at(keys: CameraKeys, time: float, size: Size) -> tuple[np.ndarray, Came
     before, after = keys.keys[segment], keys.keys[last]
     up = _great_circle(np.array(before.up), np.array(after.up), share)
     T = look_at_pose(position, look_at, up)
-    return T, page_camera(size, before.fov + (after.fov - before.fov) * share)
+    angles = [fov if key.fov is None else key.fov for key in (before, after)]
+    return T, page_camera(size, angles[0] + (angles[1] - angles[0]) * share)
 
 
 def page_camera(size: Size, fov: float) -> Camera:
@@ -106,6 +95,11 @@ def page_camera(size: Size, fov: float) -> Camera:
     width, height = size
     focal = min(height, width / 1.1) / 2 / math.tan(fov / 2)
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def page_fov(camera: Camera) -> float:
+    """The angle with which the page shows what a camera sees, radians; the other way round than `page_camera`."""
+    return 2 * math.atan(min(camera.height / camera.fy, camera.width / 1.1 / camera.fx) / 2)
 
 
 def _curve(points: np.ndarray, segment: int, share: float) -> np.ndarray:

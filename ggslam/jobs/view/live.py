@@ -157,7 +157,7 @@ class LiveView:
         packed, low, high = pack_splats(g, rows, colors, owners, None, level=LiveViewTuning.compression)
         header = {"count": len(rows), "low": low, "high": high, "scales": SCALES, "identity": False}
         scene = _scene_of(snapshot, camera, self._title, g.means.numpy()[rows])
-        scene["chunks"] = [{"id": "map", "count": len(rows), "levels": 1, "low": low, "high": high}]
+        scene["chunks"] = [{"id": "map", "count": len(rows), "levels": [len(rows)], "low": low, "high": high}]
         picture = jpeg(self._compare(snapshot, camera))
         first = not self.updates
         self.updates += 1

@@ -51,10 +51,11 @@ class RunPage:
         model = self.model
         with model.turn():
             low, high = _corners(model.centers())
+            count = len(model.shown_rows())
             return {
                 **scene_values(model, self._title, self._caption), **self._state(), "served": True, "live": False,
                 "editable": True, "target": model.default_target(), "folder": str(model.save_folder()),
-                "chunks": [{"id": CHUNK, "count": len(model.shown_rows()), "levels": 1, "low": low, "high": high}],
+                "chunks": [{"id": CHUNK, "count": count, "levels": [count], "low": low, "high": high}],
                 "annotations": self._read(AnnotationsRecord).get("annotations", []),
                 "camera_keys": self._read(CameraKeysRecord).get("keys", []),
             }  # fmt: skip

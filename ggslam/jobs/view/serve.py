@@ -13,6 +13,7 @@ import numpy as np
 from ggslam.jobs.view.live import LiveView
 from ggslam.jobs.view.packing import packed_rows
 from ggslam.jobs.view.run_page import RunPage
+from ggslam.jobs.view.store_page import StorePage
 from ggslam.jobs.view.viewed_run import ViewedRun, ViewedRunTuning
 from ggslam.runs.folder import RunFolder
 from ggslam.system.atomic import make_folder, write_bytes
@@ -42,6 +43,21 @@ def serve_run(
     server = PageServer(host, port, _title(folder))
     server.show(RunPage(model, _title(folder), caption, server.tell))
     return server, model
+
+
+def serve_store(
+    path: Path, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, caption: str = ""
+) -> tuple[PageServer, StorePage]:
+    """Serves a page of a store of submaps until the server is closed.
+
+    Raises:
+        GgslamError: as `PageServer` and `StorePage`.
+    """
+    title = path.resolve().name
+    page = StorePage(path, title, caption)
+    server = PageServer(host, port, title)
+    server.show(page)
+    return server, page
 
 
 def write_page(

@@ -2,9 +2,14 @@
 // Which chunks of a large map are held, and how fine: what is near and in sight gets more of a budget of splats.
 
 class ChunkLevels {
-  // chunks: [{id, low [3], high [3], levels: [splats of the finest level, ..., of the coarsest]}]; budget: splats.
+  // chunks: [{id, count, low [3], high [3], levels: number of levels, each a quarter of the one before, or the splats of
+  // each, finest first}]; budget: splats.
   constructor(chunks, budget) {
     Object.assign(this, { chunks, budget, chosen: new Map() });
+  }
+
+  static counts({ levels, count }) {
+    return Array.isArray(levels) ? levels : Array.from({ length: levels }, (_, level) => Math.ceil(count / 4 ** level));
   }
 
   // camera: see MapView; width, height: of the screen. Gives Map id -> level of the chunks that should be held.
@@ -18,7 +23,7 @@ class ChunkLevels {
     let left = this.budget;
     for (const place of seen) {
       // each at its coarsest first, as many as there is room for
-      const count = place.chunk.levels[place.coarsest];
+      const count = place.levels[place.coarsest];
       if (count <= left) {
         left -= count;
         place.level = place.coarsest;
@@ -28,7 +33,7 @@ class ChunkLevels {
     for (;;) {
       const next = this.worst(kept, left, focal);
       if (!next) break;
-      left -= next.chunk.levels[next.level - 1] - next.chunk.levels[next.level];
+      left -= next.levels[next.level - 1] - next.levels[next.level];
       next.level--;
     }
     this.chosen = new Map(kept.map(({ chunk, level }) => [chunk.id, level]));
@@ -41,8 +46,8 @@ class ChunkLevels {
       most = 1 / focal;
     for (const place of kept) {
       if (!place.level) continue;
-      const { levels, id } = place.chunk,
-        held = this.chosen.get(id) < place.level ? ChunkLevels.LOYALTY : 1;
+      const { levels } = place,
+        held = this.chosen.get(place.chunk.id) < place.level ? ChunkLevels.LOYALTY : 1;
       const gap = held * this.gap(place, place.level);
       if (gap > most && levels[place.level - 1] - levels[place.level] <= left) {
         best = place;
@@ -53,12 +58,13 @@ class ChunkLevels {
   }
 
   // Angle between neighbouring splats of a level as they are seen.
-  gap({ chunk, size, distance, share }, level) {
-    return (share * size) / Math.sqrt(Math.max(1, chunk.levels[level])) / distance;
+  gap({ levels, size, distance, share }, level) {
+    return (share * size) / Math.sqrt(Math.max(1, levels[level])) / distance;
   }
 
   look(chunk, v, slopes, near) {
-    const { low, high, levels } = chunk,
+    const { low, high } = chunk,
+      levels = ChunkLevels.counts(chunk),
       middle = [0, 1, 2].map((k) => (low[k] + high[k]) / 2),
       eye = eyeOf(v);
     const size = Math.hypot(...[0, 1, 2].map((k) => high[k] - low[k]));
@@ -70,6 +76,7 @@ class ChunkLevels {
     const share = out > (size * Math.hypot(1, ...slopes)) / 2 ? ChunkLevels.UNSEEN : 1;
     return {
       chunk,
+      levels,
       size,
       distance: Math.max(beside, size / 4, near),
       share,

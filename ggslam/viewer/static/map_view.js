@@ -11,15 +11,12 @@ class MapView {
       camera,
       chunks: new Map(),
       marks: new Map(),
+      colors: new Map(),
       background: options.background || [15, 17, 19],
     });
     this.states = new Uint8Array(65536).fill(SPLAT_RULES.visible);
     this.displacement = null;
-    this.renderer = this.start(options.renderer || new URLSearchParams(location.search).get("renderer"));
-    this.mode = this.renderer.mode;
     this.lines = new MapLines(canvas);
-    const { least, most, wanted } = this.renderer;
-    this.resolution = new Resolution(least, Math.min(devicePixelRatio, most), wanted);
     this.movedAt = -Infinity;
     this.drawnAt = -Infinity;
     this.times = [];
@@ -27,8 +24,7 @@ class MapView {
       this.becameReady = resolve;
     });
     this.onrest = () => {}; // the camera has come to rest, and the picture is sharp
-    this.renderer.onchange = () => this.request();
-    this.renderer.onframe = (shot, complete) => this.shown(shot, complete);
+    this.use(this.start(options.renderer || new URLSearchParams(location.search).get("renderer")));
     new ResizeObserver(() => this.redraw()).observe(canvas);
   }
 
@@ -51,11 +47,39 @@ class MapView {
     return new ProcessorRenderer(canvas);
   }
 
+  use(renderer) {
+    this.renderer = renderer;
+    this.mode = renderer.mode;
+    this.resolution = new Resolution(renderer.least, Math.min(devicePixelRatio, renderer.most), renderer.wanted);
+    renderer.onchange = () => this.request();
+    renderer.onframe = (shot, complete) => this.shown(shot, complete);
+    renderer.onlost = () => this.lose();
+  }
+
+  // The GPU is gone; the processor goes on.
+  lose() {
+    this.renderer.canvas.remove();
+    this.use(this.start("processor"));
+    this.describe(this.renderer);
+    for (const [chunk, rgb] of this.colors) this.renderer.setColors(chunk, rgb);
+    this.redraw();
+  }
+
+  // Tells a renderer, or painters, all that there is.
+  describe(renderer) {
+    for (const [chunk, splats] of this.chunks) renderer.addChunk(chunk, splats);
+    for (const [chunk, bytes] of this.marks) renderer.setMarks(chunk, bytes);
+    renderer.setStates(this.states.slice());
+    renderer.displace(this.displacement);
+  }
+
   // --- what is drawn
 
+  // A chunk takes the place of one of the same name, and has no marks and no other colours.
   setChunk(chunk, splats) {
     this.chunks.set(chunk, splats);
     this.marks.delete(chunk);
+    this.colors.delete(chunk);
     this.tell("addChunk", chunk, splats);
     this.redraw();
   }
@@ -63,12 +87,15 @@ class MapView {
   dropChunk(chunk) {
     if (this.chunks.delete(chunk)) {
       this.marks.delete(chunk);
+      this.colors.delete(chunk);
       this.tell("removeChunk", chunk);
       this.redraw();
     }
   }
 
   setColors(chunk, rgb) {
+    if (rgb) this.colors.set(chunk, rgb);
+    else this.colors.delete(chunk);
     this.renderer.setColors(chunk, rgb || this.chunks.get(chunk).rgb);
     this.redraw();
   }
@@ -164,7 +191,9 @@ class MapView {
       gap = now - this.drawnAt;
     this.drawnAt = now;
     this.lines.draw(shot);
-    if (!shot.sharp && gap < 500) this.resolution.took(shot.milliseconds || gap);
+    // After every movement comes a sharp picture, so that the time between two coarse ones is what one takes.
+    if (!shot.sharp && (shot.milliseconds || this.wasMoving)) this.resolution.took(shot.milliseconds || gap);
+    this.wasMoving = !shot.sharp;
     this.times.push(now);
     while (this.times[0] < now - 1000) this.times.shift();
     if (complete && this.chunks.size) this.becameReady();
@@ -213,10 +242,7 @@ class MapView {
     if (this.renderer.pool) return this.renderer.pool;
     if (!this.pool) {
       this.pool = new PainterPool();
-      for (const [chunk, splats] of this.chunks) this.pool.addChunk(chunk, splats);
-      for (const [chunk, bytes] of this.marks) this.pool.setMarks(chunk, bytes);
-      this.pool.setStates(this.states.slice());
-      this.pool.displace(this.displacement);
+      this.describe(this.pool);
     }
     return this.pool;
   }

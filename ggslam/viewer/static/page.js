@@ -116,7 +116,9 @@ class Viewer {
   // --- the map
 
   async load() {
-    for (const { id } of this.scene.chunks || []) this.map.setChunk(id, await this.source.splats(id));
+    const chunks = this.scene.chunks || [];
+    if (chunks.length > 1) this.startLoader(chunks);
+    else for (const { id } of chunks) this.map.setChunk(id, await this.source.splats(id));
     this.sceneChanged();
     this.emit("splats");
     this.emit("ready");
@@ -132,6 +134,13 @@ class Viewer {
     this.loaded = true;
   }
 
+  // A map in many parts: what is near is loaded finer, whenever the camera rests.
+  startLoader(chunks) {
+    const budget = this.map.mode === "webgl" ? 1000000 : 150000;
+    this.loader = new ChunkLoader(this.map, new ChunkLevels(chunks, budget), (id, level) => this.source.splats(id, level));
+    this.loader.onerror = (error) => this.say(error.message, true);
+  }
+
   // After an edit, or news from a map that grows.
   async reload(splats = true) {
     const scene = await this.source.scene();
@@ -141,7 +150,7 @@ class Viewer {
     this.camera.up = unit(scene.up);
     this.camera.fov = scene.fov;
     this.source.version = scene.version || this.source.version + 1;
-    if (splats) for (const { id } of scene.chunks) this.map.setChunk(id, await this.source.splats(id));
+    if (splats && !this.loader) for (const { id } of scene.chunks) this.map.setChunk(id, await this.source.splats(id));
     if (this.edits.take) this.edits.take(scene);
     this.notes.list = scene.annotations || this.notes.list;
     this.sceneChanged();

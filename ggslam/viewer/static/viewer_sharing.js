@@ -7,6 +7,10 @@ class ViewerSharing {
       this.showNow();
       this.map.redraw();
     }
+    if (this.loader) {
+      clearTimeout(this.resting);
+      this.resting = setTimeout(() => this.loader.update(), 200);
+    }
     this.redrawOverlay();
     this.remember();
   }

@@ -18,6 +18,7 @@ class WebglRenderer {
     this.mode = "webgl";
     this.onchange = () => {};
     this.onframe = () => {};
+    canvas.addEventListener("webglcontextlost", () => this.onlost());
     this.least = 0.3;
     this.most = 1.5; // pixels per CSS pixel
     this.slots = new Map();
@@ -36,7 +37,7 @@ class WebglRenderer {
     );
     this.textures = new SplatTextures(gl);
     this.buffers();
-    this.worker = startWorker(sortSplats, {}, isDisplaced, multiply);
+    this.worker = startWorker(sortInWorker, {}, SplatSorter, countingSort, isDisplaced, multiply);
     this.worker.onmessage = (event) => this.take(event.data);
   }
 
