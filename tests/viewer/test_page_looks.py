@@ -55,7 +55,7 @@ def test_a_page_of_one_file_is_looked_at_and_edited(hand: Hand, run: RunFolder, 
     b.wait_for(lambda: b.screenshot(hand.browser)[20:500, 80:600].std() < before.std() / 2)
     loaded = hand.ask("performance.getEntriesByType('resource').map((entry) => entry.name)")
     assert all(name.startswith(("data:", "blob:")) for name in loaded), loaded
-    assert b.errors(hand.browser) == []
+    assert b.messages(hand.browser) == []
 
 
 def test_a_run_without_objects_has_no_list(hand: Hand, run: RunFolder, tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_a_run_without_objects_has_no_list(hand: Hand, run: RunFolder, tmp_path:
     write_page(plain, tmp_path / "plain.html", max_splats=1000)
     hand.open((tmp_path / "plain.html").as_uri())
     assert not hand.browser.find_element("id", "objects").is_displayed()
-    assert b.errors(hand.browser) == []
+    assert b.messages(hand.browser) == []
 
 
 def test_names_are_no_markup(hand: Hand, run: RunFolder, tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_names_are_no_markup(hand: Hand, run: RunFolder, tmp_path: Path) -> None
             hand.wait("ggslam.total > 0")
             assert name in hand.text("chosen")
             assert not hand.ask("window.taken || document.querySelectorAll('iframe, h1 i').length")
-            assert b.errors(hand.browser) == []
+            assert b.messages(hand.browser) == []
     finally:
         hand.browser.get("about:blank")
         server.close()
@@ -129,7 +129,7 @@ def test_nothing_overlaps(hand: Hand, run: RunFolder, width: int, height: int, t
         assert hand.ask(_OUTSIDE) == [] and hand.ask(_COVERED) == [] and hand.ask(_NAMELESS) == []
         assert hand.ask("document.documentElement.scrollWidth") <= width
         assert hand.ask("ggslam.canvas.clientHeight") > 0.4 * height
-        assert b.errors(browser) == []
+        assert b.messages(browser) == []
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
@@ -150,4 +150,4 @@ def test_light_and_dark(hand: Hand, run: RunFolder, tmp_path: Path) -> None:
         assert (hand.ask(luminance) > 128) is not bright
         hand.ask("localStorage.removeItem('ggslam-theme')")
     hand.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
-    assert b.errors(hand.browser) == []
+    assert b.messages(hand.browser) == []

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ggslam.jobs.render.key_path import CameraKeys, read_camera_keys, view_at
+from ggslam.jobs.render.key_path import read_camera_keys, view_at
 from ggslam.jobs.render.shots import look_at_pose
 from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.records.annotations import CameraKeysRecord
 
 from . import browser as b
 from .page_hand import Hand
@@ -127,7 +128,7 @@ def test_the_preview_goes_the_way_of_the_film(served: tuple[Hand, ViewedRun]) ->
     asked = np.linspace(times[0] - 0.5, times[-1] + 0.5, 60).tolist()
     code = """arguments[1].map((time) => { const at = cameraAt(arguments[0], time);
         return [at.position, at.look_at, at.up, at.fov]; })"""
-    way = CameraKeys.model_validate({"keys": keys})
+    way = CameraKeysRecord.model_validate({"keys": keys})
     for time, (position, look_at, up, fov) in zip(asked, hand.ask(code, keys, asked), strict=True):
         T, camera = view_at(way, time, (1280, 720))
         assert np.allclose(look_at_pose(np.array(position), np.array(look_at), np.array(up)), T, atol=1e-9)
