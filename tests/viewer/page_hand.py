@@ -66,6 +66,7 @@ class Hand:
         from selenium.webdriver.common.action_chains import ActionChains
 
         handle = self.browser.find_elements("css selector", "#overlay .handle")[number]
+        b.wait_for(lambda: handle.get_attribute("cx"))  # it is placed with the next picture
         ActionChains(self.browser, duration=20).drag_and_drop_by_offset(handle, *by).perform()
 
     def keys(self, *keys: str) -> None:

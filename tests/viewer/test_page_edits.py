@@ -138,6 +138,7 @@ def test_splats_become_an_object_and_a_room_is_cropped(served: tuple[Hand, Viewe
     # A box round the middle of the map, one face of it dragged inward.
     hand.keys("6")
     box = hand.ask("ggslam.tools.current.shape()")
+    hand.wait("document.querySelector('#overlay .handle[cx]')")
     handles = hand.browser.find_elements("css selector", "#overlay .handle")
     seen = [k for k, handle in enumerate(handles) if handle.is_displayed()]
     face = next(k for k in seen if hand.ask(_UNCOVERED, handles[k]))

@@ -11,7 +11,7 @@ class AxisHandle {
   constructor(viewer, { color, place, direction, onstart = () => {}, onmove, from = () => null, words }) {
     Object.assign(this, { viewer, place, direction, onmove, from });
     this.arm = draw("line", { class: "arm", stroke: color });
-    this.dot = draw("circle", { class: "handle", r: 8, fill: color });
+    this.dot = draw("circle", { class: "handle", r: 8, fill: color, style: "display: none" });
     const title = draw("title");
     title.textContent = words;
     this.dot.append(title);
