@@ -50,7 +50,7 @@ points() {
 
 loop() {
     recording walk --scene loop
-    run walk_run "$work/walk" && run walk_open "$work/walk" --no-loops
+    run walk_run "$work/walk" --no-eval && run walk_open "$work/walk" --no-loops --no-eval
     local frames last rows=() frame
     last=$("$python" -c 'import json, sys; print(json.load(open(sys.argv[1]))["frames"] - 1)' "$work/walk_run/sequence.json")
     frames=$((last - 20)),$((last - 5))
