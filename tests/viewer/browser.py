@@ -15,7 +15,7 @@ import pytest
 
 from ggslam.scene.poses import quaternion_to_matrix
 
-PATIENCE_S = 60.0
+PATIENCE_S = 20.0
 LIBRARY_NOISE = "computeBoundingSphere(): Computed radius is NaN"
 """three.js says so of the mesh that viser draws all splats with, whose corners have two coordinates instead of three;
 a page of nothing but one splat says the same. It only keeps the mesh from being left out when it is out of sight."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -230,3 +231,44 @@ def test_what_nobody_saw_fades(
         assert found[1].mean() / 255 < 0.2 * whole.mean() and np.mean(picked) < 0.3
     for one, other in zip(*pictures.values(), strict=True):
         assert -10 * np.log10(np.mean((one / 255 - other / 255.0) ** 2)) > 45
+
+
+def test_lines_run_where_the_world_is(browser: Any, page: Path, poses: list[np.ndarray]) -> None:
+    """Two segments, one of which begins behind the camera, against their projections."""
+    m.open_map(browser, page, "processor")
+    here = np.array([[-0.5, -0.3, 2.0], [0.6, 0.2, 3.0]])
+    behind = np.array([[0.4, -0.2, -1.0], [-0.4, 0.3, 2.0]])
+    world = [(poses[0][:3, :3] @ line.T).T + poses[0][:3, 3] for line in (here, behind)]
+    draw = """map.setLines("test", Float32Array.from(values[0]), [255, 0, 0], 3);
+      await new Promise((resolve) => setTimeout(resolve, 600));
+      const { width, height } = map.canvas, image = map.canvas.getContext("2d").getImageData(0, 0, width, height);
+      const rows = []; for (let k = 0; k < image.data.length; k += 4) if (image.data[k + 3] > 127) rows.push(k / 4);
+      return [width, rows, image.data[4 * rows[0]]]"""
+    width, drawn, red = m.ask(browser, draw, np.concatenate([line.ravel() for line in world]).tolist())
+    assert width == SIZE[0] and red == 255
+    share = (0.05 + 1) / 3  # of the second segment, where it comes out of the near plane
+    start = behind[0] + share * (behind[1] - behind[0])
+    thin, thick = (np.zeros(SIZE[::-1], np.uint8) for _ in range(2))
+    for ends in (here, np.stack([start, behind[1]])):
+        pixels = 16 * (FOCAL * ends[:, :2] / ends[:, 2:] + np.array(SIZE) / 2 - 0.5)
+        first, last = (tuple(int(value) for value in pixel) for pixel in np.rint(pixels))
+        cv2.line(thin, first, last, 255, 1, cv2.LINE_8, 4)
+        cv2.line(thick, first, last, 255, 4, cv2.LINE_AA, 4)
+    found = np.zeros(SIZE[::-1], bool)
+    found.ravel()[drawn] = True
+    assert np.mean(thick[found] > 0) > 0.99 and np.mean(found[thin > 0]) > 0.99
+    assert m.ask(browser, draw.replace("map.setLines", "map.dropLines"), [])[1] == []
+
+
+def test_the_resolution_follows_the_time_a_picture_takes(browser: Any, page: Path) -> None:
+    m.open_map(browser, page, "processor")
+    scales = m.ask(browser, """const found = [], cost = [20, 900, 5];
+      const resolution = new Resolution(0.2, 1.5, 45);
+      for (const pixels of cost) {  // milliseconds of a picture: fixed, and by its pixels
+        for (let i = 0; i < 40; i++) resolution.took(5 + pixels * resolution.scale ** 2);
+        found.push(resolution.scale);
+      }
+      return found;""")  # fmt: skip
+    for pixels, scale in zip([20, 900, 5], scales, strict=True):
+        wanted = np.clip(np.sqrt(40 / pixels), 0.2, 1.5)
+        assert 0.75 * wanted < scale < 1.25 * wanted

@@ -191,7 +191,9 @@ class MapView {
       gap = now - this.drawnAt;
     this.drawnAt = now;
     this.lines.draw(shot);
-    if (!shot.sharp && gap < 500) this.resolution.took(shot.milliseconds || gap);
+    // After every movement comes a sharp picture, so that the time between two coarse ones is what one takes.
+    if (!shot.sharp && (shot.milliseconds || this.wasMoving)) this.resolution.took(shot.milliseconds || gap);
+    this.wasMoving = !shot.sharp;
     this.times.push(now);
     while (this.times[0] < now - 1000) this.times.shift();
     if (complete && this.chunks.size) this.becameReady();

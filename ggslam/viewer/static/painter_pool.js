@@ -7,11 +7,13 @@ class PainterPool {
       const worker = startWorker(
         paintInWorker,
         { TILE, FALL_STEPS, SEEN_RULES },
+        BandPainter,
         SplatProjector,
         TilePainter,
         isDisplaced,
         multiply,
-        rowsOf,
+        frameOf,
+        cameraOf,
         countingSort,
         ellipseEdge,
         SeenShapes,
@@ -73,7 +75,7 @@ class PainterPool {
         from = Math.max(from, end);
         if (bottom <= top) return;
         left++;
-        this.workers[i].postMessage({ job: [{ serial, shot, top, bottom, strips, kind, least }] });
+        this.workers[i].postMessage({ start: [{ serial, shot, top, bottom, strips, kind, least }] });
       });
       this.jobs.set(serial, { left, onstrip, resolve, times: [], drawn: 0 });
     });

@@ -11,7 +11,7 @@ class Resolution {
   took(milliseconds) {
     this.frameMs = this.frameMs ? 0.7 * this.frameMs + 0.3 * milliseconds : milliseconds;
     const factor = Math.sqrt(this.wanted / Math.max(milliseconds, 1));
-    if (factor < 0.9 || factor > 1.2) this.scale *= Math.max(0.7, Math.min(1.15, factor));
+    if (factor < 0.9 || factor > 1.2) this.scale *= Math.max(0.5, Math.min(1.15, factor));
     this.scale = Math.max(this.least, Math.min(this.most, this.scale));
   }
 }

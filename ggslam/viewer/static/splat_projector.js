@@ -5,7 +5,8 @@ class SplatProjector {
   constructor() {
     this.capacity = 0;
     this.count = 0;
-    this.logarithms = Float64Array.from({ length: 256 }, (_, alpha) => (alpha ? Math.log(alpha) : -1)); // of 255 alpha
+    this.flat = new Float64Array(3);
+    this.logarithms = Float64Array.from({ length: 256 }, (_, byte) => (byte ? Math.log(byte) : -1)); // of 255 alpha
   }
 
   // Room for so many splats. Conic: (a dx^2 + 2 b dx dy + c dy^2) / 2 is the exponent at an offset from the middle.
@@ -20,120 +21,112 @@ class SplatProjector {
     this.order = new Uint32Array(count);
   }
 
-  // chunks: {count, centers, covariances, alphas, ids, rgb, marks, radius}; top, bottom: rows of the picture that are
-  // wanted; asDepth: colours are (depth, 1, 0).
+  // chunks: {count, centers, covariances, alphas, ids, rgb, marks, radius, shapes}; top, bottom: rows of the picture
+  // that are wanted; asDepth: colours are (depth, 1, 0).
   project(chunks, states, displacement, shot, top, bottom, asDepth) {
     this.reserve(chunks.reduce((sum, chunk) => sum + chunk.count, 0));
     this.count = 0;
-    const moved = displacement && multiply(shot.view, displacement.T);
-    for (const chunk of chunks) this.projectChunk(chunk, states, displacement, moved, shot, top, bottom, asDepth);
-    this.sort();
+    this.asDepth = asDepth;
+    const frame = frameOf(shot, top, bottom);
+    const cameras = [shot.view, displacement && multiply(shot.view, displacement.T)].map(
+      (view) => view && cameraOf(view),
+    );
+    for (const chunk of chunks) this.projectChunk(chunk, states, displacement, cameras, frame);
+    countingSort(this.depthBits, this.bins, this.order, this.count);
   }
 
-  projectChunk(chunk, states, displacement, moved, { view, focal, near, width, height, sharp }, top, bottom, asDepth) {
-    const { count, centers, covariances: s, alphas, ids, rgb, marks, radius, shapes } = chunk;
-    const logarithms = this.logarithms;
-    const middleX = width / 2 - 0.5,
-      middleY = height / 2 - 0.5,
-      lowPass = SPLAT_RULES.lowPass;
-    const faint = sharp ? 0 : Math.log(SPLAT_RULES.movingMinAlpha / SPLAT_RULES.minAlpha);
-    const limitX = (SPLAT_RULES.slopeMargin * width) / focal,
-      limitY = (SPLAT_RULES.slopeMargin * height) / focal;
-    const left = -(width / 2 + 2) / focal,
-      right = -left,
-      above = (top - middleY - 3) / focal,
-      below = (bottom - middleY + 3) / focal;
-    const stretchX = Math.sqrt(1 + right * right),
-      stretchY = Math.sqrt(1 + Math.max(above * above, below * below));
-    let n = this.count,
-      eye = eyeOf(view),
-      [v0, v4, v8, v12, v1, v5, v9, v13, v2, v6, v10, v14] = rowsOf(view),
-      own = true;
+  // Leaves out what is not drawn and what lies beside the picture.
+  projectChunk(chunk, states, displacement, [still, moved], frame) {
+    const { count, centers, ids, marks, radius } = chunk,
+      { near, right, above, below, stretchX, stretchY } = frame;
     for (let i = 0; i < count; i++) {
-      const id = ids[i],
-        state = states[id],
-        mark = marks ? marks[i] : 0;
+      const state = states[ids[i]];
+      const mark = marks ? marks[i] : 0;
       if (!(state & SPLAT_RULES.visible) || mark & SPLAT_RULES.gone) continue;
-      if (displacement) {
-        const wanted = !isDisplaced(displacement, id, mark);
-        if (wanted !== own) {
-          own = wanted;
-          eye = eyeOf(own ? view : moved);
-          [v0, v4, v8, v12, v1, v5, v9, v13, v2, v6, v10, v14] = rowsOf(own ? view : moved);
-        }
-      }
-      const cx = centers[3 * i],
-        cy = centers[3 * i + 1],
-        cz = centers[3 * i + 2];
-      const z = v2 * cx + v6 * cy + v10 * cz + v14;
-      if (z < near) continue;
-      const x = v0 * cx + v4 * cy + v8 * cz + v12,
-        r = radius[i],
-        rx = r * stretchX;
-      if (x - right * z > rx || left * z - x > rx) continue;
-      const y = v1 * cx + v5 * cy + v9 * cz + v13,
-        ry = r * stretchY;
-      if (y - below * z > ry || above * z - y > ry) continue;
-      const inverse = 1 / z,
-        u = x * inverse,
-        v = y * inverse,
-        scale = focal * inverse;
-      const ju = -(u < -limitX ? -limitX : u > limitX ? limitX : u),
-        jv = -(v < -limitY ? -limitY : v > limitY ? limitY : v);
-      const p0 = v0 + ju * v2,
-        p1 = v4 + ju * v6,
-        p2 = v8 + ju * v10,
-        q0 = v1 + jv * v2,
-        q1 = v5 + jv * v6,
-        q2 = v9 + jv * v10;
-      let k = 6 * i,
-        from = s,
-        fade = 1;
-      if (shapes) {
-        fade = shapes.look(i, eye[0] - cx, eye[1] - cy, eye[2] - cz, r / 3.34);
-        if (fade <= 0) continue;
-        from = shapes.shape;
-        k = 0;
-      }
-      const s0 = from[k],
-        s1 = from[k + 1],
-        s2 = from[k + 2],
-        s3 = from[k + 3],
-        s4 = from[k + 4],
-        s5 = from[k + 5];
-      const e0 = s0 * p0 + s1 * p1 + s2 * p2,
-        e1 = s1 * p0 + s3 * p1 + s4 * p2,
-        e2 = s2 * p0 + s4 * p1 + s5 * p2,
-        square = scale * scale;
-      const xx = square * (p0 * e0 + p1 * e1 + p2 * e2) + lowPass,
-        xy = square * (q0 * e0 + q1 * e1 + q2 * e2);
-      const yy =
-        square *
-          (q0 * (s0 * q0 + s1 * q1 + s2 * q2) +
-            q1 * (s1 * q0 + s3 * q1 + s4 * q2) +
-            q2 * (s2 * q0 + s4 * q1 + s5 * q2)) +
-        lowPass;
-      const limit = logarithms[alphas[i]] - faint + (fade < 1 ? Math.log(fade) : 0);
-      if (!(limit > 0)) continue;
-      const reachY = Math.sqrt(2 * limit * yy),
-        sy = middleY + focal * v;
-      if (sy + reachY < top || sy - reachY > bottom - 1) continue;
-      const reachX = Math.sqrt(2 * limit * xx),
-        sx = middleX + focal * u;
-      if (sx + reachX < 0 || sx - reachX > width - 1) continue;
-      const determinant = 1 / (xx * yy - xy * xy);
-      this.x[n] = sx;
-      this.y[n] = sy;
-      this.a[n] = yy * determinant;
-      this.b[n] = -xy * determinant;
-      this.c[n] = xx * determinant;
-      this.opacity[n] = (fade * alphas[i]) / 255;
-      this.limit[n] = limit;
-      this.reachY[n] = reachY;
-      this.depth[n] = z;
-      this.paint(n++, asDepth ? null : rgb, i, state & SPLAT_RULES.selected || mark & SPLAT_RULES.marked);
+      const camera = displacement && isDisplaced(displacement, ids[i], mark) ? moved : still,
+        { rows } = camera;
+      const x = centers[3 * i];
+      const y = centers[3 * i + 1];
+      const z = centers[3 * i + 2];
+      const depth = rows[8] * x + rows[9] * y + rows[10] * z + rows[11];
+      if (depth < near) continue;
+      const across = rows[0] * x + rows[1] * y + rows[2] * z + rows[3];
+      const wide = right * depth + radius[i] * stretchX;
+      if (across > wide || across < -wide) continue;
+      const down = rows[4] * x + rows[5] * y + rows[6] * z + rows[7];
+      const reach = radius[i] * stretchY;
+      if (down - below * depth > reach || above * depth - down > reach) continue;
+      const tinted = (state & SPLAT_RULES.selected) !== 0 || (mark & SPLAT_RULES.marked) !== 0;
+      this.place(chunk, i, camera, across, down, depth, frame, tinted);
     }
-    this.count = n;
+  }
+
+  // Adds splat i, whose middle is at (x, y, z) from the camera, with its ellipse on the screen.
+  place(chunk, i, { rows: w, eye }, x, y, z, frame, tinted) {
+    const { focal, lowPass, limitX, limitY } = frame,
+      { centers, alphas, shapes, radius } = chunk;
+    let s = chunk.covariances,
+      k = 6 * i,
+      share = 1;
+    if (shapes) {
+      share = shapes.look(
+        i,
+        eye[0] - centers[3 * i],
+        eye[1] - centers[3 * i + 1],
+        eye[2] - centers[3 * i + 2],
+        radius[i] / 3.34,
+      );
+      s = shapes.shape;
+      k = 0;
+    }
+    const limit = share > 0 ? this.logarithms[alphas[i]] - frame.faint + (share < 1 ? Math.log(share) : 0) : 0;
+    if (limit <= 0) return;
+    const u = x / z;
+    const v = y / z;
+    const square = (focal / z) * (focal / z);
+    const ju = u < -limitX ? -limitX : u > limitX ? limitX : u;
+    const jv = v < -limitY ? -limitY : v > limitY ? limitY : v;
+    this.flatten(s, k, w, ju, jv);
+    const xx = square * this.flat[0] + lowPass;
+    const xy = square * this.flat[1];
+    const yy = square * this.flat[2] + lowPass;
+    const reachY = Math.sqrt(2 * limit * yy);
+    const screenY = frame.middleY + focal * v;
+    if (screenY + reachY < frame.top || screenY - reachY > frame.bottom - 1) return;
+    const reachX = Math.sqrt(2 * limit * xx);
+    const screenX = frame.middleX + focal * u;
+    if (screenX + reachX < 0 || screenX - reachX > frame.width - 1) return;
+    const n = this.count++;
+    const inverse = 1 / (xx * yy - xy * xy);
+    this.x[n] = screenX;
+    this.y[n] = screenY;
+    this.a[n] = yy * inverse;
+    this.b[n] = -xy * inverse;
+    this.c[n] = xx * inverse;
+    this.opacity[n] = (share * alphas[i]) / 255;
+    this.limit[n] = limit;
+    this.reachY[n] = reachY;
+    this.depth[n] = z;
+    this.paint(n, this.asDepth ? null : chunk.rgb, i, tinted);
+  }
+
+  // Covariance of the image (xx, xy, yy) over (focal / depth)^2, with the Jacobian's slopes ju and jv.
+  flatten(s, k, w, ju, jv) {
+    const p0 = w[0] - ju * w[8];
+    const p1 = w[1] - ju * w[9];
+    const p2 = w[2] - ju * w[10];
+    const q0 = w[4] - jv * w[8];
+    const q1 = w[5] - jv * w[9];
+    const q2 = w[6] - jv * w[10];
+    const a0 = s[k] * p0 + s[k + 1] * p1 + s[k + 2] * p2;
+    const a1 = s[k + 1] * p0 + s[k + 3] * p1 + s[k + 4] * p2;
+    const a2 = s[k + 2] * p0 + s[k + 4] * p1 + s[k + 5] * p2;
+    const b0 = s[k] * q0 + s[k + 1] * q1 + s[k + 2] * q2;
+    const b1 = s[k + 1] * q0 + s[k + 3] * q1 + s[k + 4] * q2;
+    const b2 = s[k + 2] * q0 + s[k + 4] * q1 + s[k + 5] * q2;
+    this.flat[0] = p0 * a0 + p1 * a1 + p2 * a2;
+    this.flat[1] = q0 * a0 + q1 * a1 + q2 * a2;
+    this.flat[2] = q0 * b0 + q1 * b1 + q2 * b2;
   }
 
   paint(n, rgb, i, tinted) {
@@ -150,34 +143,37 @@ class SplatProjector {
     this.green[n] = keep * rgb[3 * i + 1] + add * tint[1];
     this.blue[n] = keep * rgb[3 * i + 2] + add * tint[2];
   }
-
-  sort() {
-    countingSort(this.depthBits, this.bins, this.order, this.count);
-  }
 }
 
-function rowsOf(v) {
-  return [v[0], v[4], v[8], v[12], v[1], v[5], v[9], v[13], v[2], v[6], v[10], v[14]];
+// What of a picture's rows top .. bottom the projection needs to know.
+function frameOf({ focal, near, width, height, sharp }, top, bottom) {
+  const middleX = width / 2 - 0.5;
+  const middleY = height / 2 - 0.5;
+  const right = (width / 2 + 2) / focal;
+  const above = (top - middleY - 3) / focal;
+  const below = (bottom - middleY + 3) / focal;
+  return {
+    focal,
+    near,
+    width,
+    top,
+    bottom,
+    middleX,
+    middleY,
+    right,
+    above,
+    below,
+    stretchX: Math.sqrt(1 + right * right),
+    stretchY: Math.sqrt(1 + Math.max(above * above, below * below)),
+    limitX: (SPLAT_RULES.slopeMargin * width) / focal,
+    limitY: (SPLAT_RULES.slopeMargin * height) / focal,
+    lowPass: SPLAT_RULES.lowPass,
+    faint: sharp ? 0 : Math.log(SPLAT_RULES.movingMinAlpha / SPLAT_RULES.minAlpha),
+  };
 }
 
-// order: rows 0 .. count - 1 by rising key. Keys are the bits of positive floats: bins of a share of the depth, 0.02 %
-// where depths range from 5 cm to 100 m.
-function countingSort(keys, bins, order, count) {
-  let low = 0xffffffff,
-    high = 0;
-  for (let i = 0; i < count; i++) {
-    const key = keys[i];
-    if (key < low) low = key;
-    if (key > high) high = key;
-  }
-  let shift = 0;
-  while ((high - low) >>> shift > 65535) shift++;
-  const starts = new Uint32Array(65536);
-  for (let i = 0; i < count; i++) starts[(bins[i] = (keys[i] - low) >>> shift)]++;
-  for (let bin = 0, sum = 0; bin < 65536; bin++) {
-    const n = starts[bin];
-    starts[bin] = sum;
-    sum += n;
-  }
-  for (let i = 0; i < count; i++) order[starts[bins[i]]++] = i;
+// Rows of a matrix of world to camera, column-major, and where the camera is.
+function cameraOf(v) {
+  const rows = [v[0], v[4], v[8], v[12], v[1], v[5], v[9], v[13], v[2], v[6], v[10], v[14]];
+  return { rows: Float64Array.from(rows), eye: eyeOf(v) };
 }

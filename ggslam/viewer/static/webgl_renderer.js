@@ -37,7 +37,7 @@ class WebglRenderer {
     );
     this.textures = new SplatTextures(gl);
     this.buffers();
-    this.worker = startWorker(sortSplats, {}, isDisplaced, multiply);
+    this.worker = startWorker(sortInWorker, {}, SplatSorter, countingSort, isDisplaced, multiply);
     this.worker.onmessage = (event) => this.take(event.data);
   }
 
