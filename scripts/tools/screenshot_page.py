@@ -26,6 +26,8 @@ def main(page: str, out: str) -> None:
         options.add_argument(argument)
     browser = webdriver.Chrome(options=options)
     try:
+        view = {"width": SIZE[0], "height": SIZE[1], "deviceScaleFactor": 1, "mobile": False}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", view)
         browser.get(Path(page).resolve().as_uri())
         end = time.monotonic() + PATIENCE_S
         while not browser.execute_script(LOADED):
