@@ -9,7 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ggslam.errors import InputError
+from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ColorImage, DepthImage, Form, Mask, Pose
 from ggslam.system.savable import savable
@@ -60,19 +60,26 @@ class Frame:
     instant: int | None = None
 
     def __post_init__(self) -> None:
-        """Raises InputError for images of another type or size than the attributes say, or a time that is no number."""
+        """Raises SequenceError for images that are no arrays, of another size than the camera's or of another type.
+        `frame_checks.check_frame` also looks at the values, when a frame is mapped."""
         if not isinstance(self.camera, Camera):
-            raise InputError(f"camera: expected a Camera, found {type(self.camera).__name__}")
-        if isinstance(self.timestamp, bool) or not isinstance(self.timestamp, (int, float, np.number)):
-            raise InputError(f"timestamp: expected seconds, found {type(self.timestamp).__name__}")
+            raise SequenceError(
+                f"frame {self.source_index}: camera is {type(self.camera).__name__}, expected a ggslam.Camera"
+            )
         size = (self.camera.height, self.camera.width)
-        _check_image("color", self.color, np.uint8, (*size, 3))
-        _check_image("depth", self.depth, np.float32, size)
-        for name, dtype in (("mask", np.uint16), ("valid", np.bool_), ("moving", np.bool_), ("no_return", np.bool_)):
-            if getattr(self, name) is not None:
-                _check_image(name, getattr(self, name), dtype, size)
-        if self.T_world_camera is not None and np.shape(self.T_world_camera) != (4, 4):
-            raise InputError(f"T_world_camera: expected [4, 4], found {list(np.shape(self.T_world_camera))}")
+        self._check("colour", self.color, (*size, 3), np.uint8)
+        self._check("depth", self.depth, size, np.float32)
+
+    def _check(self, name: str, image: object, shape: tuple[int, ...], kind: type) -> None:
+        place = f"frame {self.source_index}: {name}"
+        if not isinstance(image, np.ndarray):
+            raise SequenceError(f"{place} is {type(image).__name__}, expected a numpy array")
+        if image.shape[:2] != shape[:2]:
+            found = "x".join(str(n) for n in image.shape[1::-1])
+            raise SequenceError(f"{place} is {found}, expected {shape[1]}x{shape[0]}")
+        if image.shape != shape or image.dtype != kind:
+            found = f"{image.dtype} {list(image.shape)}"
+            raise SequenceError(f"{place} is {found}, expected {np.dtype(kind)} {list(shape)}")
 
     def depth_or_infinity(self) -> np.ndarray:
         """Depth float32 [H, W], metres: 0 where unknown, +inf where the sensor found nothing."""
@@ -87,12 +94,3 @@ class Frame:
         if self.mask is not None or self.mask_loader is None:
             return self.mask
         return self.mask_loader()
-
-
-def _check_image(name: str, image: object, dtype: type, shape: tuple[int, ...]) -> None:
-    """Raises InputError unless it is an array of this type and shape, which is that of the camera's images."""
-    wanted = f"{name}: expected {np.dtype(dtype).name} {list(shape)}"
-    if not isinstance(image, np.ndarray):
-        raise InputError(f"{wanted} (numpy), found {type(image).__name__}")
-    if image.dtype != dtype or image.shape != shape:
-        raise InputError(f"{wanted}, found {image.dtype.name} {list(image.shape)}")

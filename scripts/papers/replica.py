@@ -26,8 +26,9 @@ of this repository. With them,
 ggslam batch --replica data/Replica --by-paper-rules
 ```
 
-makes our rows, scored by each paper's own rules, and `python scripts/papers/replica.py --batch runs/Replica` writes this
-page. A dash says that a figure was not made here. GG-SLAM's own figures are not in the code, so there is no row of them.
+makes our rows, scored by each paper's own rules, and `python scripts/papers/replica.py --batch runs/Replica` writes
+this page. A dash says that a figure was not made here. GG-SLAM's own figures are not in the code, so there is no row of
+them.
 """
 MISSING = """
 Not made yet, and without a command that makes them: GG-SLAM's comparison of semantic losses on one recording (table 2),
