@@ -47,6 +47,7 @@ class ScreenShape:
         near: nearer Gaussians are not shown, in metres.
         mask: bool [h, w]: what was drawn, in another number of pixels.
         seen_only: whether Gaussians behind the surface there are left out.
+        hidden: ids of objects that are not shown, and cover nothing.
     """
 
     T_camera_world: np.ndarray
@@ -56,6 +57,7 @@ class ScreenShape:
     near: float
     mask: np.ndarray
     seen_only: bool
+    hidden: frozenset[int] = frozenset()
 
     def rows(self, means: np.ndarray, depth_of: DepthOf | None) -> np.ndarray:
         """Which of the centres, float [N, 3], lie in what was drawn; bool [N]."""
@@ -79,10 +81,11 @@ class ScreenShape:
 
 @dataclass(frozen=True)
 class Step:
-    """A shape, and what becomes of the Gaussians in it."""
+    """A shape, what becomes of the Gaussians in it, and ids of objects that are hidden: it holds none of theirs."""
 
     mode: Mode
     shape: ScreenShape | _Sphere | _Box | _Objects | _All
+    hidden: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,8 @@ class Selection:
         for step in self.steps:
             shape = step.shape
             found = shape.rows(owners) if isinstance(shape, _Objects) else shape.rows(means, depth_of)
+            if step.hidden:
+                found &= ~np.isin(owners, list(step.hidden))
             if step.mode == "set":
                 selected = found
             elif step.mode == "add":
@@ -180,6 +185,8 @@ def read_selection(values: Any) -> Selection:
         {"kind": "screen", "T_camera_world": [16] by rows, "width", "height", "focal", "near", "seen_only",
          "mask": {"width", "height", "runs": [so many not set, so many set, ...] by rows}}
 
+    Each may have "hidden": ids of objects that were hidden, none of which it holds.
+
     Raises:
         ConfigError: it is something else; the message names the place.
     """
@@ -198,14 +205,18 @@ def _step(where: str, value: Any) -> Step:
     reader = readers.get(str(shape.get("kind")))
     if reader is None:
         raise ConfigError(f"{where}: expected a shape of the kinds {', '.join(readers)}")
-    return Step(value["mode"], reader(where, shape))
+    return Step(value["mode"], reader(where, shape), _ids(where, {"hidden": [], **shape}, "hidden"))
 
 
 def _objects(where: str, shape: Mapping[str, Any]) -> _Objects:
-    ids = shape.get("ids")
+    return _Objects(_ids(where, shape, "ids"))
+
+
+def _ids(where: str, shape: Mapping[str, Any], name: str) -> frozenset[int]:
+    ids = shape.get(name)
     if not isinstance(ids, list) or len(ids) > 65536 or not all(type(i) is int and 0 <= i <= 65535 for i in ids):
-        raise ConfigError(f"{where}: ids: expected object ids, 0 to 65535")
-    return _Objects(frozenset(ids))
+        raise ConfigError(f"{where}: {name}: expected object ids, 0 to 65535")
+    return frozenset(ids)
 
 
 def _sphere(where: str, shape: Mapping[str, Any]) -> _Sphere:
@@ -231,7 +242,8 @@ def _screen(where: str, shape: Mapping[str, Any]) -> ScreenShape:
     near = float(_numbers(where, {"near": [shape.get("near", 0.0)]}, "near", 1)[0])
     mask = _mask(where, shape.get("mask"))
     focal = _positive(where, shape, "focal")
-    return ScreenShape(T, max(width, 1), max(height, 1), focal, near, mask, shape.get("seen_only") is True)
+    hidden = _ids(where, {"hidden": [], **shape}, "hidden")
+    return ScreenShape(T, max(width, 1), max(height, 1), focal, near, mask, shape.get("seen_only") is True, hidden)
 
 
 def _mask(where: str, values: Any) -> np.ndarray:

@@ -118,6 +118,38 @@ def test_an_object_is_edited_and_saved(served: tuple[Hand, ViewedRun], tmp_path:
     assert len(saved.gaussians()) < len(model.folder.gaussians())
 
 
+def test_two_pages_keep_what_both_add(served: tuple[Hand, ViewedRun]) -> None:
+    """Keys of the film and notes; whoever is writing goes on."""
+    from selenium.webdriver.common.keys import Keys
+
+    hand, model = served
+    browser, first = hand.browser, hand.browser.current_window_handle
+    address = hand.ask("location.href")
+    browser.switch_to.new_window("tab")
+    hand.open(address)
+    hand.keys("k")
+    hand.wait("ggslam.film.keys.length === 1 && !ggslam.keeping")
+    browser.switch_to.window(first)
+    hand.wait("ggslam.film.keys.length === 1")
+    hand.keys("k")
+    hand.wait("ggslam.film.keys.length === 2 && !ggslam.keeping")
+    browser.switch_to.window(browser.window_handles[-1])
+    hand.wait("ggslam.film.keys.length === 2")
+    _, place = next(iter(hand.object_places().items()))
+    hand.keys("9")
+    hand.drag([place])
+    b.wait_for(lambda: hand.ask("document.activeElement.getAttribute('aria-label')") == "Text of the note")
+    browser.switch_to.active_element.send_keys("half")
+    rename = "ggslam.source.post('edit', { kind: 'rename', object: arguments[0], name: 'other' })"  # by somebody else
+    hand.ask(rename, model.objects()[0].id)
+    hand.wait("ggslam.scene.edits.length === 1")
+    browser.switch_to.active_element.send_keys(" a note", Keys.ENTER)
+    hand.wait("!ggslam.keeping && document.querySelector('#notes .label')?.textContent === 'half a note'")
+    browser.close()
+    browser.switch_to.window(first)
+    hand.wait("document.querySelector('#notes .label')?.textContent === 'half a note'")
+
+
 def test_splats_become_an_object_and_a_room_is_cropped(served: tuple[Hand, ViewedRun]) -> None:
     from selenium.webdriver.common.keys import Keys
 

@@ -103,6 +103,8 @@ class ViewedRun:
     def walks(self) -> list[np.ndarray]:
         """See `ViewedMap`."""
         found: dict[tuple[int, int], list[np.ndarray]] = {}
+        if not self.folder.has_poses:
+            return []  # nobody walked there
         for frame, pose in self.frame_poses.items():
             found.setdefault(self._record.walk_of(frame), []).append(pose[:3, 3])
         return [np.stack(positions) for positions in found.values()]
@@ -173,7 +175,7 @@ class ViewedRun:
                                                               else "")]  # fmt: skip
             taken = [quantity(len(self.frame_poses), "frame"), quantity(len(self.keyframe_poses), "keyframe")]
             parts += taken if self.folder.has_poses else [f"{quantity(len(self.frame_poses), 'view')} around it"]
-            if self._segmented is not None:
+            if self.has_objects and self._segmented is not None:
                 parts.append(quantity(len(self._segmented.table), "object"))
             return " · ".join(parts)
 

@@ -48,7 +48,14 @@ class ViewerSelecting {
     let next = shape;
     if (!exact && this.unit === "objects" && shape.kind !== "objects" && this.scene.objects.length)
       next = { kind: "objects", ids: this.objectsIn(shape) };
+    this.leaveHidden(next);
     this.select(mode === "set" ? [{ mode, shape: next }] : [...this.steps, { mode, shape: next }]);
+  }
+
+  // What is hidden is not selected by a shape.
+  leaveHidden(shape) {
+    if (shape.kind !== "objects" && this.hidden.size) shape.hidden = [...this.hidden];
+    return shape;
   }
 
   async chooseDrawn(mode, fill) {
@@ -94,11 +101,8 @@ class ViewerSelecting {
   }
 
   invert() {
-    this.select(
-      this.steps.length
-        ? [{ mode: "set", shape: { kind: "all" } }, ...this.minusSteps()]
-        : [{ mode: "set", shape: { kind: "all" } }],
-    );
+    const all = { mode: "set", shape: this.leaveHidden({ kind: "all" }) };
+    this.select(this.steps.length ? [all, ...this.minusSteps()] : [all]);
   }
 
   // Steps that take away what the present ones select: exact for one step, else by splats as they were found here.
