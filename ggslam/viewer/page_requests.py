@@ -82,6 +82,8 @@ class PageRequests(BaseHTTPRequestHandler):
             self._send_json({"error": str(error)}, status)
         except (ConnectionError, TimeoutError):  # the page is gone
             self.close_connection = True
+        except RecursionError:
+            self._send(400, "text/plain", b"400: nested too deeply\n")
         except Exception:
             _log.exception("a page's request failed")
             self._send_json({"error": "ggslam failed; it printed why"}, 500)
@@ -123,11 +125,12 @@ class PageRequests(BaseHTTPRequestHandler):
             self.server.events.leave(listener)
 
     def _post(self) -> None:
-        length = self.headers.get("Content-Length", "")
+        lengths = self.headers.get_all("Content-Length") or []
+        length = lengths[0] if len(lengths) == 1 else ""  # two of them would split one message in two ways
         if not length.isdecimal() or self.headers.get("Transfer-Encoding"):
             self._send(411, "text/plain", b"411: Content-Length is needed\n", close=True)
             return
-        if int(length) > AccessTuning.max_message_bytes:
+        if len(length) > 9 or int(length) > AccessTuning.max_message_bytes:
             self._send(413, "text/plain", b"413: too long\n", close=True)
             return
         body = self.rfile.read(int(length))
