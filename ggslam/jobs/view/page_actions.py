@@ -115,7 +115,7 @@ class PageActions:
         width, height = _whole(values, "width"), _whole(values, "height")
         if not 16 <= min(width, height) <= max(width, height) <= PageActionTuning.max_picture:
             raise ConfigError(f"picture: expected sides of 16 to {PageActionTuning.max_picture} pixels")
-        focal = values.get("focal")
+        focal: Any = values.get("focal")
         if type(focal) not in (int, float) or not 1 <= focal <= 1e5:
             raise ConfigError("picture: focal: expected a number of pixels")
         hidden = values.get("hidden", [])
