@@ -27,6 +27,8 @@ from ggslam.jobs.view.serve import serve_run
 from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.verification import verify_run
+from ggslam.system.tuning import overridden
+from ggslam.viewer.page_requests import RequestTuning
 from ggslam.viewer.page_server import PageServer
 
 MAX_SPLATS = 3000
@@ -217,6 +219,19 @@ def test_lengths_that_are_none(served: tuple[PageServer, ViewedRun], headers: st
         path = f"/edit?{urlsplit(server.address).query}"
         connection.sendall(f"POST {path} HTTP/1.1\r\nHost: localhost:{server.port}\r\n{headers}\r\n\r\n".encode())
         assert connection.recv(100).split()[1] in (b"411", b"413")
+
+
+def test_a_request_that_drips_is_cut_off(served: tuple[PageServer, ViewedRun]) -> None:
+    server, _ = served
+    with overridden(RequestTuning, request_s=1.0), socket.create_connection(("127.0.0.1", server.port)) as connection:
+        connection.settimeout(20)
+        connection.sendall(b"GET / HTTP/1.1\r\n")
+        start = time.monotonic()
+        with pytest.raises(ConnectionError):
+            while time.monotonic() - start < 15:
+                connection.sendall(b"X: y\r\n")
+                time.sleep(0.1)
+    assert Page(server).ask("GET", "/").status == 200
 
 
 def test_messages_are_not_nested_without_end(served: tuple[PageServer, ViewedRun]) -> None:
