@@ -116,7 +116,10 @@ BAD: tuple[Any, ...] = (
         {**GOOD, "focal": -1}, {**GOOD, "width": 0}, {**GOOD, "T_camera_world": [1, 2]}, {**GOOD, "mask": None},
         *({**GOOD, "mask": {"width": 3, "height": 2, "runs": runs}} for runs in ([0, 7], [-1], "x", [1.5])),
         {**GOOD, "mask": {"width": 10**6, "height": 10**6, "runs": []}},
+        {"kind": "sphere", "center": [0, 10**400, 0], "radius": 1}, {"kind": "sphere", "center": [0, 0, 0],
+                                                                     "radius": 10**400},
     )),
+    [{"mode": "add", "shape": {**GOOD, "mask": {"width": 1 << 22, "height": 1, "runs": []}}}] * 65,
 )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from ggslam.jobs.edit.edits import apply_edit, edit_run
 from ggslam.jobs.edit.selected import selected_rows
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.jobs.view.pictures import ViewPictures
-from ggslam.objects.editing import EditingTuning, opacity_centroid
+from ggslam.objects.editing import EditingTuning, group_centroid, opacity_centroid
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import copies_of
 from ggslam.objects.splat_editing import scene_without_objects
@@ -291,13 +291,15 @@ class ViewedRun:
         with self._lock:
             if not self._undone:
                 raise ConfigError("there is no edit to do again")
-            return self._do(self._undone.pop())
+            text = self._do(self._undone[-1])
+            self._undone.pop()
+            return text
 
     def _replay(self, edits: ListOf[Edit]) -> None:
-        """Reads the map anew and does edits to it."""
+        """Reads the map anew and does edits to it; a run that cannot be read any more leaves all as it is."""
         kept = list(edits)
-        self._edits, self._texts = [], []
         self._read_map()
+        self._edits, self._texts = [], []
         for edit in kept:
             self._do(edit)
 
@@ -320,7 +322,18 @@ class ViewedRun:
             scene = self._segmented or scene_without_objects(self._gaussians)
             return selected_rows(scene, selection)
 
-    def centroid_of(self, rows: np.ndarray) -> np.ndarray:
+    def centroid_of(self, ids: ListOf[int]) -> np.ndarray:
+        """About which objects turn, as one group, [3].
+
+        Raises:
+            ConfigError: there are none of these ids.
+        """
+        with self._lock:
+            if self._segmented is None:
+                raise ConfigError("this map has no objects")
+            return group_centroid(self._segmented, ids)
+
+    def centroid_of_rows(self, rows: np.ndarray) -> np.ndarray:
         """About which Gaussians (bool [N]) turn, [3]."""
         with self._lock:
             return opacity_centroid(copies_of(self._gaussians, rows))
