@@ -17,8 +17,10 @@ import numpy as np
 from ggslam.errors import ConfigError
 from ggslam.system.tuning import Tuning
 
-Mode = Literal["set", "add", "remove", "intersect"]
-MODES: Final = ("set", "add", "remove", "intersect")
+Mode = Literal["set", "add", "remove", "intersect", "invert"]
+MODES: Final = ("set", "add", "remove", "intersect", "invert")
+"""What becomes of the Gaussians in a shape; intersect drops those outside it, invert takes those in it that were not
+selected and drops those that were."""
 DepthOf = Callable[["ScreenShape"], np.ndarray]
 """Gives the depth of the surfaces that a screen shows, float32 [h, w] of its mask's size, metres; 0: none."""
 
@@ -116,15 +118,18 @@ class Selection:
                 selected = selected | found
             elif step.mode == "remove":
                 selected = selected & ~found
+            elif step.mode == "invert":
+                selected = selected ^ found
             else:
                 selected = selected & found
         return selected
 
     def objects(self) -> list[int] | None:
         """The ids, if the selection is of whole objects and nothing else."""
-        if len(self.steps) != 1 or self.steps[0].mode == "remove" or not isinstance(self.steps[0].shape, _Objects):
+        first = self.steps[0]
+        if len(self.steps) != 1 or first.mode not in ("set", "add") or not isinstance(first.shape, _Objects):
             return None
-        return sorted(self.steps[0].shape.ids)
+        return sorted(first.shape.ids)
 
 
 @dataclass(frozen=True)
@@ -178,7 +183,7 @@ def parse_selection(text: str) -> Selection:
 
 
 def read_selection(values: Any) -> Selection:
-    """A selection: a list of {"mode": "set" | "add" | "remove" | "intersect", "shape": SHAPE}, where SHAPE is one of
+    """A selection: a list of {"mode": one of `MODES`, "shape": SHAPE}, where SHAPE is one of
 
         {"kind": "all"}
         {"kind": "objects", "ids": [...]}

@@ -52,7 +52,9 @@ def test_steps_follow_each_other() -> None:
     assert rows(("add", objects), ("remove", near)) == [1]
     assert rows(("set", objects), ("intersect", near)) == [0]
     assert rows(("set", objects), ("add", {"kind": "objects", "ids": [3]})) == [0, 1, 4]
-    assert rows(("set", {"kind": "all"}), ("remove", objects)) == [2, 3, 4, 5]  # inverted
+    assert rows(("set", {"kind": "all"}), ("remove", objects)) == [2, 3, 4, 5]
+    assert rows(("set", objects), ("remove", near), ("invert", {"kind": "all"})) == [0, 2, 3, 4, 5]
+    assert rows(("set", objects), ("invert", near)) == [1]
 
 
 def test_a_screen_takes_what_is_drawn_on_and_nothing_behind_the_camera() -> None:
