@@ -141,7 +141,8 @@ def edit(
         )
     lines += [f"note: {note}" for note in outcome.notes]
     if outcome.folder.path.is_dir():
-        lines.append(f"wrote {outcome.folder.path}, {len(outcome.pictures)} pictures of before and after in renders/")
+        pictures = quantity(len(outcome.pictures), "picture")
+        lines.append(f"wrote {outcome.folder.path}, {pictures} of before and after in renders/")
     else:
         lines.append(f"wrote {outcome.folder.path}")
     for line in lines:
@@ -167,6 +168,8 @@ def _selection_in(word: str) -> str:
     """
     from ggslam.objects.selection import parse_selection
 
+    if word == "@":
+        raise ConfigError("@FILE: expected the name of a file behind the @")
     if not word.startswith("@"):
         raise ConfigError(f"--assign: expected @FILE, a selection that `ggslam view` saved, found {word!r}")
     text = read_untrusted_text(word[1:], ConfigError)
@@ -191,7 +194,9 @@ def _edits(words: list[tuple[str, list[str]]]) -> list[Edit]:
         if kind == "crop":
             edits.append(Edit("keep", "", selection=box_selection(values[0])))
         elif kind == "assign":
-            what, _, name = values[1].partition(":")
+            what, colon, name = values[1].partition(":")
+            if colon and what.strip().casefold() != "new":
+                raise ConfigError(f"--assign: only a new object gets a name, as new:NAME; found {values[1]!r}")
             edits.append(Edit("assign", what, name, selection=_selection_in(values[0])))
         elif kind != "rotate" and values[0].startswith("@"):
             edits.append(replace(Edit(kind, "", *values[1:]), selection=_selection_in(values[0])))  # type: ignore[arg-type]

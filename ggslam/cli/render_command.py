@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -70,12 +70,14 @@ def render(
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Pictures a second; default 30, of a .gif 15.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Length of the film; default: as recorded; orbit 12.")] = None,
-    smoothing: Annotated[float, typer.Option(help="Smoothing of the recorded path in seconds; 0: none.")] = 0.25,
+    smoothing: Annotated[
+        float | None, typer.Option(help="Smoothing of the recorded path in seconds; 0: none; default 0.25.")
+    ] = None,
     sequence: options.MovedSequence = None,
     plan: Annotated[
         Path | None, typer.Option(help="Write a floor plan to scale: a .png with a world file.", metavar="FILE")
     ] = None,
-    metre_per_pixel: Annotated[float, typer.Option(help="Scale of the plan.")] = 0.01,
+    metre_per_pixel: Annotated[float | None, typer.Option(help="Scale of the plan; default 0.01.")] = None,
     cut: Annotated[
         float | None, typer.Option(help="Height above the floor where the plan cuts; default: just above the cameras.")
     ] = None,
@@ -83,20 +85,45 @@ def render(
     """Render a run's map from the poses of its frames or from anywhere, as a film, or as a floor plan to scale."""
     from ggslam.runs.map_file import open_map
 
-    wanted = [name for name, value in (("pose", pose), ("film", film), ("plan", plan)) if value]
+    wanted = [name for name, value in (("pose", pose), ("film", film), ("plan", plan)) if value not in (None, [])]
     if len(wanted) > 1:
         raise ConfigError(f"`{wanted[0]}` and `{wanted[1]}`: expected one of them, found both")
-    folder = open_map(run)
+    way = wanted[0] if wanted else "frames"
+    _refuse_unused(way, {
+        "frames": frames, "every": every, "out": out, "width": width, "size": size, "path": path, "fps": fps,
+        "seconds": seconds, "smoothing": smoothing, "sequence": sequence, "metre_per_pixel": metre_per_pixel,
+        "cut": cut, "what": what,
+    })  # fmt: skip
+    smoothing = 0.25 if smoothing is None else smoothing
+    folder, kinds = open_map(run), "color,depth" if what is None else what
     if film is not None:
         chosen = size if size is not None or width is None else _size_of_width(folder, width)
-        _film(folder, film, path or ("recorded" if folder.has_poses else "orbit"), fps, seconds, chosen,
-              what or "color", smoothing, sequence)  # fmt: skip
+        chosen_path = path if path is not None else "recorded" if folder.has_poses else "orbit"
+        _film(folder, film, chosen_path, fps, seconds, chosen, "color" if what is None else what, smoothing,
+              sequence)  # fmt: skip
     elif plan is not None:
-        _plan(folder, plan, metre_per_pixel, cut)
+        _plan(folder, plan, 0.01 if metre_per_pixel is None else metre_per_pixel, cut)
     elif pose:
-        _poses(folder, pose, what or "color,depth", out, size)
+        _poses(folder, pose, kinds, out, size)
     else:
-        _frames(folder, frames, every, (what or "color,depth").split(","), out, width)
+        _frames(folder, frames, every, kinds.split(","), out, width)
+
+
+USED: Final = {
+    "frames": ("frames", "every", "out", "width", "what"),
+    "pose": ("out", "size", "what"),
+    "film": ("width", "size", "path", "fps", "seconds", "smoothing", "sequence", "what"),
+    "plan": ("metre_per_pixel", "cut"),
+}
+"""Options that each way of rendering takes."""
+
+
+def _refuse_unused(way: str, given: dict[str, object]) -> None:
+    """Raises ConfigError for an option that would be ignored."""
+    for name, value in given.items():
+        if value not in (None, []) and name not in USED[way]:
+            others = " or ".join(f"`{other}`" for other in USED if name in USED[other])
+            raise ConfigError(f"`{name}`: goes with {others}" + ("" if way == "frames" else f", not with `{way}`"))
 
 
 def _frames(

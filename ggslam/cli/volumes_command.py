@@ -46,7 +46,8 @@ Out = Annotated[
     typer.Option(help="Folder for the results; default RUN/volumes, STORE/volumes, or volumes/NAME of a recording."),
 ]
 Voxel = Annotated[
-    float | None, typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02, larger in large scenes).")
+    float | None,
+    typer.Option(help="Edge of the TSDF's voxels, metres (default 0.02, larger in large scenes).", min=0.001, max=1),
 ]
 Esdf = Annotated[bool, typer.Option("--esdf", help="Also make a distance field, with a slice and a ROS map.")]
 Occupancy = Annotated[

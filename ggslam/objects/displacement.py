@@ -36,6 +36,7 @@ class Displacement:
         """By object id: the rigid motion [4, 4] from the recorded place, None if there is no such place (duplicates)
         or no such motion (objects merged from displaced and other parts)."""
         self._left: list[tuple[int | None, GaussianTensors]] = []
+        self._cut: set[int] = set()
 
     def follow(self, change: Change, scene: SegmentedMap) -> None:
         """Takes note of an edit that was done to `scene`."""
@@ -46,7 +47,12 @@ class Displacement:
                 self._move(object_id, change.motion, scene)
         self.motions.update(dict.fromkeys(change.made))
         if change.merged is not None:
-            self._merge(*change.merged)
+            kept, merged = change.merged
+            self._gather(kept, (kept, merged))
+        if change.assigned is not None:
+            kept, sources = change.assigned
+            self._gather(kept, sources)
+            self._cut |= set(sources) - {0, kept}
         present = scene.table.ids()
         self.motions = {i: motion for i, motion in self.motions.items() if i in present}
         self._left = [(i if i in present else None, gaussians) for i, gaussians in self._left]
@@ -54,6 +60,10 @@ class Displacement:
     def left(self) -> list[GaussianTensors]:
         """What stood at the recorded places that are empty now, as it was."""
         return [gaussians for _, gaussians in self._left if len(gaussians.means)]
+
+    def cut(self) -> list[int]:
+        """Objects of which these edits took a part: what borders on the cut is the object, no trace of the part."""
+        return sorted(self._cut)
 
     def ids(self) -> list[int]:
         """Of the displaced objects, rising."""
@@ -92,12 +102,13 @@ class Displacement:
         else:
             self.motions[object_id] = total
 
-    def _merge(self, kept: int, merged: int) -> None:
-        parts = [self.motions.get(i, np.eye(4)) for i in (kept, merged)]
-        if kept in self.motions or merged in self.motions:
-            first, second = parts
-            same = first is not None and second is not None and np.allclose(first, second)
+    def _gather(self, kept: int, sources: tuple[int, ...]) -> None:
+        """An object (0: none) now has Gaussians of these."""
+        parts = [self.motions.get(i, np.eye(4)) for i in sources]
+        if kept and any(i in self.motions for i in sources):
+            first = parts[0]
+            same = first is not None and all(part is not None and np.allclose(first, part) for part in parts)
             # Of mixed parts, closing the hole of the one would damage what the other hides: none is closed.
             self.motions[kept] = first if same else None
         # A part alone does not come back to its place.
-        self._left = [(None if i in (kept, merged) else i, gaussians) for i, gaussians in self._left]
+        self._left = [(None if i in (kept, *sources) else i, gaussians) for i, gaussians in self._left]

@@ -58,6 +58,8 @@ class Change:
         motion: rigid transform [4, 4] that the objects of `left` did; None if they are gone.
         made: ids of new objects.
         merged: the id of the object that stays and that of the one that became a part of it.
+        assigned: the id of the object that got Gaussians (0: none), and those of the objects, one or none (0), that
+            had them before; of an object that there was already, its own, too.
     """
 
     text: str
@@ -67,6 +69,7 @@ class Change:
     motion: np.ndarray | None = None
     made: tuple[int, ...] = ()
     merged: tuple[int, int] | None = None
+    assigned: tuple[int, tuple[int, ...]] | None = None
 
 
 def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
@@ -84,7 +87,7 @@ def remove_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
 def keep_objects(scene: SegmentedMap, ids: Sequence[int]) -> Change:
     """Removes everything but these objects."""
     what = _labels(scene, ids)
-    own = {i: members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids}
+    own = _own_members(scene, ids)
     kept = np.logical_or.reduce(list(own.values()))
     before = copies_of(scene.gaussians, ~kept)
     _claim(scene, own)
@@ -166,8 +169,7 @@ def recolor_objects(scene: SegmentedMap, ids: Sequence[int], color: tuple[int, i
     """Gives objects a mean colour (0 to 255); see `recoloring.recolor`."""
     what = _labels(scene, ids)
     # Floaters are left out: many are faint and wide, and would cast the new colour over what lies behind them.
-    own = [members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids]
-    rows = np.logical_or.reduce(own)
+    rows = np.logical_or.reduce(list(_own_members(scene, ids).values()))
     before = copies_of(scene.gaussians, rows)
     recolor(scene.gaussians, rows, color)
     code = "".join(f"{value:02x}" for value in color)
@@ -207,17 +209,27 @@ def rename_object(scene: SegmentedMap, object_id: int, name: str) -> Change:
     Raises:
         ConfigError: unknown id; or a name that would be taken for an id or a list, or is "all", empty or another's.
     """
-    what, name = _labels(scene, [object_id]), name.strip()
+    what, name = _labels(scene, [object_id]), checked_name(scene.table, name, object_id)
+    records = [replace(r, name=name) if r.id == object_id else r for r in scene.table.objects]
+    scene.table = replace(scene.table, objects=records)
+    return Change(f"renamed {what} to {name}", no_gaussians(scene), no_gaussians(scene))
+
+
+def checked_name(table: ObjectTable, name: str, object_id: int | None = None) -> str:
+    """A name that an object (None: a new one) may have, without spaces around it.
+
+    Raises:
+        ConfigError: it would be taken for an id or a list, or is "all", empty or another's.
+    """
+    name = name.strip()
     if len(name) > EditingTuning.max_name_length:
         raise ConfigError(f"name {name[:20]!r}...: {len(name)} characters, at most {EditingTuning.max_name_length}")
     if not name or name.isdecimal() or "," in name or name.casefold() == "all" or not name.isprintable():
         raise ConfigError(f"name {name!r}: expected a printable word that is no number, without commas, and not 'all'")
-    taken = [i for i, other in names_of(scene.table).items() if other.casefold() == name.casefold() and i != object_id]
+    taken = [i for i, other in names_of(table).items() if other.casefold() == name.casefold() and i != object_id]
     if taken:
         raise ConfigError(f"name {name!r}: object {taken[0]} has it already")
-    records = [replace(r, name=name) if r.id == object_id else r for r in scene.table.objects]
-    scene.table = replace(scene.table, objects=records)
-    return Change(f"renamed {what} to {name}", no_gaussians(scene), no_gaussians(scene))
+    return name
 
 
 def rigid_motion(centre: np.ndarray, shift: Vector, rotate_degrees: Vector = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -252,10 +264,25 @@ def _check_near(scene: SegmentedMap, kind: str, ids: Sequence[int], shift: Vecto
 
 def _claimed_rows(scene: SegmentedMap, ids: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Members of objects without floaters, labelled as theirs from now on; and the floaters. bool [N] both."""
-    own = {i: members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids}
+    own = _own_members(scene, ids)
     _claim(scene, own)
     rows = np.logical_or.reduce(list(own.values()))
     return rows, np.isin(scene.gaussians.object_id.numpy(), ids) & ~rows
+
+
+def _own_members(scene: SegmentedMap, ids: Sequence[int]) -> dict[int, np.ndarray]:
+    """Members of each object without floaters, bool [N] each."""
+    return {i: members(scene.gaussians, scene.classifier, [i], MembershipSettings(floaters=False)) for i in ids}
+
+
+def group_centroid(scene: SegmentedMap, ids: Sequence[int]) -> np.ndarray:
+    """About which `move_objects` turns these objects, [3].
+
+    Raises:
+        ConfigError: unknown ids, or none.
+    """
+    _labels(scene, ids)
+    return opacity_centroid(copies_of(scene.gaussians, np.logical_or.reduce(list(_own_members(scene, ids).values()))))
 
 
 def _by_object(scene: SegmentedMap, rows: np.ndarray, ids: Sequence[int]) -> dict[int, GaussianTensors]:

@@ -55,8 +55,9 @@ def places(removed: GaussianTensors, touching: float = 0.05) -> list[GaussianTen
 
 
 def drop_artifacts(
-    scene: SegmentedMap, removed: GaussianTensors, views: Sequence[CameraView], ignored: Sequence[int] = ()
-) -> int:
+    scene: SegmentedMap, removed: GaussianTensors, views: Sequence[CameraView], ignored: Sequence[int] = (),
+    spared: Sequence[int] = (),
+) -> int:  # fmt: skip
     """Drops what a removed object left in its surroundings; returns how many Gaussians.
 
     Args:
@@ -64,10 +65,13 @@ def drop_artifacts(
         removed: Gaussians that were there, one of `places`.
         views: from where the map was seen.
         ignored: ids of objects that are no part of the surroundings and stay as they are.
+        spared: ids of objects that are, and stay as they are: the removed was cut out of them.
     """
-    around = ~np.isin(scene.gaussians.object_id.numpy(), list(ignored))
+    owners = scene.gaussians.object_id.numpy()
+    around = ~np.isin(owners, list(ignored))
     dropped = np.zeros(len(around), bool)
     dropped[around] = find_artifacts(copies_of(scene.gaussians, around), removed, views)
+    dropped &= ~np.isin(owners, list(spared))
     keep_rows(scene, ~dropped)
     return int(dropped.sum())
 

@@ -17,8 +17,10 @@ import numpy as np
 from ggslam.errors import ConfigError
 from ggslam.system.tuning import Tuning
 
-Mode = Literal["set", "add", "remove", "intersect"]
-MODES: Final = ("set", "add", "remove", "intersect")
+Mode = Literal["set", "add", "remove", "intersect", "invert"]
+MODES: Final = ("set", "add", "remove", "intersect", "invert")
+"""What becomes of the Gaussians in a shape; intersect drops those outside it, invert takes those in it that were not
+selected and drops those that were."""
 DepthOf = Callable[["ScreenShape"], np.ndarray]
 """Gives the depth of the surfaces that a screen shows, float32 [h, w] of its mask's size, metres; 0: none."""
 
@@ -30,6 +32,8 @@ class SelectionTuning(Tuning):
     """Most steps of a selection."""
     max_mask_pixels = 1 << 22
     """Most pixels of what is drawn on the screen."""
+    max_pixels_of_all = 1 << 28
+    """Most pixels of all that is drawn in a selection: each drawing may need the map to be rendered."""
     seen_share = 0.05
     """A Gaussian is seen whose depth is beyond the surface there by at most this share of it ..."""
     seen_m = 0.03
@@ -114,15 +118,18 @@ class Selection:
                 selected = selected | found
             elif step.mode == "remove":
                 selected = selected & ~found
+            elif step.mode == "invert":
+                selected = selected ^ found
             else:
                 selected = selected & found
         return selected
 
     def objects(self) -> list[int] | None:
         """The ids, if the selection is of whole objects and nothing else."""
-        if len(self.steps) != 1 or self.steps[0].mode == "remove" or not isinstance(self.steps[0].shape, _Objects):
+        first = self.steps[0]
+        if len(self.steps) != 1 or first.mode not in ("set", "add") or not isinstance(first.shape, _Objects):
             return None
-        return sorted(self.steps[0].shape.ids)
+        return sorted(first.shape.ids)
 
 
 @dataclass(frozen=True)
@@ -176,7 +183,7 @@ def parse_selection(text: str) -> Selection:
 
 
 def read_selection(values: Any) -> Selection:
-    """A selection: a list of {"mode": "set" | "add" | "remove" | "intersect", "shape": SHAPE}, where SHAPE is one of
+    """A selection: a list of {"mode": one of `MODES`, "shape": SHAPE}, where SHAPE is one of
 
         {"kind": "all"}
         {"kind": "objects", "ids": [...]}
@@ -192,7 +199,14 @@ def read_selection(values: Any) -> Selection:
     """
     if not isinstance(values, list) or not 0 < len(values) <= SelectionTuning.max_steps:
         raise ConfigError(f"selection: expected a list of 1 to {SelectionTuning.max_steps} steps")
-    return Selection(tuple(_step(f"selection[{k}]", value) for k, value in enumerate(values)))
+    steps, pixels = list[Step](), 0
+    for k, value in enumerate(values):
+        steps.append(_step(f"selection[{k}]", value))
+        shape = steps[-1].shape
+        pixels += shape.mask.size if isinstance(shape, ScreenShape) else 0
+        if pixels > SelectionTuning.max_pixels_of_all:
+            raise ConfigError(f"selection: what is drawn has over {SelectionTuning.max_pixels_of_all:,} pixels in all")
+    return Selection(tuple(steps))
 
 
 def _step(where: str, value: Any) -> Step:
@@ -267,12 +281,11 @@ def _count(value: Any) -> int:
 
 
 def _numbers(where: str, values: Mapping[str, Any], name: str, count: int) -> np.ndarray:
-    found = values.get(name)
+    found: Any = values.get(name)
     numbers = isinstance(found, Sequence) and len(found) == count and all(type(v) in (int, float) for v in found)
-    array = np.array(found, np.float64) if numbers else np.array([np.nan])
-    if not np.isfinite(array).all() or np.abs(array).max() > 1e9:
-        raise ConfigError(f"{where}: {name}: expected {count} finite number{'s' * (count > 1)}")
-    return array
+    if not numbers or not all(abs(v) <= 1e9 for v in found):  # of whole numbers, too, that no float holds
+        raise ConfigError(f"{where}: {name}: expected {count} finite number{'s' * (count > 1)}, at most 1e9")
+    return np.array(found, np.float64)
 
 
 def _positive(where: str, values: Mapping[str, Any], name: str) -> float:

@@ -15,6 +15,7 @@ from ggslam.objects.editing import (
     Change,
     EditingTuning,
     Vector,
+    checked_name,
     enrol,
     forget,
     free_id,
@@ -125,13 +126,14 @@ def assign_gaussians(scene: SegmentedMap, rows: np.ndarray, object_id: int | Non
         ConfigError: none is selected, no such object, a name that cannot be, or no id is left.
     """
     count, g = _check_rows(rows), scene.gaussians
-    made: tuple[int, ...] = ()
+    sources, new = set(np.unique(g.object_id.numpy()[rows]).tolist()), object_id is None
     if object_id is None:
+        name = checked_name(scene.table, name) if name.strip() else ""
         object_id = free_id({*scene.table.ids(), *scene.classifier.class_ids.tolist()})
         enrol(scene, rows, object_id)
-        made = (object_id,)
     elif object_id:
         scene.table.record(object_id)
+        sources.add(object_id)
         assign(g, scene.classifier, rows, object_id)
     else:
         g.object_id[torch.from_numpy(rows)] = 0
@@ -144,11 +146,13 @@ def assign_gaussians(scene: SegmentedMap, rows: np.ndarray, object_id: int | Non
         weights[rows, 1:] = 0
         scene.votes = ObjectVotes(ids, weights)
     _forget_empty(scene)
-    if made and name.strip():
+    if new and name:
         rename_object(scene, object_id, name)
     whose = scene.table.record(object_id).label() if object_id else "no object"
     nothing = no_gaussians(scene)
-    return Change(f"{quantity(count, 'selected Gaussian')} belong to {whose}", nothing, nothing, made=made)
+    belong = "belongs" if count == 1 else "belong"
+    text = f"{quantity(count, 'selected Gaussian')} {belong} to {whose}"
+    return Change(text, nothing, nothing, assigned=(object_id, tuple(sorted(sources))))
 
 
 def _check_rows(rows: np.ndarray) -> int:

@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
+import math
+import socket
+import time
 from http.server import BaseHTTPRequestHandler
 from typing import Any, Final
 from urllib.parse import parse_qs, quote, urlsplit
@@ -22,6 +26,8 @@ class RequestTuning(Tuning):
 
     timeout_s = 20.0
     """Seconds that a connection may stand still while something is read or written."""
+    request_s = 60.0
+    """Seconds in which a request has to be here, however it drips: whoever has no token holds no connection."""
 
 
 _log = logging.getLogger(__name__)
@@ -46,6 +52,25 @@ class _Once:
         return found[0] if found else None
 
 
+class _RequestReader(socket.SocketIO):
+    """Reads from a connection until a time."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        super().__init__(connection, "r")
+        self._connection, self.end = connection, math.inf
+
+    def readinto(self, buffer: Any) -> int | None:
+        """Raises TimeoutError if nothing comes in time."""
+        left = self.end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError("the request took too long")
+        self._connection.settimeout(min(left, RequestTuning.timeout_s))
+        try:
+            return super().readinto(buffer)
+        finally:
+            self._connection.settimeout(RequestTuning.timeout_s)
+
+
 class PageRequests(BaseHTTPRequestHandler):
     """Answers the requests of one connection."""
 
@@ -54,6 +79,18 @@ class PageRequests(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "ggslam", ""
     timeout = RequestTuning.timeout_s
+
+    def setup(self) -> None:
+        """Reads through a reader that gives up."""
+        super().setup()
+        self.rfile.close()
+        self._reader = _RequestReader(self.connection)
+        self.rfile = io.BufferedReader(self._reader)
+
+    def handle_one_request(self) -> None:
+        """The next request of the connection, which has to be here in time."""
+        self._reader.end = time.monotonic() + RequestTuning.request_s
+        super().handle_one_request()
 
     def do_GET(self) -> None:
         """Page, scene, splats, pictures, events."""
@@ -82,6 +119,8 @@ class PageRequests(BaseHTTPRequestHandler):
             self._send_json({"error": str(error)}, status)
         except (ConnectionError, TimeoutError):  # the page is gone
             self.close_connection = True
+        except RecursionError:
+            self._send(400, "text/plain", b"400: nested too deeply\n")
         except Exception:
             _log.exception("a page's request failed")
             self._send_json({"error": "ggslam failed; it printed why"}, 500)
@@ -123,11 +162,12 @@ class PageRequests(BaseHTTPRequestHandler):
             self.server.events.leave(listener)
 
     def _post(self) -> None:
-        length = self.headers.get("Content-Length", "")
+        lengths = self.headers.get_all("Content-Length") or []
+        length = lengths[0] if len(lengths) == 1 else ""  # two of them would split one message in two ways
         if not length.isdecimal() or self.headers.get("Transfer-Encoding"):
             self._send(411, "text/plain", b"411: Content-Length is needed\n", close=True)
             return
-        if int(length) > AccessTuning.max_message_bytes:
+        if len(length) > 9 or int(length) > AccessTuning.max_message_bytes:
             self._send(413, "text/plain", b"413: too long\n", close=True)
             return
         body = self.rfile.read(int(length))

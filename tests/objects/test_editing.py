@@ -214,6 +214,32 @@ def test_a_merged_object_stays_displaced(scene: SegmentedMap) -> None:
     assert after.left() == []
 
 
+def ball(scene: SegmentedMap, object_id: int, radius: float) -> str:
+    center = np.array(scene.table.record(object_id).centroid).tolist()
+    return json.dumps([{"mode": "set", "shape": {"kind": "sphere", "center": center, "radius": radius}}])
+
+
+def test_an_object_made_of_a_part_stands_where_it_was_recorded(scene: SegmentedMap) -> None:
+    sofa = largest(scene, "sofa")
+    after = followed(scene, Edit("assign", "new", "seat", selection=ball(scene, sofa, 0.2)))
+    assert after.ids() == [] and after.cut() == [sofa]
+    assert len(followed(scene, Edit("remove", "seat"), earlier=after).left()) == 1
+
+
+def test_a_part_of_a_moved_object_stays_displaced(scene: SegmentedMap) -> None:
+    sofa, mug, pouf = (largest(scene, name) for name in ("sofa", "mug", "pouf"))
+    moved = followed(scene, Edit("move", str(sofa), "0 -2 0"))
+    part = ball(scene, sofa, 0.2)
+    after = followed(scene, Edit("assign", "new", "seat", selection=part), earlier=moved)
+    seat = scene.table.find("seat")[0]
+    assert after.ids() == sorted([sofa, seat])
+    assert np.allclose(after.motions[seat], moved.motions[sofa])
+    after = followed(scene, Edit("assign", str(pouf), selection=ball(scene, seat, 0.1)), earlier=after)
+    assert after.motions[pouf] is None and mug not in after.ids()  # of a moved part and one in its place
+    back = Edit("move", "seat", "0 2 0")
+    assert seat not in followed(scene, back, earlier=after).ids()
+
+
 def copies(scene: SegmentedMap, *ids: int) -> list[GaussianTensors]:
     return [copies_of(scene.gaussians, scene.gaussians.object_id.numpy() == i) for i in ids]
 

@@ -52,7 +52,9 @@ def test_steps_follow_each_other() -> None:
     assert rows(("add", objects), ("remove", near)) == [1]
     assert rows(("set", objects), ("intersect", near)) == [0]
     assert rows(("set", objects), ("add", {"kind": "objects", "ids": [3]})) == [0, 1, 4]
-    assert rows(("set", {"kind": "all"}), ("remove", objects)) == [2, 3, 4, 5]  # inverted
+    assert rows(("set", {"kind": "all"}), ("remove", objects)) == [2, 3, 4, 5]
+    assert rows(("set", objects), ("remove", near), ("invert", {"kind": "all"})) == [0, 2, 3, 4, 5]
+    assert rows(("set", objects), ("invert", near)) == [1]
 
 
 def test_a_screen_takes_what_is_drawn_on_and_nothing_behind_the_camera() -> None:
@@ -116,7 +118,10 @@ BAD: tuple[Any, ...] = (
         {**GOOD, "focal": -1}, {**GOOD, "width": 0}, {**GOOD, "T_camera_world": [1, 2]}, {**GOOD, "mask": None},
         *({**GOOD, "mask": {"width": 3, "height": 2, "runs": runs}} for runs in ([0, 7], [-1], "x", [1.5])),
         {**GOOD, "mask": {"width": 10**6, "height": 10**6, "runs": []}},
+        {"kind": "sphere", "center": [0, 10**400, 0], "radius": 1}, {"kind": "sphere", "center": [0, 0, 0],
+                                                                     "radius": 10**400},
     )),
+    [{"mode": "add", "shape": {**GOOD, "mask": {"width": 1 << 22, "height": 1, "runs": []}}}] * 65,
 )  # fmt: skip
 
 

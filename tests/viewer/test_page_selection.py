@@ -56,7 +56,7 @@ def test_page_and_program_select_the_same(served: tuple[Hand, ViewedRun]) -> Non
     centers, owners = draw.normal(size=(n, 3)).astype(np.float32), draw.integers(0, 8, n)
     surface = draw.uniform(0, 4, 60 * 60).astype(np.float32)
     splats = {"count": n, "centers": centers.ravel().tolist(), "ids": owners.tolist()}
-    modes = ["set", "add", "remove", "intersect"]
+    modes = ["set", "add", "remove", "intersect", "invert"]
     cases = [
         [{"mode": str(draw.choice(modes)), "shape": random_shape(draw)} for _ in range(draw.integers(1, 5))]
         for _ in range(300)

@@ -27,6 +27,8 @@ from ggslam.jobs.view.serve import serve_run
 from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.verification import verify_run
+from ggslam.system.tuning import overridden
+from ggslam.viewer.page_requests import RequestTuning
 from ggslam.viewer.page_server import PageServer
 
 MAX_SPLATS = 3000
@@ -157,7 +159,9 @@ WRONG: tuple[tuple[str, Any, str], ...] = (
     ("edit", {"kind": "rename", "object": 1}, "name: expected a text"),
     ("edit", {"kind": "rename", "object": 60000, "name": "x"}, "60000"),
     ("edit", {"kind": "move", "selection": objects(1), "T": [1] * 16}, "rigid"),
+    ("edit", {"kind": "move", "selection": objects(1), "T": [10**400, *np.eye(4).ravel().tolist()[1:]]}, "rigid"),
     ("edit", {"kind": "recolor", "selection": objects(1), "color": "url(x)"}, "color"),
+    ("picture", {"width": 64, "height": 48, "focal": 10**400}, "focal"),
     ("undo", {}, "no edit"), ("redo", {}, "no edit"), ("save", {"target": "x"}, "nothing was edited"),
     ("picture", {"width": 10**9, "height": 10}, "picture"), ("export", {"object": 60000}, "60000"),
     ("annotations", {"annotations": [{"point": [0, 0], "text": "x"}]}, "annotations.0.point"),
@@ -190,6 +194,51 @@ def test_notes_and_keys_are_kept_beside_the_run(served: tuple[PageServer, Viewed
     assert kept["annotations"][0]["text"] == text
     (model.folder.path / "annotations.json").write_text("{" * 1000)
     assert page.scene()["annotations"] == []
+    (model.folder.path / "annotations.json").write_text('{"annotations": [], "more": ' + "[" * 900 + "]" * 900 + "}")
+    assert page.scene()["annotations"] == []
+
+
+def test_several_objects_move_as_one_group(served: tuple[PageServer, ViewedRun]) -> None:
+    """Also what they turn about, and that they leave holes, is as `ggslam edit` has it."""
+    server, model = served
+    ids = [o.id for o in model.objects()][1:3]
+    owners = model.gaussians().object_id.numpy()
+    before = model.gaussians().means.numpy()[np.isin(owners, ids)].astype(float)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], [0.3, 0.0, -0.2]
+    Page(server).post("edit", {"kind": "move", "selection": objects(*ids), "T": T.ravel().tolist()})
+    assert [(e.kind, e.objects, e.selection) for e in model._edits] == [("move", ",".join(map(str, ids)), "")]
+    distance = cKDTree(model.gaussians().means.numpy()).query(before @ T[:3, :3].T + T[:3, 3])[0]
+    assert np.mean(distance < 1e-4) > 0.98  # floaters stay
+
+
+@pytest.mark.parametrize("headers", ["Content-Length: " + "9" * 5000, "Content-Length: 2\r\nContent-Length: 3"])
+def test_lengths_that_are_none(served: tuple[PageServer, ViewedRun], headers: str) -> None:
+    server, model = served
+    with socket.create_connection(("127.0.0.1", server.port), timeout=20) as connection:
+        path = f"/edit?{urlsplit(server.address).query}"
+        connection.sendall(f"POST {path} HTTP/1.1\r\nHost: localhost:{server.port}\r\n{headers}\r\n\r\n".encode())
+        assert connection.recv(100).split()[1] in (b"411", b"413")
+
+
+def test_a_request_that_drips_is_cut_off(served: tuple[PageServer, ViewedRun]) -> None:
+    server, _ = served
+    with overridden(RequestTuning, request_s=1.0), socket.create_connection(("127.0.0.1", server.port)) as connection:
+        connection.settimeout(20)
+        connection.sendall(b"GET / HTTP/1.1\r\n")
+        start = time.monotonic()
+        with pytest.raises(ConnectionError):
+            while time.monotonic() - start < 15:
+                connection.sendall(b"X: y\r\n")
+                time.sleep(0.1)
+    assert Page(server).ask("GET", "/").status == 200
+
+
+def test_messages_are_not_nested_without_end(served: tuple[PageServer, ViewedRun]) -> None:
+    values: Any = 1
+    for _ in range(900):
+        values = [values]
+    assert Page(served[0]).ask("POST", "/annotations", {"annotations": values}).status == 400
 
 
 def test_pictures_and_files(served: tuple[PageServer, ViewedRun]) -> None:

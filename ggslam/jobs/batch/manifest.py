@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 import shlex
 from collections.abc import Iterable, Sequence
@@ -118,7 +119,9 @@ def read_manifest(path: str | Path, out: Path | None = None, options: Sequence[s
     except PlainYamlError as error:
         raise ConfigError(f"{path}: {error}") from None
     if not isinstance(values, dict) or set(values) - _KEYS or "recordings" not in values:
-        raise NotABatchError(path, f"expected recordings and no other keys than {', '.join(sorted(_KEYS))}")
+        strange = [str(key)[:40] for key in values if key not in _KEYS] if isinstance(values, dict) else []
+        found = f", found {', '.join(strange)}" if strange else ""
+        raise NotABatchError(path, f"expected recordings and no other keys than {', '.join(sorted(_KEYS))}{found}")
     asked = tuple(_check_words("`options`", options))
     common = _options(path, "options", values.get("options"))
     items = _take_list(path, "recordings", values["recordings"])
@@ -228,6 +231,8 @@ def _check_words(where: str, words: Sequence[str]) -> Sequence[str]:
     for name, value in _pairs(words):
         if name not in map(option, ALLOWED):
             told = f"{name} is not for batches: folders, seeds, scores and pages are theirs"
+            near = difflib.get_close_matches(name, [option(known) for known in ALLOWED], 1, 0.75)
+            told += f"; did you mean {near[0]}?" if near else ""
             told = told if name.startswith("-") else f"expected an option, found {name[:80]!r}"
             raise ConfigError(f"{where}: {told}")
         if value is None and name[2:] not in FLAGS:

@@ -308,7 +308,9 @@ def _mend(
     if settings is not None:
         filling = inpaint(scene, removed, source.views, displaced, recording, settings)
     else:
-        filling = Filling(dropped=sum(drop_artifacts(scene, part, source.views, displaced) for part in places(removed)))
+        spared = source.displacement.cut()
+        dropped = [drop_artifacts(scene, part, source.views, displaced, spared) for part in places(removed)]
+        filling = Filling(dropped=sum(dropped))
     rebuild_table(scene)
     return filling
 

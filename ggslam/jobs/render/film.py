@@ -83,7 +83,7 @@ def render_film(
     folder = run if isinstance(run, RunFolder) else open_map(run)
     ending, out, beside = film_ending(Path(out)), Path(out), BESIDE in what
     kinds = [kind for kind in what if kind != BESIDE] or ["color"]
-    rate = fps or (FilmJobTuning.gif_fps if ending == ".gif" else None)
+    rate = FilmJobTuning.gif_fps if fps is None and ending == ".gif" else fps
     shots = shots_along(folder, path, rate, seconds, size, smoothing, beside)
     artist = Artist(folder, kinds)
     recorded = _RecordedPictures(folder, kinds, path, recording) if beside else None

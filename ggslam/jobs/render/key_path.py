@@ -67,7 +67,7 @@ def key_shots(
         ConfigError: numbers that make no film, or a camera that looks along its up direction.
     """
     times = np.array([key.time for key in keys.keys])
-    shown, taken = film_times(float(times[-1] - times[0]), fps or keys.fps, seconds)
+    shown, taken = film_times(float(times[-1] - times[0]), keys.fps if fps is None else fps, seconds)
     return [
         Shot(float(t), *view_at(keys, float(times[0] + at), size or (1280, 720), fov))
         for t, at in zip(shown, taken, strict=True)

@@ -18,6 +18,8 @@ class RecordedPathTuning(Tuning):
 
     smoothing_s = 0.25
     """Standard deviation of the smoothing of poses over time, in seconds: hands that tremble are calm."""
+    max_smoothing_s = 60.0
+    """Most of it: longer, and a film hardly moves."""
     frame_s = 1 / 30
     """Time between frames without times, in seconds."""
 
@@ -41,8 +43,9 @@ def recorded_shots(
     """
     if not folder.has_poses:
         raise ConfigError(f"{folder.path}: tells no recorded poses; use `path` orbit or a file of keys")
-    if not smoothing >= 0:
-        raise ConfigError(f"`smoothing`: expected 0 or more seconds, found {smoothing:g}")
+    if not 0 <= smoothing <= RecordedPathTuning.max_smoothing_s:
+        limit = f"expected 0 to {RecordedPathTuning.max_smoothing_s:g} seconds"
+        raise ConfigError(f"`smoothing`: {limit}, found {smoothing:g}")
     frames, times, poses = _longest_walk(folder)
     shown, taken = film_times(float(times[-1]), fps, seconds)
     last = np.clip(np.searchsorted(times, taken + 1e-6, side="right") - 1, 0, len(frames) - 1)

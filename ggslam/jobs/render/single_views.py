@@ -58,6 +58,8 @@ def _numbers(words: list[str], text: str) -> np.ndarray:
         numbers = np.array([np.nan])
     if not np.isfinite(numbers).all():
         raise ConfigError(f"`pose`: expected {FORMS}, found {text!r}")
+    if np.abs(numbers).max() > 1e6:
+        raise ConfigError(f"`pose`: expected places within 1e6 m of the origin, found {text!r}")
     return numbers
 
 
@@ -95,6 +97,8 @@ def render_poses(
     single = out.suffix.lower() == ".png"
     if single and len(poses) * len(artist.kinds) != 1:
         raise ConfigError(f"`out`: {len(poses) * len(artist.kinds)} pictures need a folder, found {out.name!r}")
+    if out.suffix.lower() in (".jpg", ".jpeg", ".webp", ".gif", ".bmp", ".tif", ".tiff") and not out.is_dir():
+        raise ConfigError(f"`out`: expected a folder or a name that ends with .png, found {out.name!r}")
     written = []
     with write_beside(out) if single else change_in_run(out):
         if not single:

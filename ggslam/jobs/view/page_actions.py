@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.edit.edit import Edit
@@ -93,14 +92,13 @@ class PageActions:
         if not rows.any():
             raise ConfigError("nothing is selected")
         ids = selection.objects()
-        center = self._model.centroid_of(rows)
-        if ids is not None and len(ids) == 1:  # the whole of an object turns about its own middle
-            center = next((o.centroid for o in self._model.objects() if o.id == ids[0]), center)
+        whole = bool(ids) and 0 not in (ids or ())  # whole objects turn about their own middle and leave holes
+        center = self._model.centroid_of(ids or ()) if whole else self._model.centroid_of_rows(rows)
         shift = T[:3, :3] @ center + T[:3, 3] - center
-        turn = Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)  # about fixed x, then y, then z
+        turn = _turns(T[:3, :3])
         rotation = _numbers(turn) if np.abs(turn).max() > 10.0**-PageActionTuning.digits else ""
-        if ids is not None and len(ids) == 1 and ids[0]:
-            return Edit("move", str(ids[0]), _numbers(shift), rotation)
+        if whole:
+            return Edit("move", ",".join(map(str, ids or ())), _numbers(shift), rotation)
         return Edit("move", "", _numbers(shift), rotation, text)
 
     def _select(self, values: dict[str, Any]) -> dict[str, Any]:
@@ -117,9 +115,8 @@ class PageActions:
         width, height = _whole(values, "width"), _whole(values, "height")
         if not 16 <= min(width, height) <= max(width, height) <= PageActionTuning.max_picture:
             raise ConfigError(f"picture: expected sides of 16 to {PageActionTuning.max_picture} pixels")
-        given = values.get("focal")
-        focal = float(given) if isinstance(given, (int, float)) else 0.0
-        if not 1 <= focal <= 1e5:
+        focal: Any = values.get("focal")
+        if type(focal) not in (int, float) or not 1 <= focal <= 1e5:
             raise ConfigError("picture: focal: expected a number of pixels")
         hidden = values.get("hidden", [])
         if not isinstance(hidden, list) or not all(type(i) is int for i in hidden):
@@ -140,13 +137,22 @@ def _edit_of(selection: Selection, text: str, kind: Any, value: str = "") -> Edi
 def _matrix(values: dict[str, Any], name: str) -> np.ndarray:
     found = values.get(name)
     good = isinstance(found, list) and len(found) == 16 and all(type(v) in (int, float) for v in found)
+    good = good and all(abs(v) <= 1e6 for v in found or ())  # of whole numbers, too, that no float holds
     T = np.array(found, np.float64).reshape(4, 4) if good else np.full((4, 4), math.nan)
     rigid = np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
-    if not rigid or np.linalg.det(T[:3, :3]) < 0 or np.abs(T).max() > 1e6:
+    if not rigid or np.linalg.det(T[:3, :3]) < 0:
         raise ConfigError(f"{name}: expected a rigid transform, 16 numbers by rows")
     u, _, v = np.linalg.svd(T[:3, :3])
-    T[:3, :3] = u @ v
+    T[:3, :3], T[3] = u @ v, (0, 0, 0, 1)
     return T
+
+
+def _turns(R: np.ndarray) -> np.ndarray:
+    """Degrees about the world's x, then y, then z axis that make a rotation; of those that are as good, without z."""
+    about_y = math.atan2(-R[2, 0], math.hypot(R[0, 0], R[1, 0]))
+    if math.hypot(R[0, 0], R[1, 0]) < 1e-9:  # x and z turn about the same line
+        return np.degrees([math.atan2(-R[1, 2], R[1, 1]), about_y, 0.0])
+    return np.degrees([math.atan2(R[2, 1], R[2, 2]), about_y, math.atan2(R[1, 0], R[0, 0])])
 
 
 def _whole(values: dict[str, Any], name: str) -> int:

@@ -120,9 +120,9 @@ class RunPage:
             return {}
         try:
             record = kind.read_if_there(self.model.folder.path)
-        except GgslamError:  # the map is there
+            return {} if record is None else record.values()
+        except (GgslamError, RecursionError):  # the map is there
             return {}
-        return {} if record is None else record.values()
 
     def _write(self, kind: type[RecordFile], values: dict[str, Any]) -> dict[str, Any]:
         if isinstance(self.model.folder, MapFile):

@@ -22,7 +22,7 @@ from ggslam.jobs.edit.edits import apply_edit, edit_run
 from ggslam.jobs.edit.selected import selected_rows
 from ggslam.jobs.export.map_files import OBJECT_EXTRAS
 from ggslam.jobs.view.pictures import ViewPictures
-from ggslam.objects.editing import EditingTuning, opacity_centroid
+from ggslam.objects.editing import EditingTuning, group_centroid, opacity_centroid
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.objects.segmented_rows import copies_of
 from ggslam.objects.splat_editing import scene_without_objects
@@ -42,7 +42,7 @@ from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted
 from ggslam.viewer.model import Box, ListedObject, ShownChange, ShownMover
 from ggslam.viewer.splats import most_visible
-from ggslam.viewer.viewed_sides import viewed_sides
+from ggslam.viewer.viewed_sides import KnownSides
 from ggslam.volumes.map_upright import upright_of
 
 
@@ -81,6 +81,7 @@ class ViewedRun:
     ) -> None:  # fmt: skip
         self.folder, self._max_splats, self._sequence_path = folder, max_splats, sequence
         self._lock = threading.RLock()
+        self._sides: KnownSides | None = None
         self._edits: list[Edit] = []
         self._texts: list[str] = []
         self._undone: list[Edit] = []
@@ -229,7 +230,9 @@ class ViewedRun:
         """See `viewed_sides`; None where the poses are none of a recording."""
         if not self.folder.has_poses:
             return None
-        return viewed_sides(self._gaussians, rows, self.camera, list(self.frame_poses.values()))
+        if self._sides is None:  # before the first edit as a rule, else of what is left by then
+            self._sides = KnownSides(self._gaussians, self.camera, list(self.frame_poses.values()))
+        return self._sides.find(self._gaussians, rows)
 
     def identity_colors(self, rows: np.ndarray) -> np.ndarray | None:
         """Colours uint8 [N, 3] of the identity vectors of some rows; None if they have none."""
@@ -288,13 +291,15 @@ class ViewedRun:
         with self._lock:
             if not self._undone:
                 raise ConfigError("there is no edit to do again")
-            return self._do(self._undone.pop())
+            text = self._do(self._undone[-1])
+            self._undone.pop()
+            return text
 
     def _replay(self, edits: ListOf[Edit]) -> None:
-        """Reads the map anew and does edits to it."""
+        """Reads the map anew and does edits to it; a run that cannot be read any more leaves all as it is."""
         kept = list(edits)
-        self._edits, self._texts = [], []
         self._read_map()
+        self._edits, self._texts = [], []
         for edit in kept:
             self._do(edit)
 
@@ -317,7 +322,18 @@ class ViewedRun:
             scene = self._segmented or scene_without_objects(self._gaussians)
             return selected_rows(scene, selection)
 
-    def centroid_of(self, rows: np.ndarray) -> np.ndarray:
+    def centroid_of(self, ids: ListOf[int]) -> np.ndarray:
+        """About which objects turn, as one group, [3].
+
+        Raises:
+            ConfigError: there are none of these ids.
+        """
+        with self._lock:
+            if self._segmented is None:
+                raise ConfigError("this map has no objects")
+            return group_centroid(self._segmented, ids)
+
+    def centroid_of_rows(self, rows: np.ndarray) -> np.ndarray:
         """About which Gaussians (bool [N]) turn, [3]."""
         with self._lock:
             return opacity_centroid(copies_of(self._gaussians, rows))

@@ -31,6 +31,7 @@ function reveal(piece, needed) {
 function viewPanel(viewer) {
   const coloring = make("select", { id: "coloring", onchange: () => viewer.color(coloring.value) }),
     places = row(make("span", { className: "name", textContent: "Camera" }));
+  places.classList.add("tight");
   const lines = row(make("span", { className: "name", textContent: "Show" }));
   for (const [name, words] of [
     ["path", "path"],
@@ -87,18 +88,13 @@ function framePanel(viewer) {
     picture = make("img", { id: "picture", alt: "recorded and rendered images of the frame" });
   const go = make("input", { type: "checkbox", id: "going", checked: true }),
     play = button("Play", () => playing()),
-    whole = part(
-      viewer,
-      "Frames",
-      true,
-      row(make("label", { htmlFor: "frame", textContent: "Frame" }), slider, play),
-      row(
-        make("label", { htmlFor: "going", textContent: "Look" }),
-        go,
-        make("span", { className: "soft", textContent: "from where it was taken" }),
-      ),
-      picture,
-    );
+    sliding = row(make("label", { htmlFor: "frame", textContent: "Frame" }), slider, play),
+    looking = row(
+      make("label", { htmlFor: "going", textContent: "Look" }),
+      go,
+      make("span", { className: "soft", textContent: "from where it was taken" }),
+    ),
+    whole = part(viewer, "Frames", true, sliding, looking, picture);
   let timer = 0,
     waiting = 0;
   const show = (look) => {
@@ -132,6 +128,7 @@ function framePanel(viewer) {
   viewer.on("user", () => playing(false));
   viewer.on("scene", () => {
     whole.hidden = !viewer.scene.frames.length && !viewer.scene.live;
+    sliding.hidden = looking.hidden = !viewer.scene.frames.length;
     slider.max = Math.max(0, viewer.scene.frames.length - 1);
     slider.value = viewer.frame;
     if (viewer.scene.frames.length) show(false);
@@ -191,11 +188,13 @@ function objectPanel(viewer) {
 }
 
 function selectionPanel(viewer) {
+  let asked = false; // whether people said what is selected
   const unit = split(
     { objects: "objects", splats: "splats" },
     viewer.unit,
     (value) => {
       viewer.unit = value;
+      asked = true;
     },
     "What is selected",
   );
@@ -313,7 +312,10 @@ function selectionPanel(viewer) {
     );
   };
   viewer.on("selection", update);
-  viewer.on("scene", update);
+  viewer.on("scene", () => {
+    if (!asked) unit.choose((viewer.unit = viewer.scene.objects.length ? "objects" : "splats"));
+    update();
+  });
   viewer.on("unit", () => unit.choose(viewer.unit));
   viewer.on("tool", () => {
     if (!["box", "lasso", "brush", "sphere"].includes(viewer.tools.name)) return;

@@ -19,6 +19,8 @@ function selectedSplats(steps, splats, depthOf = () => null) {
         if (inside) next[i] = 1;
       } else if (mode === "remove") {
         if (inside) next[i] = 0;
+      } else if (mode === "invert") {
+        if (inside) next[i] = 1 - next[i];
       } else if (!inside) next[i] = 0;
     }
     selected = next;

@@ -101,18 +101,7 @@ class ViewerSelecting {
   }
 
   invert() {
-    const all = { mode: "set", shape: this.leaveHidden({ kind: "all" }) };
-    this.select(this.steps.length ? [all, ...this.minusSteps()] : [all]);
-  }
-
-  // Steps that take away what the present ones select: exact for one step, else by splats as they were found here.
-  minusSteps() {
-    if (this.steps.length === 1) return [{ mode: "remove", shape: this.steps[0].shape }];
-    const parts = this.steps.map((step) => ({ ...step }));
-    if (parts.every(({ mode }) => mode === "set" || mode === "add"))
-      return parts.map(({ shape }) => ({ mode: "remove", shape }));
-    this.say("a selection of added and removed parts cannot be inverted");
-    return parts.slice(0, 1).map(({ shape }) => ({ mode: "remove", shape }));
+    this.select([...this.steps, { mode: "invert", shape: this.leaveHidden({ kind: "all" }) }]);
   }
 
   applySelection() {
