@@ -118,6 +118,22 @@ def test_an_object_is_edited_and_saved(served: tuple[Hand, ViewedRun], tmp_path:
     assert len(saved.gaussians()) < len(model.folder.gaussians())
 
 
+def test_tab_passes_the_list_of_objects(served: tuple[Hand, ViewedRun]) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    hand, model = served
+    ids = [record.id for record in model.objects()]
+    assert len(ids) > 3
+    hand.browser.find_element("id", "only").send_keys(Keys.TAB)
+    hand.browser.switch_to.active_element.send_keys(Keys.DOWN)
+    hand.browser.switch_to.active_element.send_keys(Keys.DOWN, Keys.ENTER)
+    b.wait_for(lambda: hand.selected() == [ids[2]])
+    hand.browser.switch_to.active_element.send_keys(Keys.TAB)
+    assert hand.ask("document.activeElement.type") == "checkbox"  # shows and hides it
+    hand.browser.switch_to.active_element.send_keys(Keys.TAB)
+    assert not hand.ask("document.getElementById('objects').contains(document.activeElement)")
+
+
 def test_what_is_moved_is_what_is_selected(served: tuple[Hand, ViewedRun]) -> None:
     hand, model = served
     (one, place), (other, _) = list(hand.object_places().items())[2:4]
