@@ -32,9 +32,9 @@ class Hand:
         """What an expression gives; `values` are its `arguments`."""
         return self.browser.execute_script(f"return {code}", *values)
 
-    def wait(self, code: str) -> Any:
+    def wait(self, code: str, *values: Any) -> Any:
         """What an expression gives once it is true."""
-        return b.wait_for(lambda: self.ask(code))
+        return b.wait_for(lambda: self.ask(code, *values))
 
     # --- mouse, keys, fingers
 

@@ -118,6 +118,40 @@ def test_an_object_is_edited_and_saved(served: tuple[Hand, ViewedRun], tmp_path:
     assert len(saved.gaussians()) < len(model.folder.gaussians())
 
 
+def test_tab_passes_the_list_of_objects(served: tuple[Hand, ViewedRun]) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    hand, model = served
+    ids = [record.id for record in model.objects()]
+    assert len(ids) > 3
+    hand.browser.find_element("id", "only").send_keys(Keys.TAB)
+    hand.browser.switch_to.active_element.send_keys(Keys.DOWN)
+    hand.browser.switch_to.active_element.send_keys(Keys.DOWN, Keys.ENTER)
+    b.wait_for(lambda: hand.selected() == [ids[2]])
+    hand.browser.switch_to.active_element.send_keys(Keys.TAB)
+    assert hand.ask("document.activeElement.type") == "checkbox"  # shows and hides it
+    hand.browser.switch_to.active_element.send_keys(Keys.TAB)
+    assert not hand.ask("document.getElementById('objects').contains(document.activeElement)")
+
+
+def test_what_is_moved_is_what_is_selected(served: tuple[Hand, ViewedRun]) -> None:
+    hand, model = served
+    (one, place), (other, _) = list(hand.object_places().items())[2:4]
+    hand.keys("7")  # nothing is selected yet
+    hand.drag([place])
+    b.wait_for(lambda: hand.selected() == [one])
+    shown = hand.wait("ggslam.tools.current.box?.center")
+    assert np.allclose(shown, hand.ask("ggslam.objectOf(arguments[0]).center", one), atol=0.4)
+    hand.browser.find_element("css selector", f"#objects li[data-id='{other}'] .label").click()
+    b.wait_for(lambda: hand.selected() == [other])
+    hand.wait("JSON.stringify(ggslam.tools.current.box.center) !== JSON.stringify(arguments[0])", shown)
+    hand.drag_handle(2, (0, -40))
+    before = record_of(model, one).centroid
+    hand.press("do-move")
+    edited(hand, model, 1)
+    assert f"({other})" in model.edits()[0] and np.array_equal(record_of(model, one).centroid, before)
+
+
 def test_two_pages_keep_what_both_add(served: tuple[Hand, ViewedRun]) -> None:
     """Keys of the film and notes; whoever is writing goes on."""
     from selenium.webdriver.common.keys import Keys

@@ -382,7 +382,9 @@ class ViewedRun:
             edits = list(self._edits)
         out = self.save_folder() / target.strip()
         outcome = edit_run(self.folder, edits, out, inpainting=inpaint, sequence=sequence)
-        return "\n".join([f"saved to {outcome.folder.path}", *outcome.notes])
+        dropped = 0 if outcome.filling is None else outcome.filling.dropped
+        left = [f"without {quantity(dropped, 'Gaussian')} that removed or moved objects left over"] if dropped else []
+        return "\n".join([f"saved to {outcome.folder.path}", *left, *outcome.notes])
 
     def _scene_for(self, edit: Edit) -> SegmentedMap:
         if self._segmented is None and edit.selection:

@@ -59,7 +59,19 @@ class AxisHandle {
 }
 
 class MoveTool extends Tool {
+  constructor(viewer) {
+    super(viewer);
+    viewer.on("selection", () => {
+      if (viewer.tools.current === this && viewer.steps !== this.steps) viewer.tools.choose("move"); // of something else
+    });
+  }
+
+  click(x, y, event) {
+    if (!this.box) new LookTool(this.viewer).click(x, y, event);
+  }
+
   start() {
+    this.steps = this.viewer.steps;
     const box = boxOfSelected(this.viewer);
     if (!box || !this.viewer.edits.can("move")) {
       this.viewer.say(
@@ -116,6 +128,7 @@ class MoveTool extends Tool {
         add(middle(), turned(box.axes[0], box.axes[2], (k * Math.PI) / 24), reach()),
       );
     viewer.overlay.prepend(this.ring);
+    this.redraw(); // in place before the next picture
   }
 
   set(shift, angle) {
@@ -182,6 +195,7 @@ class CropTool extends Tool {
     this.yaw = 0;
     this.handles = [0, 1, 2].flatMap((k) => [1, -1].map((side) => this.faceHandle(k, side)));
     this.set(this.box);
+    this.redraw();
   }
 
   faceHandle(k, side) {

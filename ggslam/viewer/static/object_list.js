@@ -9,6 +9,7 @@ class ObjectList {
     this.items = new Map();
     search.addEventListener("input", () => this.filter());
     element.addEventListener("keydown", (event) => this.key(event));
+    element.addEventListener("focusin", (event) => this.stopAt(event.target.closest("li")));
     viewer.on("scene", () => this.fill());
     viewer.on("hidden", () => this.mark());
     viewer.on("selection", () => this.mark());
@@ -76,7 +77,16 @@ class ObjectList {
     for (const object of objects)
       this.items.get(object.id).hidden = words !== "" && !fits(words, object, this.colors?.get(object.id));
     if (this.items.has(0)) this.items.get(0).hidden = words !== "";
+    const visible = [...this.items.values()].filter((one) => !one.hidden);
+    this.stopAt(visible.find((one) => one.dataset.id === this.stop) || visible[0]);
     this.viewer.emit("searched");
+  }
+
+  // Tab stops at one line, arrows go on from there.
+  stopAt(item) {
+    if (!item) return;
+    this.stop = item.dataset.id;
+    for (const one of this.items.values()) one.tabIndex = one.firstChild.tabIndex = one === item ? 0 : -1;
   }
 
   found() {

@@ -317,6 +317,10 @@ function selectionPanel(viewer) {
     update();
   });
   viewer.on("unit", () => unit.choose(viewer.unit));
+  viewer.on("tool", () => {
+    if (!["box", "lasso", "brush", "sphere"].includes(viewer.tools.name)) return;
+    for (const choice of [told, unit]) choice.scrollIntoView({ block: "nearest" }); // what the tool goes by
+  });
 }
 
 function movePanel(viewer) {

@@ -46,15 +46,23 @@ class ServerSource {
     return `frame?number=${frame.frame}&version=${this.version}`;
   }
 
+  async fetch(...request) {
+    try {
+      return await fetch(...request);
+    } catch {
+      throw new Error("the program that serves this page does not answer"); // browsers have words of their own
+    }
+  }
+
   async get(address) {
-    const answer = await fetch(address);
+    const answer = await this.fetch(address);
     if (!answer.ok)
       throw new Error((await answer.json().catch(() => ({}))).error || `the program answered ${answer.status}`);
     return answer;
   }
 
   async post(action, values, method = "POST") {
-    const answer = await fetch(action, {
+    const answer = await this.fetch(action, {
       method,
       headers: { "Content-Type": "application/json" },
       body: JSON.stringify(values),
