@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from command_line import ggslam, refuse
 
 from ggslam.errors import ConfigError
 from ggslam.jobs.batch.manifest import read_manifest
@@ -14,7 +15,6 @@ from ggslam.jobs.render.film import render_film
 from ggslam.jobs.render.key_path import read_camera_keys
 from ggslam.jobs.render.single_views import parse_pose
 from ggslam.runs.folder import RunFolder
-from command_line import ggslam, refuse
 
 IGNORED = (
     (("--path", "orbit"), "--path: goes with --film"), (("--size", "64x48"), "--size: goes with --pose or --film"),
