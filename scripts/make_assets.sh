@@ -7,7 +7,7 @@
 #
 # overview, points, loop, film and clip need nothing but generated recordings. editing and viewer need GGSLAM_DATA/livingroom,
 # objects and volumes GGSLAM_DATA/redkitchen (7-Scenes); without GGSLAM_DATA, pictures made of these stay as they are. viewer
-# needs chromium, clip Pillow. Runs are kept in GGSLAM_ASSETS (default: a folder below the temporary one) and used again.
+# needs chromium and selenium, clip Pillow. Runs are kept in GGSLAM_ASSETS (default: a folder below the temporary one) and used again.
 # PICTURES and CLIPS say where the pictures go.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -50,7 +50,7 @@ points() {
 
 loop() {
     recording walk --scene loop
-    run walk_run "$work/walk" && run walk_open "$work/walk" --no-loops
+    run walk_run "$work/walk" --no-eval && run walk_open "$work/walk" --no-loops --no-eval
     local frames last rows=() frame
     last=$("$python" -c 'import json, sys; print(json.load(open(sys.argv[1]))["frames"] - 1)' "$work/walk_run/sequence.json")
     frames=$((last - 20)),$((last - 5))
@@ -103,8 +103,7 @@ viewer() {
     command -v chromium > /dev/null || { echo "left as it is: viewer.jpg (needs chromium)"; return 0; }
     run living_run "$data/livingroom"
     ggslam view "$work/living_run" --html "$work/living.html"
-    chromium --headless --no-sandbox --hide-scrollbars --window-size=1280,800 --virtual-time-budget=20000 \
-        --screenshot="$work/viewer.png" "file://$work/living.html"
+    "$python" scripts/tools/screenshot_page.py "$work/living.html" "$work/viewer.png"
     sheet "$pictures/viewer.jpg" --width 1280 --row "$work/viewer.png"
 }
 

@@ -49,10 +49,11 @@ def test_there_are_enough_questions() -> None:
 
 MADE = {
     "--html": "kitchen.html", "--film": "round.mp4", "--plan": "plan.png", "--pose": "view.png",
-    "--crop": "runs/cropped", "@selection": "runs/clean", "--inpaint": "runs/without", "merge": "runs/both", "mesh": "kitchen.glb",
+    "--crop": "runs/cropped", "@selection": "runs/clean", "--inpaint": "runs/without", "merge": "runs/both",
+    "mesh": "kitchen.glb",
     "spz": "kitchen.spz", "encode": "kitchen.bin", "colmap": "colmap", "align": "registered.json",
-    "trajectory --out": "trajectory.txt", "localize": "found", "changes": "changes", "report": "runs/kitchen/report.html",
-    "refine": "runs/finer", "--iterations": "runs/fast",
+    "trajectory --out": "trajectory.txt", "localize": "found", "changes": "changes",
+    "report": "runs/kitchen/report.html", "refine": "runs/finer", "--iterations": "runs/fast",
 }  # fmt: skip
 """Words of a command, and what it leaves behind."""
 

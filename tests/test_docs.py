@@ -54,6 +54,13 @@ def test_examples_run_in_order(tmp_path: Path, page: str, least: int) -> None:
         os.chdir(before)
 
 
+def test_the_papers_figures_are_those_of_the_code() -> None:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as ended:
+        patch.setattr(sys, "argv", ["replica.py", "--check"])
+        runpy.run_path(str(ROOT / "scripts" / "papers" / "replica.py"), run_name="__main__")
+    assert not ended.value.code
+
+
 def test_the_settings_page_is_up_to_date() -> None:
     check_page("make_settings_reference.py")
 

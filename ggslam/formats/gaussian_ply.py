@@ -22,6 +22,7 @@ from ggslam.formats.ply import read_ply, write_ply_parts
 from ggslam.formats.splat_columns import MAX_FLOAT_ID
 from ggslam.formats.writer import Splats, Takes, Writer
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.given_map import given_map
 from ggslam.system.atomic import write_bytes
 from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
@@ -49,15 +50,16 @@ def write_gaussian_ply(
 
     Args:
         path: the file to write.
-        gaussians: the map (any device).
+        gaussians: the map (any device), or a model.
         extra: which additional properties to write, of `EXTRAS`.
         comments: single ASCII lines for the header.
 
     Raises:
-        InputError: an unknown extra.
+        InputError: an unknown extra, or no map.
         FormatError: an object id above 2^24.
         RunFolderError: the file cannot be written.
     """
+    gaussians = given_map(gaussians)
     write_gaussian_parts(path, len(gaussians), [gaussians], gaussians, extra, comments)
 
 

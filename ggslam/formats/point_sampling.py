@@ -14,6 +14,7 @@ from ggslam.formats.pending_cubes import PendingCubes
 from ggslam.formats.surface_discs import SurfaceDiscs, disc_samples
 from ggslam.formats.voxel_cloud import BITS, VoxelCloud, VoxelSums, cloud_of_sums, pack, unpack
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.given_map import given_map
 from ggslam.system.tuning import Tuning
 
 
@@ -48,14 +49,15 @@ def sample_points(
     of largest weight. Deterministic.
 
     Args:
-        gaussians: the map; only the view-independent part of its colours is used.
+        gaussians: the map, or a model; only the view-independent part of its colours is used.
         voxel_size: edge of a voxel in metres.
         minimum_opacity: in (0, 1); fainter Gaussians and the faint outskirts of others are left out.
         with_object_id: whether the points carry the object ids.
 
     Raises:
-        InputError: impossible settings, or a map that spans more than 2^21 voxels.
+        InputError: impossible settings, no map, or one that spans more than 2^21 voxels.
     """
+    gaussians = given_map(gaussians)
     if not voxel_size > 0 or not 0 < minimum_opacity < 1:
         raise InputError(f"impossible voxel size {voxel_size} or minimum opacity {minimum_opacity}")
     discs = SurfaceDiscs.of(gaussians, minimum_opacity)

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from ggslam.errors import InputError
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.given_map import given_map
 
 
 def objects_at(
@@ -25,8 +26,9 @@ def objects_at(
         uint16 [n] object ids, 0 = no object.
 
     Raises:
-        InputError: points of another shape, or that are not finite.
+        InputError: points of another shape, or that are not finite, or no map.
     """
+    gaussians = given_map(gaussians)
     places = np.atleast_2d(np.asarray(points, np.float64))
     if places.ndim != 2 or places.shape[1] != 3 or not np.isfinite(places).all():
         raise InputError(f"points: expected finite numbers [n, 3], found shape {list(np.shape(points))}")

@@ -17,8 +17,10 @@ import numpy as np
 from ggslam.errors import ConfigError
 from ggslam.system.tuning import Tuning
 
-Mode = Literal["set", "add", "remove", "intersect"]
-MODES: Final = ("set", "add", "remove", "intersect")
+Mode = Literal["set", "add", "remove", "intersect", "invert"]
+MODES: Final = ("set", "add", "remove", "intersect", "invert")
+"""What becomes of the Gaussians in a shape; intersect drops those outside it, invert takes those in it that were not
+selected and drops those that were."""
 DepthOf = Callable[["ScreenShape"], np.ndarray]
 """Gives the depth of the surfaces that a screen shows, float32 [h, w] of its mask's size, metres; 0: none."""
 
@@ -49,6 +51,7 @@ class ScreenShape:
         near: nearer Gaussians are not shown, in metres.
         mask: bool [h, w]: what was drawn, in another number of pixels.
         seen_only: whether Gaussians behind the surface there are left out.
+        hidden: ids of objects that are not shown, and cover nothing.
     """
 
     T_camera_world: np.ndarray
@@ -58,6 +61,7 @@ class ScreenShape:
     near: float
     mask: np.ndarray
     seen_only: bool
+    hidden: frozenset[int] = frozenset()
 
     def rows(self, means: np.ndarray, depth_of: DepthOf | None) -> np.ndarray:
         """Which of the centres, float [N, 3], lie in what was drawn; bool [N]."""
@@ -81,10 +85,11 @@ class ScreenShape:
 
 @dataclass(frozen=True)
 class Step:
-    """A shape, and what becomes of the Gaussians in it."""
+    """A shape, what becomes of the Gaussians in it, and ids of objects that are hidden: it holds none of theirs."""
 
     mode: Mode
     shape: ScreenShape | _Sphere | _Box | _Objects | _All
+    hidden: frozenset[int] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -105,21 +110,26 @@ class Selection:
         for step in self.steps:
             shape = step.shape
             found = shape.rows(owners) if isinstance(shape, _Objects) else shape.rows(means, depth_of)
+            if step.hidden:
+                found &= ~np.isin(owners, list(step.hidden))
             if step.mode == "set":
                 selected = found
             elif step.mode == "add":
                 selected = selected | found
             elif step.mode == "remove":
                 selected = selected & ~found
+            elif step.mode == "invert":
+                selected = selected ^ found
             else:
                 selected = selected & found
         return selected
 
     def objects(self) -> list[int] | None:
         """The ids, if the selection is of whole objects and nothing else."""
-        if len(self.steps) != 1 or self.steps[0].mode == "remove" or not isinstance(self.steps[0].shape, _Objects):
+        first = self.steps[0]
+        if len(self.steps) != 1 or first.mode not in ("set", "add") or not isinstance(first.shape, _Objects):
             return None
-        return sorted(self.steps[0].shape.ids)
+        return sorted(first.shape.ids)
 
 
 @dataclass(frozen=True)
@@ -173,7 +183,7 @@ def parse_selection(text: str) -> Selection:
 
 
 def read_selection(values: Any) -> Selection:
-    """A selection: a list of {"mode": "set" | "add" | "remove" | "intersect", "shape": SHAPE}, where SHAPE is one of
+    """A selection: a list of {"mode": one of `MODES`, "shape": SHAPE}, where SHAPE is one of
 
         {"kind": "all"}
         {"kind": "objects", "ids": [...]}
@@ -181,6 +191,8 @@ def read_selection(values: Any) -> Selection:
         {"kind": "box", "center": [3], "axes": three rows, "size": [3]}
         {"kind": "screen", "T_camera_world": [16] by rows, "width", "height", "focal", "near", "seen_only",
          "mask": {"width", "height", "runs": [so many not set, so many set, ...] by rows}}
+
+    Each may have "hidden": ids of objects that were hidden, none of which it holds.
 
     Raises:
         ConfigError: it is something else; the message names the place.
@@ -207,14 +219,18 @@ def _step(where: str, value: Any) -> Step:
     reader = readers.get(str(shape.get("kind")))
     if reader is None:
         raise ConfigError(f"{where}: expected a shape of the kinds {', '.join(readers)}")
-    return Step(value["mode"], reader(where, shape))
+    return Step(value["mode"], reader(where, shape), _ids(where, {"hidden": [], **shape}, "hidden"))
 
 
 def _objects(where: str, shape: Mapping[str, Any]) -> _Objects:
-    ids = shape.get("ids")
+    return _Objects(_ids(where, shape, "ids"))
+
+
+def _ids(where: str, shape: Mapping[str, Any], name: str) -> frozenset[int]:
+    ids = shape.get(name)
     if not isinstance(ids, list) or len(ids) > 65536 or not all(type(i) is int and 0 <= i <= 65535 for i in ids):
-        raise ConfigError(f"{where}: ids: expected object ids, 0 to 65535")
-    return _Objects(frozenset(ids))
+        raise ConfigError(f"{where}: {name}: expected object ids, 0 to 65535")
+    return frozenset(ids)
 
 
 def _sphere(where: str, shape: Mapping[str, Any]) -> _Sphere:
@@ -240,7 +256,8 @@ def _screen(where: str, shape: Mapping[str, Any]) -> ScreenShape:
     near = float(_numbers(where, {"near": [shape.get("near", 0.0)]}, "near", 1)[0])
     mask = _mask(where, shape.get("mask"))
     focal = _positive(where, shape, "focal")
-    return ScreenShape(T, max(width, 1), max(height, 1), focal, near, mask, shape.get("seen_only") is True)
+    hidden = _ids(where, {"hidden": [], **shape}, "hidden")
+    return ScreenShape(T, max(width, 1), max(height, 1), focal, near, mask, shape.get("seen_only") is True, hidden)
 
 
 def _mask(where: str, values: Any) -> np.ndarray:

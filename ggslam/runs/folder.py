@@ -60,7 +60,7 @@ from ggslam.system.folder_lock import LOCK_FILE, refuse_other_writers
 from ggslam.system.missing_paths import why_missing
 from ggslam.system.plain_yaml import PlainYamlError, parse_yaml
 from ggslam.system.staging import finish_saving, is_being_saved, leftovers, refuse_links_at
-from ggslam.system.untrusted_files import printable, read_untrusted_text, refuse_links
+from ggslam.system.untrusted_files import given_path, printable, read_untrusted_text, refuse_links
 
 MARKER = RunRecord.FILE
 """Is there if and only if a folder is a run of ggslam."""
@@ -121,8 +121,9 @@ class RunFolder:
         Raises:
             RunFolderError: no such folder, or not a run, or one whose saving cannot be finished, or files of several.
         """
-        if not (Path(path) / MARKER).is_file():
-            if has_checkpoints(Path(path)):
+        path = given_path(path, RunFolderError)
+        if not (path / MARKER).is_file():
+            if has_checkpoints(path):
                 raise RunFolderError(f"{path}: the run was cut off before it was saved; go on with it: `resume`")
             raise no_run(Path(path))
         refuse_links(path, RunFolderError)

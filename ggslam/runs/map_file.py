@@ -38,7 +38,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.slam.config import Config
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import open_untrusted, printable, read_untrusted
+from ggslam.system.untrusted_files import given_path, open_untrusted, printable, read_untrusted
 
 
 class MapViewTuning(Tuning):
@@ -193,7 +193,7 @@ def open_map(path: str | Path) -> RunFolder:
         FormatError: a damaged file.
         MissingDependency: a package is needed to read it.
     """
-    path = Path(path)
+    path = given_path(path, RunFolderError)
     if (path / MARKER).is_file():
         return RunFolder.open(path)
     folder: MapFile | None = None

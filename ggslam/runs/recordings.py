@@ -21,7 +21,7 @@ from ggslam.sequences.live import LiveSequence, is_live, open_live
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sequences.rig import RigSequence
 from ggslam.system.json_files import json_ready
-from ggslam.system.untrusted_files import read_untrusted
+from ggslam.system.untrusted_files import given_path, read_untrusted
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class SequenceRequest:
         paths = ("masks", "depth_camera", "camera")
         given: dict[str, Any] = {k: Path(v) if k in paths and v is not None else v for k, v in selection.items()}
         try:
-            return cls(Path(path), **given)
+            return cls(given_path(path, ConfigError), **given)
         except TypeError:
             raise ConfigError(f"{caller}: no such argument of open_sequence in {', '.join(given)}") from None
 

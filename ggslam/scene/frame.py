@@ -9,6 +9,7 @@ from typing import Annotated
 
 import numpy as np
 
+from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ColorImage, DepthImage, Form, Mask, Pose
 from ggslam.system.savable import savable
@@ -57,6 +58,28 @@ class Frame:
     depth_delay: float = 0.0
     camera_number: int = 0
     instant: int | None = None
+
+    def __post_init__(self) -> None:
+        """Raises SequenceError for images that are no arrays, of another size than the camera's or of another type.
+        `frame_checks.check_frame` also looks at the values, when a frame is mapped."""
+        if not isinstance(self.camera, Camera):
+            raise SequenceError(
+                f"frame {self.source_index}: camera is {type(self.camera).__name__}, expected a ggslam.Camera"
+            )
+        size = (self.camera.height, self.camera.width)
+        self._check("colour", self.color, (*size, 3), np.uint8)
+        self._check("depth", self.depth, size, np.float32)
+
+    def _check(self, name: str, image: object, shape: tuple[int, ...], kind: type) -> None:
+        place = f"frame {self.source_index}: {name}"
+        if not isinstance(image, np.ndarray):
+            raise SequenceError(f"{place} is {type(image).__name__}, expected a numpy array")
+        if image.shape[:2] != shape[:2]:
+            found = "x".join(str(n) for n in image.shape[1::-1])
+            raise SequenceError(f"{place} is {found}, expected {shape[1]}x{shape[0]}")
+        if image.shape != shape or image.dtype != kind:
+            found = f"{image.dtype} {list(image.shape)}"
+            raise SequenceError(f"{place} is {found}, expected {np.dtype(kind)} {list(shape)}")
 
     def depth_or_infinity(self) -> np.ndarray:
         """Depth float32 [H, W], metres: 0 where unknown, +inf where the sensor found nothing."""

@@ -47,10 +47,12 @@ def given_path(path: str | Path, error: type[GgslamError] = SequenceError, where
         where: the file and entry that name the path, for the message.
 
     Raises:
-        error: no file can have this path: it, or a name in it, is too long, or it has a zero byte.
+        error: it is no path, or no file can have it: it, or a name in it, is too long, or it has a zero byte.
     """
-    text = os.fspath(path)
     shown = f"{where}: " if where else ""
+    if not isinstance(path, (str, os.PathLike)) or not isinstance(os.fspath(path), str):
+        raise error(f"{shown}expected a path, found {type(path).__name__}")
+    text = os.fspath(path)
     shown += repr(text if len(text) <= FileTuning.shown_characters else text[: FileTuning.shown_characters] + "...")
     if "\0" in text:
         raise error(f"{shown}: a path cannot have a zero byte")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ggslam.system.json_files import json_ready
-from ggslam.viewer.static_page import MAP_SCRIPTS
+from ggslam.viewer.packed_splats import MAP_SCRIPTS
 
 STATIC = Path(__file__).with_name("static")
 SCRIPTS: Final = (

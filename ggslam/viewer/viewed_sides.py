@@ -85,6 +85,35 @@ def viewed_sides(gaussians: Gaussians, rows: np.ndarray, camera: Camera, poses: 
     return found
 
 
+class KnownSides:
+    """Sides of a map as it was recorded, for what is left of it after edits.
+
+    Args:
+        gaussians, camera, poses: as of `viewed_sides`.
+    """
+
+    def __init__(self, gaussians: Gaussians, camera: Camera, poses: Sequence[np.ndarray]) -> None:
+        rows = np.arange(len(gaussians.means))
+        keys = _place_keys(gaussians, rows)
+        order = np.argsort(keys)
+        self._keys, self._sides = keys[order], viewed_sides(gaussians, rows, camera, poses)[order]
+
+    def find(self, gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
+        """uint8 [N, 4] of rows of an edited map; 0 for what is where nothing was, which no view saw there."""
+        keys = _place_keys(gaussians, rows)
+        at = np.minimum(np.searchsorted(self._keys, keys), max(len(self._keys) - 1, 0))
+        if not len(self._keys):
+            return np.zeros((len(rows), 4), np.uint8)
+        return np.where((self._keys[at] == keys)[:, None], self._sides[at], np.uint8(0))
+
+
+def _place_keys(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
+    """uint64 [N] that differ where means do, to all that matters."""
+    bits = np.ascontiguousarray(gaussians.means.numpy()[rows], np.float32).view(np.uint32).astype(np.uint64)
+    factors = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+    return np.asarray((bits * factors).sum(axis=1, dtype=np.uint64))
+
+
 def _look_at(
     gaussians: Gaussians, means: np.ndarray, camera: Camera, poses: list[np.ndarray]
 ) -> tuple[list[np.ndarray], np.ndarray]:

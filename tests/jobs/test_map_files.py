@@ -105,7 +105,7 @@ def test_objects_of_a_file_are_edited_and_exported(name: str, tmp_path: Path) ->
     succeed("render", path, "--frames", "0", "--what", "ids", "--width", 64, "--out", tmp_path / "ids")
     refuse(ggslam("render", path, "--what", "pca", "--out", tmp_path / "pca"), "no identity vectors")
     model = ViewedRun(open_map(path))
-    assert len(model.frame_picture(0)) == 2 and "identity" not in model.colorings
+    assert len(model.frame_picture(0)) == 2 and model.identity_colors(model.shown_rows()) is None
     assert model.has_objects and {listed.id for listed in model.objects()} == {1, 2}
     assert "views around it" in model.describe() and model.notes == []
 
@@ -153,7 +153,7 @@ def test_what_needs_a_recording_says_so(tmp_path: Path) -> None:
         refuse(ggslam("export", path, *words), "without a run's poses and recording", expected)
     refuse(ggslam("edit", path, "--remove", "mug"), "no object ids")
     refuse(ggslam("edit", path, "--move", "all", "0 0 1", "--out", path), "is there already")
-    refuse(ggslam("eval", path), "view, render, export, edit, encode and compare take files of Gaussians")
+    refuse(ggslam("eval", path), "is a file of Gaussians: view, render, export, edit, encode and compare take it")
     with pytest.raises(RunFolderError, match=r"map\.ply.*trajectory"):
         open_map(path).trajectory()
     refuse(ggslam("render", tmp_path / "none.sog"), "no such folder")

@@ -216,7 +216,7 @@ def test_nothing_to_resume(whole: Path, room: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(Killed):
         execute(request(room, out, every=0), KillAt(frame=5))
-    refuse(ggslam("run", "--resume", out), "is not a run of ggslam")
+    refuse(ggslam("run", "--resume", out), "is an empty folder")
 
 
 @pytest.mark.long("a run that is ended and resumed")

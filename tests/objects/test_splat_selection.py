@@ -52,7 +52,9 @@ def test_steps_follow_each_other() -> None:
     assert rows(("add", objects), ("remove", near)) == [1]
     assert rows(("set", objects), ("intersect", near)) == [0]
     assert rows(("set", objects), ("add", {"kind": "objects", "ids": [3]})) == [0, 1, 4]
-    assert rows(("set", {"kind": "all"}), ("remove", objects)) == [2, 3, 4, 5]  # inverted
+    assert rows(("set", {"kind": "all"}), ("remove", objects)) == [2, 3, 4, 5]
+    assert rows(("set", objects), ("remove", near), ("invert", {"kind": "all"})) == [0, 2, 3, 4, 5]
+    assert rows(("set", objects), ("invert", near)) == [1]
 
 
 def test_a_screen_takes_what_is_drawn_on_and_nothing_behind_the_camera() -> None:
@@ -77,6 +79,21 @@ def test_only_what_is_seen() -> None:
     assert not asked
 
 
+def test_what_is_hidden_is_in_no_shape() -> None:
+    ball = {"kind": "sphere", "center": [0, 0, 2], "radius": 1.0}
+    assert rows(("set", {**ball, "hidden": [2, 0]})) == [0, 1, 4]
+    assert rows(("set", {"kind": "all"}), ("remove", {**ball, "hidden": [3]})) == [4, 5]
+    asked = list[ScreenShape]()
+
+    def depth_of(shape: ScreenShape) -> np.ndarray:
+        asked.append(shape)
+        return np.full((10, 20), 9.0, np.float32)
+
+    everything = screen(np.ones((10, 20), bool), seen_only=True, hidden=[1])
+    assert rows(("set", everything), depth=depth_of) == [2, 3, 4]
+    assert [shape.hidden for shape in asked] == [{1}]  # so that it covers nothing
+
+
 def test_whole_objects_are_told_from_gaussians() -> None:
     def of(*steps: dict[str, Any]) -> list[int] | None:
         return read_selection(list(steps)).objects()
@@ -97,6 +114,7 @@ BAD: tuple[Any, ...] = (
         {"kind": "box", "center": [0, 0, 0], "axes": [[1, 0, 0], [1, 0, 0], [0, 0, 1]], "size": [1, 1, 1]},
         {"kind": "box", "center": [0, 0, 0], "axes": [[1, 0], [1, 0, 0]], "size": [1, 1, 1]},
         {"kind": "box", "center": [0, 0, 0], "axes": np.eye(3).tolist(), "size": [1, 1, -1]},
+        {"kind": "all", "hidden": [-1]}, {**GOOD, "hidden": "1"},
         {**GOOD, "focal": -1}, {**GOOD, "width": 0}, {**GOOD, "T_camera_world": [1, 2]}, {**GOOD, "mask": None},
         *({**GOOD, "mask": {"width": 3, "height": 2, "runs": runs}} for runs in ([0, 7], [-1], "x", [1.5])),
         {**GOOD, "mask": {"width": 10**6, "height": 10**6, "runs": []}},

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A browser as a person uses it: finds things by what is written on them, clicks, types, drags."""
+"""Chromium without a screen: opening it, waiting, what it shows and complains about."""
 
 from __future__ import annotations
 
@@ -13,12 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ggslam.scene.poses import quaternion_to_matrix
-
-PATIENCE_S = 20.0
-LIBRARY_NOISE = "computeBoundingSphere(): Computed radius is NaN"
-"""three.js says so of the mesh that viser draws all splats with, whose corners have two coordinates instead of three;
-a page of nothing but one splat says the same. It only keeps the mesh from being left out when it is out of sight."""
+PATIENCE_S = 60.0
 
 
 def open_browser(width: int, height: int, *more: str) -> Any:
@@ -66,78 +61,17 @@ def screenshot(browser: Any) -> np.ndarray:
 
 def errors(browser: Any) -> list[str]:
     """What the console complained about."""
-    found = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
-    return [message for message in found if LIBRARY_NOISE not in message]
+    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+def messages(browser: Any) -> list[str]:
+    """All that is in the console."""
+    return [entry["message"] for entry in browser.get_log("browser")]
 
 
 def said(browser: Any) -> str:
     """All text of the page."""
     return str(browser.execute_script("return document.body.innerText"))
-
-
-def values(browser: Any) -> list[str]:
-    """What the inputs hold."""
-    return list(browser.execute_script("return [...document.querySelectorAll('input')].map((input) => input.value)"))
-
-
-def press(browser: Any, selector: str, text: str) -> None:
-    """Clicks the first visible element of some text, or input of some value."""
-    wait_for(lambda: any(_click(found, text) for found in browser.find_elements("css selector", selector)))
-
-
-def _click(element: Any, text: str) -> bool:
-    from selenium.common.exceptions import WebDriverException
-
-    try:
-        if text not in (element.text.strip(), element.get_attribute("value")):
-            return False
-        element.click()
-    except WebDriverException:  # covered, moving, or gone by now
-        return False
-    return True
-
-
-def check(browser: Any, label: str) -> None:
-    """Clicks the box beside a label."""
-    boxes = """return [...document.querySelectorAll("label")]
-        .filter((found) => found.innerText.trim() === arguments[0]).map((found) => found.control)"""
-    wait_for(lambda: any(found and _click(found, "on") for found in browser.execute_script(boxes, label)))
-
-
-def write_over(browser: Any, old: str, new: str) -> None:
-    """Types something in place of what an input holds."""
-    from selenium.webdriver.common.keys import Keys
-
-    press(browser, "input", old)
-    field = browser.switch_to.active_element
-    field.send_keys(Keys.CONTROL, "a")
-    field.send_keys(new)
-
-
-def pixel_of(browser: Any, camera: Any, point: np.ndarray) -> np.ndarray:
-    """Where a viser camera shows a point [3], in pixels from the upper left corner of space."""
-    size = _space(browser).rect
-    ray = quaternion_to_matrix(np.array(camera.wxyz)).T @ (np.asarray(point) - np.array(camera.position))
-    focal = size["height"] / 2 / np.tan(camera.fov / 2)
-    return np.array([size["width"], size["height"]]) / 2 + focal * ray[:2] / ray[2]
-
-
-def drag(browser: Any, start: np.ndarray, by: np.ndarray, steps: int = 6) -> None:
-    """Presses the mouse at a pixel of space, moves it and lets go; with no movement a click."""
-    from selenium.webdriver.common.action_chains import ActionChains
-
-    space = _space(browser)
-    x, y = np.rint(start - np.array([space.rect["width"], space.rect["height"]]) / 2).astype(int).tolist()
-    hand = ActionChains(browser).move_to_element_with_offset(space, x, y).click_and_hold()
-    if np.any(by):
-        corners = np.rint(np.linspace(0, 1, steps + 1)[:, None] * by).astype(int)
-        for move in np.diff(corners, axis=0).tolist():
-            hand = hand.move_by_offset(*move)
-    hand.release().perform()
-
-
-def _space(browser: Any) -> Any:
-    return max(browser.find_elements("css selector", "canvas"), key=lambda found: found.rect["width"])
 
 
 def download_to(browser: Any, folder: Path) -> None:

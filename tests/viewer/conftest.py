@@ -13,7 +13,7 @@ from ggslam.jobs.view.serve import serve_run
 from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.runs.folder import RunFolder
 
-from .browser import PATIENCE_S, errors, open_browser
+from .browser import PATIENCE_S, messages, open_browser
 from .page_hand import Hand
 
 MAX_SPLATS = 4000
@@ -43,7 +43,7 @@ def served(hand: Hand, run: RunFolder, tmp_path: Path) -> Iterator[tuple[Hand, V
     try:
         hand.open(server.address)
         yield hand, model
-        assert errors(hand.browser) == []
+        assert messages(hand.browser) == []
     finally:
         hand.browser.get("about:blank")
         server.close()

@@ -14,8 +14,8 @@ import numpy as np
 from ggslam.rendering.types import Gaussians
 from ggslam.scene.gaussian_map import SH_C0
 from ggslam.scene.poses import inverse
+from ggslam.viewer.packed_splats import MAP_SCRIPTS, SCALES, STATIC, pack_splats
 from ggslam.viewer.splats import colors_to_uint8
-from ggslam.viewer.static_page import MAP_SCRIPTS, SCALES, STATIC, pack_splats
 
 _PAGE = """<!DOCTYPE html><meta charset="utf-8"><link rel="icon" href="data:,">
 <style>body {{ margin: 0; }} #space {{ position: relative; width: {width}px; height: {height}px; }}

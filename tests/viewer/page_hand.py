@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,7 @@ class Hand:
         from selenium.webdriver.common.action_chains import ActionChains
 
         handle = self.browser.find_elements("css selector", "#overlay .handle")[number]
+        b.wait_for(lambda: handle.get_attribute("cx"))  # it is placed with the next picture
         ActionChains(self.browser, duration=20).drag_and_drop_by_offset(handle, *by).perform()
 
     def keys(self, *keys: str) -> None:
@@ -133,6 +135,7 @@ class Hand:
 
         def still() -> bool:
             nonlocal last
+            time.sleep(0.15)
             before, last = last, self.eye()
             return bool(np.abs(last - before).max() < 1e-9)
 

@@ -233,6 +233,25 @@ def test_what_nobody_saw_fades(
         assert -10 * np.log10(np.mean((one / 255 - other / 255.0) ** 2)) > 45
 
 
+def test_pictures_become_sharp_whatever_comes_between(
+    browser: Any, page: Path, gaussians: GaussianMap, poses: list[np.ndarray]
+) -> None:
+    m.open_map(browser, page, "processor")
+    code = """const rest = (ms) => new Promise((resolve) => setTimeout(resolve, ms)), waiting = [];
+      for (let k = 0; k < 12; k++) {
+        camera.pose = k < 11 ? camera.pose.map((value, i) => value + (i === 12) * 0.01) : values[0]; map.redraw();
+        waiting.push(map.depthImage(320, 240), map.screenshot()); await rest(k < 11 ? 30 : 160);
+      }
+      for (let k = 0; k < 4; k++) { waiting.push(map.depthImage(320, 240)); await rest(15); }
+      await Promise.all(waiting); await rest(600);
+      const { canvas } = map.renderer, { width, height } = canvas;
+      const image = canvas.getContext("2d").getImageData(0, 0, width, height);
+      return [width, height, [...image.data.filter((_, i) => i % 4 < 3)]]"""
+    width, height, values = m.ask(browser, code, inverse(poses[1]).T.ravel().tolist())
+    assert (width, height) == SIZE
+    assert decibels(np.array(values).reshape(height, width, 3), expected(gaussians, poses[1])) > 45
+
+
 def test_lines_run_where_the_world_is(browser: Any, page: Path, poses: list[np.ndarray]) -> None:
     """Two segments, one of which begins behind the camera, against their projections."""
     m.open_map(browser, page, "processor")

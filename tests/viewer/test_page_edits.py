@@ -17,6 +17,8 @@ from . import browser as b
 from .page_hand import Hand
 
 pytestmark = pytest.mark.browser
+_UNCOVERED = """(() => { const { x, y, width, height } = arguments[0].getBoundingClientRect();
+    return document.elementFromPoint(x + width / 2, y + height / 2) === arguments[0]; })()"""
 
 
 def record_of(model: ViewedRun, number: int) -> ListedObject:
@@ -60,7 +62,15 @@ def test_an_object_is_edited_and_saved(served: tuple[Hand, ViewedRun], tmp_path:
     from selenium.webdriver.common.keys import Keys
 
     hand, model = served
-    (one, place), (other, there) = list(hand.object_places().items())[2:4]
+    places = hand.object_places()
+    size = np.array(hand.ask("[ggslam.canvas.clientWidth, ggslam.canvas.clientHeight]"))
+
+    def amid(number: int) -> bool:  # its handles are on the map
+        middle = hand.place_of(record_of(model, number).center)
+        return bool(((middle > [150, 170]) & (middle < size - 120)).all())
+
+    one, other = [number for number in places if amid(number)][:2]
+    place, there = places[one], places[other]
     before = record_of(model, one)
     b.download_to(hand.browser, tmp_path / "files")
     hand.drag([place])
@@ -108,6 +118,38 @@ def test_an_object_is_edited_and_saved(served: tuple[Hand, ViewedRun], tmp_path:
     assert len(saved.gaussians()) < len(model.folder.gaussians())
 
 
+def test_two_pages_keep_what_both_add(served: tuple[Hand, ViewedRun]) -> None:
+    """Keys of the film and notes; whoever is writing goes on."""
+    from selenium.webdriver.common.keys import Keys
+
+    hand, model = served
+    browser, first = hand.browser, hand.browser.current_window_handle
+    address = hand.ask("location.href")
+    browser.switch_to.new_window("tab")
+    hand.open(address)
+    hand.keys("k")
+    hand.wait("ggslam.film.keys.length === 1 && !ggslam.keeping")
+    browser.switch_to.window(first)
+    hand.wait("ggslam.film.keys.length === 1")
+    hand.keys("k")
+    hand.wait("ggslam.film.keys.length === 2 && !ggslam.keeping")
+    browser.switch_to.window(browser.window_handles[-1])
+    hand.wait("ggslam.film.keys.length === 2")
+    _, place = next(iter(hand.object_places().items()))
+    hand.keys("9")
+    hand.drag([place])
+    b.wait_for(lambda: hand.ask("document.activeElement.getAttribute('aria-label')") == "Text of the note")
+    browser.switch_to.active_element.send_keys("half")
+    rename = "ggslam.source.post('edit', { kind: 'rename', object: arguments[0], name: 'other' })"  # by somebody else
+    hand.ask(rename, model.objects()[0].id)
+    hand.wait("ggslam.scene.edits.length === 1")
+    browser.switch_to.active_element.send_keys(" a note", Keys.ENTER)
+    hand.wait("!ggslam.keeping && document.querySelector('#notes .label')?.textContent === 'half a note'")
+    browser.close()
+    browser.switch_to.window(first)
+    hand.wait("document.querySelector('#notes .label')?.textContent === 'half a note'")
+
+
 def test_splats_become_an_object_and_a_room_is_cropped(served: tuple[Hand, ViewedRun]) -> None:
     from selenium.webdriver.common.keys import Keys
 
@@ -128,10 +170,10 @@ def test_splats_become_an_object_and_a_room_is_cropped(served: tuple[Hand, Viewe
     # A box round the middle of the map, one face of it dragged inward.
     hand.keys("6")
     box = hand.ask("ggslam.tools.current.shape()")
+    hand.wait("document.querySelector('#overlay .handle[cx]')")
     handles = hand.browser.find_elements("css selector", "#overlay .handle")
     seen = [k for k, handle in enumerate(handles) if handle.is_displayed()]
-    face = next(k for k in seen if hand.ask("(() => { const r = arguments[0].getBoundingClientRect();"
-        " return document.elementFromPoint(r.x + r.width / 2, r.y + r.height / 2) === arguments[0]; })()", handles[k]))  # fmt: skip
+    face = next(k for k in seen if hand.ask(_UNCOVERED, handles[k]))
     hand.drag_handle(face, (25, 25))
     dragged = hand.ask("ggslam.tools.current.shape()")
     changed = [k for k in range(3) if abs(dragged["size"][k] - box["size"][k]) > 1e-6]

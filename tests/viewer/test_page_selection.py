@@ -20,7 +20,11 @@ pytestmark = pytest.mark.browser
 
 
 def random_shape(draw: np.random.Generator) -> dict[str, Any]:
-    """Near the origin, where the Gaussians of the test are."""
+    """Near the origin, where the Gaussians of the test are; some objects are hidden."""
+    return {**_visible_shape(draw), "hidden": draw.integers(0, 8, draw.integers(3)).tolist()}
+
+
+def _visible_shape(draw: np.random.Generator) -> dict[str, Any]:
     kind = draw.choice(["all", "objects", "sphere", "box", "screen"], p=[0.1, 0.2, 0.2, 0.2, 0.3])
     if kind == "all":
         return {"kind": "all"}
@@ -52,7 +56,7 @@ def test_page_and_program_select_the_same(served: tuple[Hand, ViewedRun]) -> Non
     centers, owners = draw.normal(size=(n, 3)).astype(np.float32), draw.integers(0, 8, n)
     surface = draw.uniform(0, 4, 60 * 60).astype(np.float32)
     splats = {"count": n, "centers": centers.ravel().tolist(), "ids": owners.tolist()}
-    modes = ["set", "add", "remove", "intersect"]
+    modes = ["set", "add", "remove", "intersect", "invert"]
     cases = [
         [{"mode": str(draw.choice(modes)), "shape": random_shape(draw)} for _ in range(draw.integers(1, 5))]
         for _ in range(300)
@@ -152,6 +156,28 @@ def test_what_is_drawn_is_selected(served: tuple[Hand, ViewedRun]) -> None:
     hand.wait(f"ggslam.total === {len(model.gaussians())}")
     hand.keys(Keys.ESCAPE)
     hand.wait("ggslam.steps.length === 0")
+
+
+def test_what_is_hidden_is_neither_selected_nor_in_the_way(served: tuple[Hand, ViewedRun]) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    hand, model = served
+    ((number, place),) = list(hand.object_places().items())[:1]
+    owners = model.gaussians().object_id.numpy()
+    hand.ask("ggslam.hide([arguments[0]], true)", number)
+    hand.press_words("splats")
+    hand.keys("4")
+    steps, found = drawn(hand, [place, place + [40, 0]])
+    assert steps[0]["shape"]["hidden"] == [number]
+    _, ids = splats_of(hand)
+    assert found.any() and not found[ids == number].any()
+    b.wait_for(lambda: hand.text("chosen").startswith(f"{hand.ask('ggslam.total'):,}"))
+    decided = chosen_of(hand)  # by the program, of what lies behind
+    assert (decided != found).sum() <= 0.2 * found.sum() and not decided[ids == number].any()
+    before = int((owners == number).sum())
+    hand.keys(Keys.DELETE)
+    b.wait_for(lambda: len(model.edits()) == 1)
+    assert int((model.gaussians().object_id.numpy() == number).sum()) == before
 
 
 def test_whole_objects_are_drawn_round(served: tuple[Hand, ViewedRun]) -> None:

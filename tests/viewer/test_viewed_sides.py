@@ -8,7 +8,13 @@ import torch
 from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.camera import Camera
 from ggslam.viewer.cameras import pose_along
-from ggslam.viewer.viewed_sides import ViewedSidesTuning, octahedron_to_unit, unit_to_octahedron, viewed_sides
+from ggslam.viewer.viewed_sides import (
+    KnownSides,
+    ViewedSidesTuning,
+    octahedron_to_unit,
+    unit_to_octahedron,
+    viewed_sides,
+)
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
 
@@ -33,7 +39,7 @@ def walls(thickness: float) -> GaussianTensors:
 
 
 @pytest.mark.parametrize("thickness", [0.005, 0.12])
-def test_what_is_viewed_sides_where(thickness: float) -> None:
+def test_what_is_seen_from_where(thickness: float) -> None:
     gaussians = walls(thickness)
     means = gaussians.means.numpy()
     eyes = [np.array([0.5 * step, 0.0, 0.0]) for step in (-1, 0, 1)]
@@ -59,3 +65,9 @@ def test_what_is_viewed_sides_where(thickness: float) -> None:
     ratio = distances.min(axis=0) / nearest
     assert (ratio >= 1 - 1e-6).all() and (ratio < 1.03).all()
     assert not viewed_sides(gaussians, np.arange(len(means)), CAMERA, []).any()
+    # After an edit that moves some and leaves some out, the others have what they had.
+    kept = np.arange(len(means))[::-3].copy()
+    known = KnownSides(gaussians, CAMERA, poses)
+    gaussians.means[kept[:50]] += 0.5
+    left = known.find(gaussians, kept)
+    assert np.array_equal(left[50:], found[kept[50:]]) and not left[:50].any()

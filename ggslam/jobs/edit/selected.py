@@ -13,6 +13,7 @@ from ggslam.jobs.edit.vectors import read_vector
 from ggslam.objects.editing import Change
 from ggslam.objects.recoloring import parse_color
 from ggslam.objects.segmented_map import SegmentedMap
+from ggslam.objects.segmented_rows import copies_of
 from ggslam.objects.selection import ScreenShape, parse_selection
 from ggslam.objects.splat_editing import (
     assign_gaussians,
@@ -33,9 +34,13 @@ def selected_rows(scene: SegmentedMap, selection: str) -> np.ndarray:
         ConfigError: it is no selection.
     """
     g = scene.gaussians
-    return parse_selection(selection).rows(
-        g.means.numpy(), g.object_id.numpy(), lambda screen: depth_of_screen(g, screen)
-    )
+    owners = g.object_id.numpy()
+
+    def depth_of(screen: ScreenShape) -> np.ndarray:
+        shown = copies_of(g, ~np.isin(owners, list(screen.hidden))) if screen.hidden else g
+        return depth_of_screen(shown, screen)
+
+    return parse_selection(selection).rows(g.means.numpy(), owners, depth_of)
 
 
 def depth_of_screen(gaussians: Gaussians, screen: ScreenShape) -> np.ndarray:

@@ -25,11 +25,11 @@ from ggslam.slam.slam import Slam
 from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import CameraTuning, top_view, vertical_fov, view_from_behind
+from ggslam.viewer.packed_splats import SCALES, pack_splats
 from ggslam.viewer.page_server import PageServer
 from ggslam.viewer.page_source import Download
 from ggslam.viewer.scene_values import jpeg, packed_chunk
 from ggslam.viewer.splats import colors_to_uint8, most_visible
-from ggslam.viewer.static_page import SCALES, pack_splats
 
 
 class LiveViewTuning(Tuning):

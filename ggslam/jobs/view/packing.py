@@ -9,8 +9,8 @@ import numpy as np
 
 from ggslam.jobs.view.viewed_run import ViewedRun
 from ggslam.scene.gaussian_map import SH_C0
+from ggslam.viewer.packed_splats import SCALES, pack_splats
 from ggslam.viewer.splats import colors_to_uint8
-from ggslam.viewer.static_page import SCALES, pack_splats
 
 
 def packed_rows(model: ViewedRun, rows: np.ndarray) -> tuple[dict[str, Any], bytes]:

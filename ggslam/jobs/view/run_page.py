@@ -54,7 +54,8 @@ class RunPage:
             count = len(model.shown_rows())
             return {
                 **scene_values(model, self._title, self._caption), **self._state(), "served": True, "live": False,
-                "editable": True, "target": model.default_target(), "folder": str(model.save_folder()),
+                "editable": True, "keeps": not isinstance(model.folder, MapFile),
+                "target": model.default_target(), "folder": str(model.save_folder()),
                 "chunks": [{"id": CHUNK, "count": count, "levels": [count], "low": low, "high": high}],
                 "annotations": self._read(AnnotationsRecord).get("annotations", []),
                 "camera_keys": self._read(CameraKeysRecord).get("keys", []),

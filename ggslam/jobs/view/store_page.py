@@ -22,10 +22,10 @@ from ggslam.submaps.store_objects import read_objects
 from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import CameraTuning, top_view, vertical_fov, view_of_pose
+from ggslam.viewer.packed_splats import SCALES, pack_splats
 from ggslam.viewer.page_source import Download
 from ggslam.viewer.scene_values import packed_chunk
 from ggslam.viewer.splats import colors_to_uint8, most_visible
-from ggslam.viewer.static_page import SCALES, pack_splats
 
 
 class StorePageTuning(Tuning):

@@ -42,7 +42,7 @@ from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted
 from ggslam.viewer.model import Box, ListedObject, ShownChange, ShownMover
 from ggslam.viewer.splats import most_visible
-from ggslam.viewer.viewed_sides import viewed_sides
+from ggslam.viewer.viewed_sides import KnownSides
 from ggslam.volumes.map_upright import upright_of
 
 
@@ -81,6 +81,7 @@ class ViewedRun:
     ) -> None:  # fmt: skip
         self.folder, self._max_splats, self._sequence_path = folder, max_splats, sequence
         self._lock, self._saving = threading.RLock(), threading.Lock()
+        self._sides: KnownSides | None = None
         self._edits: list[Edit] = []
         self._texts: list[str] = []
         self._undone: list[Edit] = []
@@ -102,6 +103,8 @@ class ViewedRun:
     def walks(self) -> list[np.ndarray]:
         """See `ViewedMap`."""
         found: dict[tuple[int, int], list[np.ndarray]] = {}
+        if not self.folder.has_poses:
+            return []  # nobody walked there
         for frame, pose in self.frame_poses.items():
             found.setdefault(self._record.walk_of(frame), []).append(pose[:3, 3])
         return [np.stack(positions) for positions in found.values()]
@@ -172,7 +175,7 @@ class ViewedRun:
                                                               else "")]  # fmt: skip
             taken = [quantity(len(self.frame_poses), "frame"), quantity(len(self.keyframe_poses), "keyframe")]
             parts += taken if self.folder.has_poses else [f"{quantity(len(self.frame_poses), 'view')} around it"]
-            if self._segmented is not None:
+            if self.has_objects and self._segmented is not None:
                 parts.append(quantity(len(self._segmented.table), "object"))
             return " · ".join(parts)
 
@@ -227,7 +230,9 @@ class ViewedRun:
         """See `viewed_sides`; None where the poses are none of a recording."""
         if not self.folder.has_poses:
             return None
-        return viewed_sides(self._gaussians, rows, self.camera, list(self.frame_poses.values()))
+        if self._sides is None:  # before the first edit as a rule, else of what is left by then
+            self._sides = KnownSides(self._gaussians, self.camera, list(self.frame_poses.values()))
+        return self._sides.find(self._gaussians, rows)
 
     def identity_colors(self, rows: np.ndarray) -> np.ndarray | None:
         """Colours uint8 [N, 3] of the identity vectors of some rows; None if they have none."""

@@ -3,7 +3,8 @@
 // keys to fly. Coordinates: x right, y down, z forward.
 
 class OrbitCamera {
-  // taken(event): whether somebody else wants a press of the pointer; onclick(x, y, event), ondouble(x, y) in CSS pixels.
+  // taken(event): whether somebody else wants a press of the pointer; onclick(x, y, event) and ondouble(x, y) are told
+  // CSS pixels.
   constructor(canvas, up, fov, redraw) {
     Object.assign(this, {
       canvas,

@@ -82,6 +82,14 @@ class Film {
     this.viewer.say(`key ${this.keys.length} of the film`);
   }
 
+  // Keys that are kept now, perhaps added by another page; those of a map that grew are not kept anywhere yet.
+  kept(keys) {
+    if (!keys || (!keys.length && !this.inFile)) return;
+    this.inFile = true;
+    this.keys = keys;
+    this.viewer.emit("film");
+  }
+
   take(keys) {
     this.keys = keys;
     this.changed();
@@ -131,8 +139,9 @@ class Film {
   async changed() {
     const { viewer } = this;
     viewer.emit("film");
-    if (viewer.source.served && viewer.scene.editable)
-      await viewer.try(() => viewer.source.post("camera-keys", { fps: 30, keys: this.complete() }, "PUT"));
+    if (!viewer.keeps()) return;
+    this.inFile = true;
+    await viewer.keep("camera-keys", { fps: 30, keys: this.complete() });
   }
 
   // Shows the film, or ends it.

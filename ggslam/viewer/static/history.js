@@ -34,7 +34,8 @@ class LocalEdits {
       next.set(chunk, gone);
     }
     if (!count) throw new Error("nothing is selected");
-    const text = `${kind === "remove" ? "removed" : "cropped:"} ${count.toLocaleString()} splats${kind === "remove" ? "" : " removed"}`;
+    const splats = `${count.toLocaleString()} ${count === 1 ? "splat" : "splats"}`;
+    const text = kind === "remove" ? `removed ${splats}` : `cropped: ${splats} removed`;
     this.done.push({ text, before, after: next });
     this.undone = [];
     this.viewer.setGone(next);

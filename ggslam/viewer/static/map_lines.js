@@ -25,11 +25,8 @@ class MapLines {
     if (this.clean && !this.sets.size) return;
     const wide = Math.round(canvas.clientWidth * pixels),
       tall = Math.round(canvas.clientHeight * pixels);
-    if (canvas.width !== wide || canvas.height !== tall) {
-      canvas.width = wide;
-      canvas.height = tall;
-    }
-    context.clearRect(0, 0, wide, tall);
+    if (canvas.height !== tall) canvas.height = tall;
+    canvas.width = wide; // empties it; chromium forgets a clearRect that only lines out of sight follow
     for (const { segments, color, width: thick } of this.sets.values()) {
       context.beginPath();
       context.lineWidth = thick * pixels;

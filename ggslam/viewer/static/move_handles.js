@@ -11,7 +11,7 @@ class AxisHandle {
   constructor(viewer, { color, place, direction, onstart = () => {}, onmove, from = () => null, words }) {
     Object.assign(this, { viewer, place, direction, onmove, from });
     this.arm = draw("line", { class: "arm", stroke: color });
-    this.dot = draw("circle", { class: "handle", r: 8, fill: color });
+    this.dot = draw("circle", { class: "handle", r: 8, fill: color, style: "display: none" });
     const title = draw("title");
     title.textContent = words;
     this.dot.append(title);
@@ -74,6 +74,7 @@ class MoveTool extends Tool {
     this.angle = 0;
     this.who = this.viewer.movedWho();
     this.makeHandles();
+    if (!this.viewer.inView(box.center)) this.viewer.say("the handles are out of sight; F looks at them");
     this.viewer.emit("moved");
     this.viewer.redrawOverlay();
   }

@@ -23,6 +23,15 @@ class Notes {
     this.editing = -1;
   }
 
+  // What is kept now; a note that is being written stays.
+  take(list) {
+    const draft = this.list[this.editing];
+    this.list = list;
+    if (!draft) return;
+    this.editing = list.findIndex(({ point }) => length(minus(point, draft.point)) < 1e-6);
+    if (this.editing < 0) this.editing = list.push(draft) - 1;
+  }
+
   add(note) {
     this.list.push(note);
     this.editing = this.list.length - 1;
@@ -52,8 +61,8 @@ class Notes {
   async changed(keep = true) {
     this.viewer.emit("notes");
     this.viewer.redrawOverlay();
-    if (keep && this.viewer.source.served && this.viewer.scene.editable)
-      await this.viewer.try(() => this.viewer.source.post("annotations", { annotations: this.list }, "PUT"));
+    if (keep && this.viewer.keeps())
+      await this.viewer.keep("annotations", { annotations: this.list.filter((_, k) => k !== this.editing) });
   }
 
   labels() {

@@ -145,14 +145,22 @@ class Viewer {
   async reload(splats = true) {
     const scene = await this.source.scene();
     if (scene.waiting) return;
-    const first = !this.scene.chunks;
+    const first = !this.scene.chunks,
+      grew = this.scene.live && !scene.live;
     this.scene = scene;
+    if (grew && scene.objects.length) {
+      this.unit = "objects"; // those that the run has found
+      this.emit("unit");
+    }
     this.camera.up = unit(scene.up);
     this.camera.fov = scene.fov;
     this.source.version = scene.version || this.source.version + 1;
     if (splats && !this.loader) for (const { id } of scene.chunks) this.map.setChunk(id, await this.source.splats(id));
     if (this.edits.take) this.edits.take(scene);
-    this.notes.list = scene.annotations || this.notes.list;
+    if (scene.keeps && !this.keeping) {
+      this.notes.take(scene.annotations);
+      this.film.kept(scene.camera_keys);
+    }
     this.sceneChanged();
     if (splats) {
       this.color(this.coloring, false);

@@ -66,19 +66,32 @@ class PainterPool {
     const serial = ++this.serial,
       rows = Math.ceil(shot.height / TILE),
       ends = this.shares.map((share) => Math.round(share * rows));
-    return new Promise((resolve) => {
-      let left = 0,
-        from = 0;
-      ends.forEach((end, i) => {
-        const top = from * TILE,
-          bottom = Math.min(shot.height, end * TILE);
-        from = Math.max(from, end);
-        if (bottom <= top) return;
-        left++;
-        this.workers[i].postMessage({ start: [{ serial, shot, top, bottom, strips, kind, least }] });
-      });
-      this.jobs.set(serial, { left, onstrip, resolve, times: [], drawn: 0 });
+    const job = { onstrip, left: 0, times: [], drawn: 0 };
+    let top = 0;
+    ends.forEach((end, i) => {
+      const bottom = Math.min(shot.height, end * TILE);
+      if (bottom <= top) return;
+      job.left++;
+      this.workers[i].postMessage({ start: [{ serial, shot, top, bottom, strips, kind, least }] });
+      top = bottom;
     });
+    job.promise = new Promise((resolve) => {
+      job.resolve = resolve;
+    });
+    this.jobs.set(serial, job);
+    return job.promise;
+  }
+
+  // Until nothing is being painted.
+  async rest() {
+    for (const job of this.jobs.values()) await job.promise;
+    if (this.jobs.size) await this.rest();
+  }
+
+  // Paints in the breaks that others leave, until all of it is done.
+  async finish(shot, options) {
+    do await this.rest();
+    while (!(await this.paint(shot, options)));
   }
 
   take(strip) {
@@ -114,9 +127,7 @@ class PainterPool {
 
   async depth(shot) {
     const depths = new Float32Array(shot.width * shot.height);
-    for (;;) {
-      const onstrip = ({ top, values }) => depths.set(values, top * shot.width);
-      if (await this.paint(shot, { kind: "depth", onstrip })) return depths;
-    }
+    await this.finish(shot, { kind: "depth", onstrip: ({ top, values }) => depths.set(values, top * shot.width) });
+    return depths;
   }
 }

@@ -31,6 +31,7 @@ function reveal(piece, needed) {
 function viewPanel(viewer) {
   const coloring = make("select", { id: "coloring", onchange: () => viewer.color(coloring.value) }),
     places = row(make("span", { className: "name", textContent: "Camera" }));
+  places.classList.add("tight");
   const lines = row(make("span", { className: "name", textContent: "Show" }));
   for (const [name, words] of [
     ["path", "path"],
@@ -87,18 +88,13 @@ function framePanel(viewer) {
     picture = make("img", { id: "picture", alt: "recorded and rendered images of the frame" });
   const go = make("input", { type: "checkbox", id: "going", checked: true }),
     play = button("Play", () => playing()),
-    whole = part(
-      viewer,
-      "Frames",
-      true,
-      row(make("label", { htmlFor: "frame", textContent: "Frame" }), slider, play),
-      row(
-        make("label", { htmlFor: "going", textContent: "Look" }),
-        go,
-        make("span", { className: "soft", textContent: "from where it was taken" }),
-      ),
-      picture,
-    );
+    sliding = row(make("label", { htmlFor: "frame", textContent: "Frame" }), slider, play),
+    looking = row(
+      make("label", { htmlFor: "going", textContent: "Look" }),
+      go,
+      make("span", { className: "soft", textContent: "from where it was taken" }),
+    ),
+    whole = part(viewer, "Frames", true, sliding, looking, picture);
   let timer = 0,
     waiting = 0;
   const show = (look) => {
@@ -132,6 +128,7 @@ function framePanel(viewer) {
   viewer.on("user", () => playing(false));
   viewer.on("scene", () => {
     whole.hidden = !viewer.scene.frames.length && !viewer.scene.live;
+    sliding.hidden = looking.hidden = !viewer.scene.frames.length;
     slider.max = Math.max(0, viewer.scene.frames.length - 1);
     slider.value = viewer.frame;
     if (viewer.scene.frames.length) show(false);
@@ -145,7 +142,14 @@ function framePanel(viewer) {
 }
 
 function objectPanel(viewer) {
-  const search = make("input", { type: "search", placeholder: "name, #7, red ...", "aria-label": "Search objects" }),
+  const search = make("input", {
+      type: "search",
+      placeholder: "name, #7, red ...",
+      "aria-label": "Search objects",
+      onkeydown: (event) => {
+        if (event.key === "Enter") selectFound();
+      },
+    }),
     list = make("ul", { id: "objects", role: "listbox", "aria-label": "Objects", "aria-multiselectable": "true" });
   const ids = () => [0, ...viewer.scene.objects.map((o) => o.id)],
     whole = part(
@@ -154,7 +158,7 @@ function objectPanel(viewer) {
       true,
       row(
         search,
-        button("Select found", () => viewer.choose("set", { kind: "objects", ids: objects.found() })),
+        button("Select found", () => selectFound()),
       ),
       row(
         make("span", { className: "name", textContent: "Show" }),
@@ -172,6 +176,11 @@ function objectPanel(viewer) {
       list,
     );
   const objects = (viewer.objectList = new ObjectList(viewer, list, search));
+  const selectFound = () => {
+    const found = objects.found();
+    viewer.choose("set", { kind: "objects", ids: found });
+    if (!found.length) viewer.say("no object is called so, nor has this colour");
+  };
   viewer.on("scene", () => {
     whole.hidden = !viewer.scene.objects.length;
     whole.count(String(viewer.scene.objects.length));
@@ -179,11 +188,13 @@ function objectPanel(viewer) {
 }
 
 function selectionPanel(viewer) {
+  let asked = false; // whether people said what is selected
   const unit = split(
     { objects: "objects", splats: "splats" },
     viewer.unit,
     (value) => {
       viewer.unit = value;
+      asked = true;
     },
     "What is selected",
   );
@@ -235,6 +246,7 @@ function selectionPanel(viewer) {
     () => viewer.edit({ kind: "assign", selection: viewer.steps, object: "new", name: name.value }),
     { id: "do-assign" },
   );
+  const copyBox = button("Copy box", () => viewer.copyBox(), { id: "do-copy", title: "Its middle and size as text" });
   const whose = make("select", { "aria-label": "Object to add to", id: "whose" }),
     give = button(
       "Add to",
@@ -264,10 +276,10 @@ function selectionPanel(viewer) {
       remove,
       keep,
       button("Invert", () => viewer.invert(), { title: "Ctrl+I", id: "do-invert" }),
-      button("Copy box", () => viewer.copyBox(), { id: "do-copy" }),
     ),
-    row(color, recolor, name, rename, assign),
+    row(name, rename, assign),
     row(give, whose),
+    row(color, recolor, copyBox),
     row(
       button("Export PLY", () => viewer.exportObject(), { id: "do-export", title: "The object's Gaussians as a file" }),
       button("Save selection", () => viewer.saveSelection(), { title: "For `ggslam edit --remove @FILE`" }),
@@ -275,6 +287,7 @@ function selectionPanel(viewer) {
     movePanel(viewer),
     cropPanel(viewer),
   );
+  let offered = ""; // by a selection, not by a person
   const update = () => {
     const { total } = viewer,
       objects = viewer.selectedObjects(),
@@ -291,14 +304,19 @@ function selectionPanel(viewer) {
     recolor.disabled = assign.disabled = give.disabled = !total || !viewer.edits.can("recolor");
     document.getElementById("do-export").disabled = !one || !viewer.source.served;
     rename.disabled = !one || !viewer.edits.can("rename");
-    if (one && document.activeElement !== name) name.value = one.name || "";
+    copyBox.disabled = !total;
+    if (document.activeElement !== name && (one || name.value === offered)) name.value = offered = one?.name || "";
     whose.replaceChildren(
       ...viewer.scene.objects.map((o) => new Option(`${o.id} · ${o.name || "object"}`, o.id)),
       new Option("no object", "none"),
     );
   };
   viewer.on("selection", update);
-  viewer.on("scene", update);
+  viewer.on("scene", () => {
+    if (!asked) unit.choose((viewer.unit = viewer.scene.objects.length ? "objects" : "splats"));
+    update();
+  });
+  viewer.on("unit", () => unit.choose(viewer.unit));
 }
 
 function movePanel(viewer) {
@@ -437,6 +455,8 @@ function notePanel(viewer) {
     });
   });
   viewer.on("notes", () => {
+    const writing = list.querySelector("input");
+    if (writing && writing === document.activeElement && viewer.notes.editing >= 0) return; // shown when it is written
     whole.count(viewer.notes.list.length ? String(viewer.notes.list.length) : "");
     list.replaceChildren(
       ...viewer.notes.list.map(({ text }, k) => {
@@ -477,10 +497,10 @@ function notePanel(viewer) {
           "aria-label": "Text of the note",
           onkeydown: (event) => {
             event.stopPropagation();
-            if (event.key === "Enter") input.blur();
+            if (event.key === "Enter" || event.key === "Escape") input.blur();
           },
           onblur: () => {
-            if (viewer.notes.editing === k) viewer.notes.setText(k, input.value);
+            if (viewer.notes.editing >= 0) viewer.notes.setText(viewer.notes.editing, input.value);
           },
         });
         setTimeout(() => input.focus());
@@ -504,7 +524,8 @@ function filmPanel(viewer) {
       file.value = "";
     },
   });
-  const play = button("Play", () => viewer.film.play(), { id: "film-play" }),
+  const how = make("p"),
+    play = button("Play", () => viewer.film.play(), { id: "film-play" }),
     whole = part(
       viewer,
       "Film",
@@ -522,10 +543,11 @@ function filmPanel(viewer) {
         make("label", {}, "fps ", fps),
         file,
       ),
-      make("p", { textContent: "ggslam render RUN --film fly.mp4 --path keys.json makes the film." }),
+      how,
     );
   viewer.on("film", () => {
     const { keys } = viewer.film;
+    how.textContent = `ggslam render RUN --film fly.mp4 --path ${viewer.keeps() ? "keys" : "keys.json"} makes the film.`;
     play.textContent = viewer.film.running ? "Stop" : "Play";
     play.disabled = keys.length < 2;
     whole.count(keys.length ? String(keys.length) : "");
@@ -584,6 +606,7 @@ function editPanel(viewer) {
       className: "main",
       id: "do-save",
     });
+  const saved = make("p", { id: "saved", className: "value" });
   const saving = make(
     "div",
     {},
@@ -594,6 +617,7 @@ function editPanel(viewer) {
       make("span", { className: "soft", textContent: "close those that objects leave" }),
     ),
     row(save, progress),
+    saved,
   );
   const other = make("p", { textContent: "`ggslam view RUN` serves a page that moves, recolours and saves, too." }),
     whole = part(viewer, "Edits", false, list, row(undo, redo), saving, other);
@@ -606,6 +630,7 @@ function editPanel(viewer) {
     redo.disabled = !redoCount;
     save.disabled = !texts.length || viewer.saving;
     progress.hidden = !viewer.saving;
+    saved.textContent = viewer.saved || "";
     saving.hidden = !viewer.scene.editable;
     other.hidden = !!viewer.source.served;
     whole.count(texts.length ? String(texts.length) : "");

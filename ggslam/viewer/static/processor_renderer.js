@@ -35,6 +35,7 @@ class ProcessorRenderer {
   }
 
   draw(shot) {
+    this.latest = shot;
     if (this.busy) {
       this.next = shot;
       return;
@@ -56,9 +57,11 @@ class ProcessorRenderer {
       for (const strip of strips) this.put(strip, shot);
       this.onframe({ ...shot, milliseconds: performance.now() - start }, complete);
     }
-    const next = this.next;
+    const next = this.next || (whole ? null : shot);
     this.next = null;
-    if (next) this.draw(next);
+    if (!next) return;
+    await this.pool.rest();
+    if (this.latest === next && !this.busy) this.draw(next);
   }
 
   // Sharp strips replace the coarse picture as they come.
@@ -73,7 +76,10 @@ class ProcessorRenderer {
     if (await this.pool.paint(shot, { strips: 12, onstrip })) {
       this.sharpMs = performance.now() - start;
       this.onframe(shot, this.chunks.size > 0);
+      return;
     }
+    await this.pool.rest(); // a depth image came between
+    if (this.latest === shot && !this.busy) this.sharpen(shot);
   }
 
   resize({ width, height }) {
@@ -99,6 +105,6 @@ class ProcessorRenderer {
   }
 
   async copyTo(context, shot) {
-    while (!(await this.pool.paint(shot, { onstrip: (strip) => this.put(strip, shot, context) })));
+    await this.pool.finish(shot, { onstrip: (strip) => this.put(strip, shot, context) });
   }
 }

@@ -10,14 +10,17 @@ function selectedSplats(steps, splats, depthOf = () => null) {
   let selected = new Uint8Array(splats.count);
   for (const { mode, shape } of steps) {
     const found = shapeTest(shape, depthOf(shape)),
+      hidden = new Set(shape.hidden || []),
       { centers, ids } = splats,
       next = mode === "set" ? new Uint8Array(splats.count) : selected;
     for (let i = 0; i < splats.count; i++) {
-      const inside = found(centers[3 * i], centers[3 * i + 1], centers[3 * i + 2], ids[i]);
+      const inside = !hidden.has(ids[i]) && found(centers[3 * i], centers[3 * i + 1], centers[3 * i + 2], ids[i]);
       if (mode === "set" || mode === "add") {
         if (inside) next[i] = 1;
       } else if (mode === "remove") {
         if (inside) next[i] = 0;
+      } else if (mode === "invert") {
+        if (inside) next[i] = 1 - next[i];
       } else if (!inside) next[i] = 0;
     }
     selected = next;

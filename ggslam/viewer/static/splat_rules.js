@@ -28,6 +28,6 @@ function startWorker(main, constants, ...parts) {
   ];
   const address = URL.createObjectURL(new Blob([text.join("\n")], { type: "text/javascript" }));
   const worker = new Worker(address);
-  URL.revokeObjectURL(address);
+  setTimeout(() => URL.revokeObjectURL(address), 10000); // some browsers have not read it yet
   return worker;
 }

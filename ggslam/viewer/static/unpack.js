@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Splats from the bytes that ggslam/viewer/static_page.py packs.
+// Splats from the bytes that ggslam/viewer/packed_splats.py packs.
 
 // buffer: ArrayBuffer, deflated; header: {count, low, high, scales, identity, seen}. Gives {count, centers Float32
 // [3n], covariances Float32 [6n] (xx xy xz yy yz zz), alphas Uint8 [n], ids Uint16 [n], rgb Uint8 [3n], identity Uint8 [3n]

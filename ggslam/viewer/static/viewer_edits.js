@@ -11,6 +11,17 @@ class ViewerEditing {
     }
   }
 
+  // Whether notes and keys of the film are kept beside the run.
+  keeps() {
+    return this.source.served && !!this.scene.keeps;
+  }
+
+  async keep(what, values) {
+    this.keeping = (this.keeping || 0) + 1;
+    await this.try(() => this.source.post(what, values, "PUT"));
+    this.keeping--;
+  }
+
   async edit(values) {
     if (values.selection && !values.selection.length) {
       this.say("nothing is selected");
@@ -20,6 +31,7 @@ class ViewerEditing {
     if (text === undefined) return;
     if (values.kind !== "rename" && values.kind !== "recolor") this.select([]);
     if (this.tools.name === "crop") this.tools.choose("look");
+    this.saved = "";
     this.say(text);
     this.emit("edits");
   }
@@ -44,9 +56,10 @@ class ViewerEditing {
   async save(target, inpaint) {
     this.saving = true;
     this.emit("edits");
-    this.say("saving: the edits are done to the run's files");
+    this.say("saving: the edits are done to the run's files", false, true);
     const text = await this.try(() => this.edits.save(target, inpaint));
     this.saving = false;
+    this.saved = text || "";
     this.emit("edits");
     if (text !== undefined) this.say(text);
   }

@@ -10,6 +10,7 @@ class ViewerGrowing {
           document.getElementById("about").textContent = news.text;
         }
         if (news.what.includes("splats") || news.what.includes("scene") || news.what.includes("path")) {
+          this.stale ||= news.what.includes("splats") || news.what.includes("path") || !this.scene.chunks;
           if (this.reloading) {
             this.again = true;
             return;
@@ -17,7 +18,9 @@ class ViewerGrowing {
           this.reloading = true;
           do {
             this.again = false;
-            await this.try(() => this.reload(true));
+            const splats = this.stale;
+            this.stale = false;
+            await this.try(() => this.reload(splats));
           } while (this.again);
           this.reloading = false;
         }

@@ -2,6 +2,12 @@
 // Light and dark, and what is drawn over the map. A part of `Viewer`.
 
 class ViewerLooks {
+  inView(point) {
+    const at = this.camera.project(point);
+    const { clientWidth, clientHeight } = this.canvas;
+    return !!at && at[0] > 0 && at[1] > 0 && at[0] < clientWidth && at[1] < clientHeight;
+  }
+
   // What a pixel is wide at a point, in metres.
   metresPerPixel(point) {
     return Math.max(dot(minus(point, this.camera.position), this.camera.axes()[2]), this.camera.near) / this.focal();

@@ -48,7 +48,14 @@ class ViewerSelecting {
     let next = shape;
     if (!exact && this.unit === "objects" && shape.kind !== "objects" && this.scene.objects.length)
       next = { kind: "objects", ids: this.objectsIn(shape) };
+    this.leaveHidden(next);
     this.select(mode === "set" ? [{ mode, shape: next }] : [...this.steps, { mode, shape: next }]);
+  }
+
+  // What is hidden is not selected by a shape.
+  leaveHidden(shape) {
+    if (shape.kind !== "objects" && this.hidden.size) shape.hidden = [...this.hidden];
+    return shape;
   }
 
   async chooseDrawn(mode, fill) {
@@ -94,21 +101,7 @@ class ViewerSelecting {
   }
 
   invert() {
-    this.select(
-      this.steps.length
-        ? [{ mode: "set", shape: { kind: "all" } }, ...this.minusSteps()]
-        : [{ mode: "set", shape: { kind: "all" } }],
-    );
-  }
-
-  // Steps that take away what the present ones select: exact for one step, else by splats as they were found here.
-  minusSteps() {
-    if (this.steps.length === 1) return [{ mode: "remove", shape: this.steps[0].shape }];
-    const parts = this.steps.map((step) => ({ ...step }));
-    if (parts.every(({ mode }) => mode === "set" || mode === "add"))
-      return parts.map(({ shape }) => ({ mode: "remove", shape }));
-    this.say("a selection of added and removed parts cannot be inverted");
-    return parts.slice(0, 1).map(({ shape }) => ({ mode: "remove", shape }));
+    this.select([...this.steps, { mode: "invert", shape: this.leaveHidden({ kind: "all" }) }]);
   }
 
   applySelection() {

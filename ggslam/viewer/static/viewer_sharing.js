@@ -102,11 +102,13 @@ class ViewerSharing {
     });
   }
 
-  say(text, failed = false) {
+  // stays: until something else is said.
+  say(text, failed = false, stays = false) {
     const said = document.getElementById("said");
     said.textContent = text;
     said.classList.toggle("failed", failed);
     clearTimeout(this.quiet);
+    if (stays) return;
     this.quiet = setTimeout(
       () => {
         said.textContent = "";
@@ -129,5 +131,6 @@ class ViewerSharing {
         make("form", { method: "dialog" }, make("button", { className: "main", textContent: "Close" })),
       );
     dialog.showModal();
+    dialog.scrollTop = 0; // the button at its end has the focus
   }
 }

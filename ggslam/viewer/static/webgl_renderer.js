@@ -167,10 +167,12 @@ class WebglRenderer {
 
 // Some browsers say of a program that it is a GPU.
 function drawsInSoftware(gl) {
-  const info = gl.getExtension("WEBGL_debug_renderer_info");
-  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(
-    gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER),
-  );
+  let name = gl.getParameter(gl.RENDERER);
+  if (/^WebKit/.test(name)) {
+    const info = gl.getExtension("WEBGL_debug_renderer_info"); // elsewhere asking for it is complained about
+    if (info) name = gl.getParameter(info.UNMASKED_RENDERER_WEBGL);
+  }
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
 // How far splats reach at most, in metres: 3.33 standard deviations.

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from ggslam.cli.main import app
 from ggslam.runs.folder import RunFolder
-from ggslam.viewer.static_page import SCALES, STATIC, pack_splats
+from ggslam.viewer.packed_splats import SCALES, STATIC, pack_splats
 
 from .test_splats import some
 

@@ -22,14 +22,14 @@ MAP_SCRIPTS = (
 """What `MapView` consists of, in the order in which a page needs it."""
 
 
-class StaticPageTuning(Tuning):
+class PackedSplatTuning(Tuning):
     """How exactly splats are stored."""
 
     min_size_m = 1e-4
     """Smallest standard deviation that is stored, in metres."""
 
 
-SCALES = (float(np.log(StaticPageTuning.min_size_m)), float(np.log(DrawnSplatTuning.max_size_m)))
+SCALES = (float(np.log(PackedSplatTuning.min_size_m)), float(np.log(DrawnSplatTuning.max_size_m)))
 """Logarithms of the smallest and largest standard deviation that are written, 255 steps (4 %) apart."""
 
 
