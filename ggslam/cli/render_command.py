@@ -40,6 +40,7 @@ EPILOG = """
 
 
 def render(
+    context: typer.Context,
     run: options.MapPath,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the pictures; default RUN/renders, or NAME_renders beside a file.")
@@ -85,22 +86,11 @@ def render(
     """Render a run's map from the poses of its frames or from anywhere, as a film, or as a floor plan to scale."""
     from ggslam.runs.map_file import open_map
 
-    wanted = [name for name, value in (("pose", pose), ("film", film), ("plan", plan)) if value not in (None, [])]
-    if len(wanted) > 1:
-        raise ConfigError(f"`{wanted[0]}` and `{wanted[1]}`: expected one of them, found both")
-    way = wanted[0] if wanted else "frames"
-    _refuse_unused(way, {
-        "frames": frames, "every": every, "out": out, "width": width, "size": size, "path": path, "fps": fps,
-        "seconds": seconds, "smoothing": smoothing, "sequence": sequence, "metre_per_pixel": metre_per_pixel,
-        "cut": cut, "what": what,
-    })  # fmt: skip
-    smoothing = 0.25 if smoothing is None else smoothing
+    _refuse_unused(_way(pose=pose, film=film, plan=plan), context.params)
     folder, kinds = open_map(run), "color,depth" if what is None else what
     if film is not None:
         chosen = size if size is not None or width is None else _size_of_width(folder, width)
-        chosen_path = path if path is not None else "recorded" if folder.has_poses else "orbit"
-        _film(folder, film, chosen_path, fps, seconds, chosen, "color" if what is None else what, smoothing,
-              sequence)  # fmt: skip
+        _film(folder, film, path, fps, seconds, chosen, "color" if what is None else what, smoothing, sequence)
     elif plan is not None:
         _plan(folder, plan, 0.01 if metre_per_pixel is None else metre_per_pixel, cut)
     elif pose:
@@ -118,10 +108,18 @@ USED: Final = {
 """Options that each way of rendering takes."""
 
 
+def _way(**given: object) -> str:
+    """Which of the ways is asked for; raises ConfigError for two."""
+    wanted = [name for name, value in given.items() if value not in (None, [])]
+    if len(wanted) > 1:
+        raise ConfigError(f"`{wanted[0]}` and `{wanted[1]}`: expected one of them, found both")
+    return wanted[0] if wanted else "frames"
+
+
 def _refuse_unused(way: str, given: dict[str, object]) -> None:
-    """Raises ConfigError for an option that would be ignored."""
+    """Raises ConfigError for an option that would be ignored; `given` are the command's parameters."""
     for name, value in given.items():
-        if value not in (None, []) and name not in USED[way]:
+        if value not in (None, []) and name not in (*USED[way], "run", "pose", "film", "plan"):
             others = " or ".join(f"`{other}`" for other in USED if name in USED[other])
             raise ConfigError(f"`{name}`: goes with {others}" + ("" if way == "frames" else f", not with `{way}`"))
 
@@ -142,12 +140,14 @@ def _frames(
 
 
 def _film(
-    folder: RunFolder, film: Path, path: str, fps: float | None, seconds: float | None, size: str | None, what: str,
-    smoothing: float, sequence: Path | None,
+    folder: RunFolder, film: Path, path: str | None, fps: float | None, seconds: float | None, size: str | None,
+    what: str, smoothing: float | None, sequence: Path | None,
 ) -> None:  # fmt: skip
     from ggslam.jobs.render.film import render_film
     from ggslam.jobs.render.shots import parse_size
 
+    path = path if path is not None else "recorded" if folder.has_poses else "orbit"
+    smoothing = 0.25 if smoothing is None else smoothing
     with progress_bar() as bar:
         task = bar.add_task("film", total=None, info="")
         note = render_film(

@@ -14,7 +14,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ import numpy as np
 from ggslam.errors import ConfigError, MissingDependency, RunFolderError
 from ggslam.system.atomic import atomic_write
 from ggslam.system.tuning import Tuning
+from ggslam.system.untrusted_files import open_untrusted
 
 ENDINGS = (".mp4", ".gif", ".webp")
 """Of the files that films are written to."""
@@ -74,9 +75,60 @@ def write_film(path: str | Path, fps: float) -> Iterator[FilmWriter]:
         try:
             yield writer
             writer.finish()
+            if not is_whole_film(temporary):  # the libraries keep a full disk to themselves
+                failure = RunFolderError(f"cannot write {path}: the film was cut off; is the disk full?")
+                failure.exit_code = 1
+                raise failure
         except BaseException:
             writer.abandon()
             raise
+
+
+def is_whole_film(path: Path) -> bool:
+    """Whether a file of one of the `ENDINGS` has its end, going by the sizes that its parts state."""
+    ending, size = film_ending(path), path.stat().st_size
+    with open_untrusted(path, RunFolderError) as file:
+        if ending == ".mp4":
+            return _mp4_is_whole(file, size)
+        if ending == ".webp":
+            return int.from_bytes(file.read(8)[4:], "little") + 8 == size
+        try:
+            return _gif_end(file.read()) == size
+        except (IndexError, ValueError):
+            return False
+
+
+def _mp4_is_whole(file: BinaryIO, size: int) -> bool:
+    """Whether boxes, one of them with the index of the pictures, fill a file of so many bytes."""
+    start, kinds = 0, set()
+    while start < size:
+        file.seek(start)
+        head = file.read(16)
+        kinds.add(head[4:8])
+        long = head[:4] == b"\0\0\0\1"
+        length = int.from_bytes(head[8:16] if long else head[:4], "big")
+        if length < (16 if long else 8):
+            return False
+        start += length
+    return start == size and b"moov" in kinds
+
+
+def _gif_end(content: bytes) -> int:
+    """Where its blocks end; raises IndexError if they do not."""
+    start = 13 + _color_table(content[10])
+    while (kind := content[start]) != 0x3B:
+        if kind not in (0x21, 0x2C):
+            raise ValueError("no block of a GIF")
+        start += 2 if kind == 0x21 else 11 + _color_table(content[start + 9])
+        while size := content[start]:
+            start += size + 1
+        start += 1
+    return start + 1
+
+
+def _color_table(flags: int) -> int:
+    """Bytes of a table of colours."""
+    return 3 << ((flags & 7) + 1) if flags & 0x80 else 0
 
 
 def _writer_for(ending: str, path: Path, fps: float) -> FilmWriter:

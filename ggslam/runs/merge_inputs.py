@@ -35,8 +35,9 @@ def read_known_run(folder: RunFolder, context: NativeContext) -> KnownRun:
     """
     path = folder.path / PLACES_FILE
     if not path.is_file():
-        reason = "its map was edited since: merge first, then edit" if folder.mark().edits else "made without loops"
-        raise RunFolderError(f"{path}: missing, and without places a run cannot be merged ({reason})")
+        edited = "its map was edited since: merge or compare first, then edit"
+        reason = edited if folder.mark().edits else "made without loops"
+        raise RunFolderError(f"{path}: missing, and without places a run cannot be laid over another ({reason})")
     arrays: dict[str, Any] = read_all_arrays(path, "the places of a run")
     try:
         return _known_run(folder, arrays, context)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats import film_files
-from ggslam.formats.film_files import durations, even, find_ffmpeg, write_film
+from ggslam.formats.film_files import durations, even, find_ffmpeg, is_whole_film, write_film
 from ggslam.system.tuning import overridden
 
 FPS = 12.0
@@ -118,6 +119,36 @@ def test_ffmpeg_that_fails_is_told_of(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(RunFolderError, match="no space for it"):
         write(tmp_path / "film.mp4", pictures())
     assert not (tmp_path / "film.mp4").exists()
+
+
+@pytest.mark.parametrize("program", ["ffmpeg", "opencv"])
+@pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])
+def test_a_full_disk_is_told_of(ending: str, program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if program == "ffmpeg" and find_ffmpeg() is None:
+        pytest.skip("no ffmpeg with x264 here")
+    if program == "opencv":
+        monkeypatch.setattr(film_files, "find_ffmpeg", lambda: None)
+    noise = np.random.default_rng(0)
+    made = [noise.integers(0, 256, (96, 128, 3), np.uint8) for _ in range(10)]
+    size = write(tmp_path / f"whole.{ending}", made).stat().st_size
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1000, before[1]))
+    try:
+        with pytest.raises(RunFolderError):
+            write(tmp_path / f"film.{ending}", made)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [p.name for p in tmp_path.iterdir()] == [f"whole.{ending}"]
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])
+def test_a_film_without_its_end_is_not_whole(ending: str, tmp_path: Path) -> None:
+    path = write(tmp_path / f"film.{ending}", pictures())
+    content = path.read_bytes()
+    assert is_whole_film(path)
+    for count in range(0, len(content), len(content) // 200 + 1):
+        path.write_bytes(content[:count])
+        assert not is_whole_film(path), count
 
 
 def test_unknown_endings_and_large_animations(tmp_path: Path) -> None:

@@ -73,6 +73,18 @@ def test_every_form_holds_the_same_and_names_what_failed(table: ScoresTable) -> 
     assert len(lines) == 5 and len({line.count("&") for line in lines}) == 1
 
 
+def test_differences_are_numbers_in_csv(tmp_path: Path) -> None:
+    states = [
+        done(tmp_path, "room0", "default", 0, 30.0, 0.010), done(tmp_path, "room0", "default", 1, 32.0, 0.020),
+        done(tmp_path, "room0", "more", 0, 29.5, 0.010), done(tmp_path, "room0", "more", 1, 31.0, 0.020),
+    ]  # fmt: skip
+    table = ScoresTable.of("mine", states, "a machine", "default", by_rules=True)
+    rows = list(csv.DictReader(io.StringIO(table.to_csv())))
+    assert rows[0]["Δ PSNR dB"] == "" and float(rows[1]["Δ PSNR dB"]) == -0.75
+    assert float(rows[1]["Δ PSNR dB std"]) ** 2 == pytest.approx(0.125)
+    assert float(rows[1]["PSNR dB, GS-ICP (published)"]) == 35.37 and None not in rows[1]
+
+
 def test_nothing_done(tmp_path: Path) -> None:
     table = ScoresTable.of("mine", [JobState(BatchJob("a", "b", 0, ()), tmp_path, State.FAILED, "why")], "m")
     assert table.rows == [] and "why" in table.to_markdown() and "tabular" in table.to_latex() and table.to_html()

@@ -289,6 +289,21 @@ def test_a_page_that_reads_nothing_costs_nothing(served: tuple[PageServer, Viewe
         assert Page(server).scene()["title"] == "room"
 
 
+def test_one_of_two_saves_to_one_name_is_told_so(served: tuple[PageServer, ViewedRun]) -> None:
+    server, model = served
+    page = Page(server)
+    page.post("edit", {"kind": "rename", "object": model.objects()[0].id, "name": "thing"})
+    for target in (".hidden", "-rf", ".."):
+        assert "a name is needed" in page.post("save", {"target": target})["error"]
+    answers: list[Any] = []
+    save = [threading.Thread(target=lambda: answers.append(page.post("save", {"target": "twice"}))) for _ in range(3)]
+    for thread in save:
+        thread.start()
+    for thread in save:
+        thread.join()
+    assert sorted("text" in answer for answer in answers) == [False, False, True]
+
+
 def test_pages_edit_in_turn(served: tuple[PageServer, ViewedRun]) -> None:
     server, model = served
     ids, said = [o.id for o in model.objects()[:6]], list[Any]()

@@ -185,13 +185,21 @@ class ScoresTable:
 
     def to_csv(self) -> str:
         """Numbers with all their digits, means and spreads in columns of their own."""
-        spreads = [f"{column.title} std" for column in COLUMNS]
-        names, end = len(_NAMES), len(_NAMES) + len(COLUMNS)
+        titles = [column.title for column in COLUMNS]
+        head = [*_NAMES, *titles, *(f"{title} std" for title in titles)]
+        if self.baseline is not None:
+            head += [f"{title}{what}" for what in ("", " std") for title in self._delta_head()]
         rows = []
-        for row, cells in zip(self.rows, self.cells(), strict=True):
-            numbers = [None if math.isnan(value) else value for value in (*row.means, *row.spreads)]
-            rows.append([*cells[:names], *numbers, *cells[end:]])
-        return csv_text([*self.head()[:end], *spreads, *self.head()[end:]], rows)
+        for row in self.rows:
+            numbers = [*row.means, *row.spreads]
+            if self.baseline is not None:
+                pair = row.deltas or ((math.nan,) * len(COLUMNS),) * 2
+                numbers += [values[k] for values in pair for k in COMPARED]
+            for k in range(len(self.published)):
+                numbers += [*([row.by_rules[k]] * self.by_rules), row.papers[k]]
+            names = [row.recording, row.settings, str(row.runs), row.verdict]
+            rows.append([*names, *(None if math.isnan(value) else value for value in numbers)])
+        return csv_text([*head, *self._paper_head()], rows)
 
     def to_markdown(self) -> str:
         """A table and its notes."""

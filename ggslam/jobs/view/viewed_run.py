@@ -80,7 +80,7 @@ class ViewedRun:
         changes: Path | None = None,
     ) -> None:  # fmt: skip
         self.folder, self._max_splats, self._sequence_path = folder, max_splats, sequence
-        self._lock = threading.RLock()
+        self._lock, self._saving = threading.RLock(), threading.Lock()
         self._sides: KnownSides | None = None
         self._edits: list[Edit] = []
         self._texts: list[str] = []
@@ -372,16 +372,14 @@ class ViewedRun:
         with self._lock:
             if not self._edits:
                 raise ConfigError("nothing was edited, so there is nothing to save")
-            if (
-                not is_plain_name(target.strip())
-                or not target.isprintable()
-                or len(target) > EditingTuning.max_name_length
-            ):
+            name = target.strip()
+            long = len(name) > EditingTuning.max_name_length
+            if long or not is_plain_name(name) or not name.isprintable() or name[0] in ".-":  # hidden, or an option
                 raise ConfigError(f"a name is needed to save as, of a new folder in {self.save_folder()}")
             sequence = self._sequence_path if inpaint else None
             edits = list(self._edits)
-        out = self.save_folder() / target.strip()
-        outcome = edit_run(self.folder, edits, out, inpainting=inpaint, sequence=sequence)
+        with self._saving:  # the second of two to one place is told so
+            outcome = edit_run(self.folder, edits, self.save_folder() / name, inpainting=inpaint, sequence=sequence)
         dropped = 0 if outcome.filling is None else outcome.filling.dropped
         left = [f"without {quantity(dropped, 'Gaussian')} that removed or moved objects left over"] if dropped else []
         return "\n".join([f"saved to {outcome.folder.path}", *left, *outcome.notes])
