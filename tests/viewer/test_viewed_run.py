@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.formats.gaussian_ply import read_gaussian_ply
@@ -41,6 +42,12 @@ def some_object(viewed: ViewedRun) -> int:
     return sorted(viewed.objects(), key=lambda record: record.gaussians)[len(viewed.objects()) // 2].id
 
 
+def means_of(viewed: ViewedRun, object_id: int) -> np.ndarray:
+    """Centres of an object's Gaussians, float64 [N, 3]."""
+    g = viewed.gaussians()
+    return g.means.numpy()[g.object_id.numpy() == object_id].astype(float)
+
+
 def test_edits_are_saved_as_the_command_would(viewed: ViewedRun, tmp_path: Path) -> None:
     before = (viewed.folder.path / "map.ply").read_bytes()
     ids = [record.id for record in viewed.objects()]
@@ -49,11 +56,12 @@ def test_edits_are_saved_as_the_command_would(viewed: ViewedRun, tmp_path: Path)
     T[:3, :3] = quaternion_to_matrix(np.array([0.9, 0.1, -0.3, 0.2]))
     T[:3, 3] = record.centroid - T[:3, :3] @ record.centroid + [0.1, -0.05, 0.2]
     viewed.edit(Edit("remove", str(ids[0])))
+    home = means_of(viewed, ids[1])
     PageActions(viewed).edit(moved_objects([ids[1]], T))
     viewed.edit(Edit("rename", str(ids[2]), "thing"))
     assert len(viewed.edits()) == 3 and ids[0] not in [r.id for r in viewed.objects()]
-    moved = next(r for r in viewed.objects() if r.id == ids[1])
-    assert np.allclose(moved.centroid, record.centroid + [0.1, -0.05, 0.2], atol=0.02)
+    moved = cKDTree(home @ T[:3, :3].T + T[:3, 3]).query(means_of(viewed, ids[1]))[0]
+    assert np.mean(moved < 1e-4) > 0.98  # as the page showed it; some had another label before
     viewed.save("saved-from-a-page", inpaint=False)
     edits = [*viewed._edits]
     assert edits[0] == Edit("remove", str(ids[0])) and edits[1].rotation
