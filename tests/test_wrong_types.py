@@ -15,8 +15,8 @@ PATHS: dict[str, tuple[Any, ...]] = {
     "open_sequence": (), "run_recording": (), "fuse_volumes": (), "localize_recording": ("x",), "compare_maps": ("x",),
     "merge_runs": (), "find_changes": ("x",), "update_run": ("x", "out"), "refine_run": (), "export_run": ("x.ply",),
     "edit_run": ([ggslam.Edit("remove", "x")],), "render_run": ("out",), "render_film": ("x.mp4",),
-    "render_plan": ("x.png",), "evaluate_run": (), "read_gaussian_ply": (), "read_splats": (), "read_point_cloud": (), "read_trajectory": (),
-    "surface_points": (),
+    "render_plan": ("x.png",), "evaluate_run": (), "read_gaussian_ply": (), "read_splats": (), "read_point_cloud": (),
+    "read_trajectory": (), "surface_points": (),
 }  # fmt: skip
 """Functions that begin with a path or a run, and what follows."""
 MAPS: dict[str, tuple[Any, ...]] = {"sample_points": (), "objects_at": (np.zeros(3),), "render": (None,)}
