@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import ggslam, refuse, succeed
 
 from ggslam.formats.point_cloud import write_point_cloud
-from tests.command_line import ggslam, refuse, succeed
 
 SAMPLE = Path(__file__).parents[2] / "assets" / "sample"
 

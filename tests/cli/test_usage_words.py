@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 import pytest
-
-from tests.command_line import ggslam
+from command_line import ggslam
 
 CASES = {
     "runn x": "there is no command 'runn'; did you mean run?; see `ggslam --help`",

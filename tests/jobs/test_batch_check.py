@@ -6,9 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from tests.command_line import ggslam, refuse, succeed
-from tests.jobs.small_batch import write_small_batch
+from command_line import ggslam, refuse, succeed
+from small_batch import write_small_batch
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_notes_are_kept_beside_the_run(served: tuple[Hand, ViewedRun]) -> None:
     hand.browser.switch_to.active_element.send_keys(text, Keys.ENTER)
     kept = b.wait_for(lambda: path.exists() and json.loads(path.read_text())["annotations"])
     assert kept[0]["text"] == text and np.allclose(kept[0]["point"], hit["point"], atol=1e-3)
-    assert hand.wait("document.querySelector('#labels .pin')?.textContent") == text
+    hand.wait(f"document.querySelector('#labels .pin')?.textContent === {json.dumps(text)}")
     assert not hand.ask("window.taken || document.querySelectorAll('#labels img, #notes img').length")
     hand.browser.refresh()
     hand.wait("window.ggslam && ggslam.loaded && document.querySelectorAll('#notes li').length === 1")

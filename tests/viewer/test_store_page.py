@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import ggslam, refuse, succeed
 
 from ggslam.errors import ConfigError, FormatError
 from ggslam.jobs.view.serve import serve_store
 from ggslam.jobs.view.store_page import StorePage
 from ggslam.runs.folder import RunFolder
-from tests.command_line import ggslam, refuse, succeed
 
 
 @pytest.fixture(scope="module")

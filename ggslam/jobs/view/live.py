@@ -111,7 +111,7 @@ class LiveView:
 
     def scene(self) -> dict[str, Any]:
         """See `PageSource`."""
-        return {**self._scene, "served": True, "live": True, "editable": False}
+        return {**self._scene, "version": self.updates, "served": True, "live": True, "editable": False}
 
     def splats(self, chunk: str, level: int) -> bytes:
         """See `PageSource`."""
@@ -159,10 +159,10 @@ class LiveView:
         scene = _scene_of(snapshot, camera, self._title, g.means.numpy()[rows])
         scene["chunks"] = [{"id": "map", "count": len(rows), "levels": [len(rows)], "low": low, "high": high}]
         picture = jpeg(self._compare(snapshot, camera))
-        first = not self.updates
-        self.updates += 1
-        self._packed = packed_chunk({**header, "version": self.updates}, packed)
+        first, number = not self.updates, self.updates + 1
+        self._packed = packed_chunk({**header, "version": number}, packed)
         self._scene, self._picture = scene, picture
+        self.updates = number  # last: a page that asks meanwhile asks again when it is told
         T = None if snapshot.T_world_camera is None else snapshot.T_world_camera.ravel().tolist()
         what = ("scene", "splats", "camera") if first else ("path", "splats", "camera")
         self._server.tell(*what, version=self.updates, text=snapshot.text, T_world_camera=T)

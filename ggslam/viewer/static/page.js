@@ -117,6 +117,7 @@ class Viewer {
 
   async load() {
     const chunks = this.scene.chunks || [];
+    this.loadedVersion = this.scene.version;
     if (chunks.length > 1) this.startLoader(chunks);
     else for (const { id } of chunks) this.map.setChunk(id, await this.source.splats(id));
     this.sceneChanged();
@@ -155,14 +156,16 @@ class Viewer {
     this.camera.up = unit(scene.up);
     this.camera.fov = scene.fov;
     this.source.version = scene.version || this.source.version + 1;
-    if (splats && !this.loader) for (const { id } of scene.chunks) this.map.setChunk(id, await this.source.splats(id));
+    const fresh = splats && scene.version !== this.loadedVersion; // of an edit here the answer and the news both tell
+    this.loadedVersion = scene.version;
+    if (fresh && !this.loader) for (const { id } of scene.chunks) this.map.setChunk(id, await this.source.splats(id));
     if (this.edits.take) this.edits.take(scene);
     if (scene.keeps && !this.keeping) {
       this.notes.take(scene.annotations);
       this.film.kept(scene.camera_keys);
     }
     this.sceneChanged();
-    if (splats) {
+    if (fresh) {
       this.color(this.coloring, false);
       this.applySelection();
       this.emit("splats");
