@@ -26,7 +26,9 @@ IGNORED = (
 
 
 @pytest.mark.parametrize(("words", "told"), IGNORED)
-def test_options_that_would_be_ignored(room_run: RunFolder, words: tuple[str, ...], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_that_would_be_ignored(
+    room_run: RunFolder, words: tuple[str, ...], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     refuse(ggslam("render", room_run.path, *words), told)
 
