@@ -72,63 +72,9 @@ def top_view(centers: np.ndarray, positions: np.ndarray, forward: np.ndarray, up
     return Viewpoint(position, middle, level / np.linalg.norm(level), near=max(0.01, height))
 
 
-def upright_axes(up: np.ndarray) -> np.ndarray:
-    """A rotation [3, 3] whose third column is `up` [3], a unit vector; the first is as near to the x axis as can be."""
-    near = np.eye(3)[int(abs(up[0]) > 0.9)]
-    level = near - (near @ up) * up
-    level /= np.linalg.norm(level)
-    return np.column_stack([level, np.cross(up, level), up])
-
-
 def vertical_fov(camera: Camera) -> float:
     """Vertical field of view in radians."""
     return 2 * math.atan(camera.height / 2 / camera.fy)
-
-
-def fitting_fov(camera: Camera, aspect: float) -> float:
-    """Vertical field of view in radians of a canvas, width by height `aspect`, that shows all that a camera sees."""
-    across = 2 * math.atan(camera.width / 2 / camera.fx / max(aspect, 1e-3))
-    return max(vertical_fov(camera), across)
-
-
-def shorter_fov(fov: float, aspect: float) -> float:
-    """Field of view in radians along the shorter side of a canvas, width by height `aspect`, with vertical `fov`."""
-    return 2 * math.atan(math.tan(fov / 2) * min(1.0, aspect))
-
-
-def canvas_camera(width: int, height: int, fov: float, longest: int | None = None) -> Camera:
-    """The pinhole camera of a canvas with vertical field of view `fov` in radians; its size is changed so that the
-    longer side has `longest` pixels, if that is given."""
-    factor = 1.0 if longest is None else longest / max(width, height)
-    width, height = max(1, round(width * factor)), max(1, round(height * factor))
-    focal = height / 2 / math.tan(fov / 2)
-    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-
-
-def pose_along(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """T_world_camera [4, 4] of a camera at `origin` [3] that looks along `direction` [3], rolled in any way."""
-    forward = direction / np.linalg.norm(direction)
-    right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
-    T[:3, 3] = origin
-    return T
-
-
-def frustum_lines(T_world_camera: np.ndarray, camera: Camera, depth: float) -> np.ndarray:
-    """Edges of the pyramids that cameras see, float32 [8 K, 2, 3].
-
-    Args:
-        T_world_camera: [K, 4, 4].
-        camera: of all of them.
-        depth: of the pyramids, metres.
-    """
-    w, h = camera.width / 2 / camera.fx * depth, camera.height / 2 / camera.fy * depth
-    corners = np.array([[0, 0, 0], [-w, -h, depth], [w, -h, depth], [w, h, depth], [-w, h, depth]])
-    edges = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
-    world = corners @ np.swapaxes(T_world_camera[:, :3, :3], 1, 2) + T_world_camera[:, None, :3, 3]
-    return world[:, edges].reshape(-1, 2, 3).astype(np.float32)
 
 
 def box_lines(center: np.ndarray, axes: np.ndarray, size: np.ndarray) -> np.ndarray:

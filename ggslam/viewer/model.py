@@ -36,11 +36,6 @@ class ListedObject:
     size: np.ndarray
     centroid: np.ndarray
 
-    @property
-    def label(self) -> str:
-        """For people: number and name."""
-        return f"{self.id} · {self.name}" if self.name else f"{self.id} · object"
-
 
 @dataclass(frozen=True)
 class ShownMover:

@@ -7,7 +7,6 @@ import torch
 
 from ggslam.rendering.types import GaussianTensors
 from ggslam.scene.camera import Camera
-from ggslam.viewer.cameras import pose_along
 from ggslam.viewer.viewed_sides import (
     KnownSides,
     ViewedSidesTuning,
@@ -17,6 +16,17 @@ from ggslam.viewer.viewed_sides import (
 )
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 79.5, 59.5)
+
+
+def pose_along(origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """T_world_camera [4, 4] of a camera at `origin` [3] that looks along `direction` [3], rolled in any way."""
+    forward = direction / np.linalg.norm(direction)
+    right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = origin
+    return T
 
 
 def test_directions_survive_two_bytes() -> None:
