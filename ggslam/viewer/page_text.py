@@ -16,8 +16,8 @@ STATIC = Path(__file__).with_name("static")
 SCRIPTS: Final = (
     *MAP_SCRIPTS, "vectors.js", "camera.js", "shapes.js", "selection.js", "history.js", "source.js", "link.js",
     "tools.js", "measure.js", "search.js", "film.js", "notes.js", "move_handles.js", "object_list.js", "panels.js",
-    "keyboard.js", "viewer_colors.js", "viewer_selection.js", "viewer_edits.js", "viewer_sharing.js",
-    "viewer_looks.js", "viewer_live.js", "page.js",
+    "selection_panels.js", "record_panels.js", "keyboard.js", "viewer_colors.js", "viewer_selection.js",
+    "viewer_edits.js", "viewer_sharing.js", "viewer_looks.js", "viewer_live.js", "page.js",
 )  # fmt: skip
 """In the order in which the page needs them."""
 FILE_POLICY: Final = (
