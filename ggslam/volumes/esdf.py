@@ -3,9 +3,10 @@
 
 The TSDF of `ggslam.volumes.tsdf` measures along the camera's axis and only near surfaces; what it has exactly is where
 surfaces are. The field takes its zero crossings as surface points with normals, and what is too thin for its voxels
-from the points that were measured in them, finds the nearest for every voxel that was seen, and measures the distance
-from there. An update looks only at what changed in the TSDF, and its
-result is the same as that of computing everything anew, also after an obstacle has gone.
+from the points that were measured in them. Around each it takes a disc for the surface, which ends where it would
+stand out over an edge; the field is the distance to the nearest of all discs, in every voxel that was seen. An update
+computes the voxels whose nearest disc changed, and its result is the same as that of computing everything anew from the
+surface points held, also after an obstacle has gone.
 
 Unknown voxels, those that no frame has seen, have no distance. The field does not tell how far they are either: a
 distance in known space is that to the nearest *seen* surface, and a planner that may not enter unknown space must check
@@ -36,6 +37,9 @@ class FieldSettings:
 
     max_distance: float = setting(2.0, 1e-3, 100, "m")
     """Largest distance computed; farther voxels have this distance and no gradient."""
+    budget_ms: float = setting(0.0, 0, 1e6, "ms")
+    """Time a frame for the TSDF and the field together; what is far from the camera waits for the next frame. 0: as
+    long as it takes."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,10 @@ class UpdateStats:
         revision: of the TSDF that the field now stands for.
         changed_blocks: blocks of the TSDF that changed since the last update, those that went counted.
         changed_sites: surface points that came, went or moved.
-        recomputed_blocks: blocks of the field that were computed.
+        recomputed_blocks: blocks of the field in which something was computed.
         blocks: blocks of the field.
-        transformed_voxels: voxels that went through the distance transform, with those beside and computed again.
+        computed_voxels: voxels that were.
+        stale_blocks: blocks that there was no time for.
         sites_ms, select_ms, transform_ms: time spent finding surface points, finding out what to compute, computing.
     """
 
@@ -57,7 +62,8 @@ class UpdateStats:
     changed_sites: int
     recomputed_blocks: int
     blocks: int
-    transformed_voxels: int
+    computed_voxels: int
+    stale_blocks: int
     sites_ms: float
     select_ms: float
     transform_ms: float
@@ -77,11 +83,28 @@ class FieldValues:
         gradient: float32 [N, 3], unit vectors in which the distance grows; zero where not known, and where the nearest
             surface is beyond the largest distance.
         known: bool [N], whether the voxel that the point is in was seen.
+        stale: bool [N], whether it is known as it was before the last update, which had no time for it.
     """
 
     distance: np.ndarray
     gradient: np.ndarray
     known: np.ndarray
+    stale: np.ndarray
+
+
+@dataclass(frozen=True)
+class SurfaceDiscs:
+    """What distances are measured from: discs that together are the surface.
+
+    Attributes:
+        points: their middles [S, 3], metres; float32, or float64 if the origin is not the world's.
+        normals: float32 [S, 3], unit vectors to the side in front; zero where something is thinner than a voxel.
+        radii: float32 [S], metres.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    radii: np.ndarray
 
 
 class DistanceField:
@@ -130,12 +153,43 @@ class DistanceField:
         """Memory held by the field between updates."""
         return int(self._library.ggslam_esdf_bytes(self._handle))
 
-    def update(self) -> UpdateStats:
-        """Brings the field up to date with the map."""
+    def update(self, budget_ms: float | None = None, near: np.ndarray | None = None) -> UpdateStats:
+        """Brings the field up to date with the map.
+
+        A surface point stays where it is until its disc has moved by 1/16 voxel: the rounding of the map's values would
+        move half of them with every frame. So distances are within 1/16 voxel of those of the map's own surface
+        points, and exactly those of the points that are held (`recompute`).
+
+        Args:
+            budget_ms: milliseconds after which what is not done is left for the next update; finding the surface points
+                is always done. None: as long as it takes.
+            near: [3], metres: what lies near it is done first, and what has waited.
+        """
+        if budget_ms is not None and not budget_ms > 0:
+            raise InputError(f"budget_ms: expected a positive number, found {budget_ms}")
+        place = None if near is None else np.ascontiguousarray(near, np.float64)
+        if place is not None and (place.shape != (3,) or not np.isfinite(place).all()):
+            raise InputError(f"near: expected 3 finite numbers, found {near}")
+        place = None if place is None else place - self.origin
         stats = FieldStats()
-        self._library.ggslam_esdf_update(self._handle, self.tsdf.context.handle, ctypes.byref(stats))
-        counts = (stats.changed_blocks, stats.changed_sites, stats.recomputed_blocks, stats.blocks, stats.transformed)
-        return UpdateStats(self.tsdf.revision, *counts, stats.sites_ms, stats.select_ms, stats.transform_ms)
+        self._library.ggslam_esdf_update(
+            self._handle, self.tsdf.context.handle, budget_ms or 0.0, None if place is None else place.ctypes.data,
+            ctypes.byref(stats),
+        )  # fmt: skip
+        return self._outcome(stats)
+
+    def recompute(self) -> UpdateStats:
+        """Computes all distances anew from the surface points that the field holds. Updates give the same, bit for bit,
+        so this is for checks; `clear` and `update` take the map's surface points as they are."""
+        stats = FieldStats()
+        self._library.ggslam_esdf_recompute(self._handle, self.tsdf.context.handle, ctypes.byref(stats))
+        return self._outcome(stats)
+
+    def _outcome(self, stats: FieldStats) -> UpdateStats:
+        return UpdateStats(
+            self.tsdf.revision, stats.changed_blocks, stats.changed_sites, stats.recomputed_blocks, stats.blocks,
+            stats.computed_voxels, stats.stale_blocks, stats.sites_ms, stats.select_ms, stats.transform_ms,
+        )  # fmt: skip
 
     def clear(self) -> None:
         """Forgets everything; the next update computes the whole field."""
@@ -153,9 +207,10 @@ class DistanceField:
         where = where - self.origin if self.origin.any() else where
         n = len(where)
         distance, gradient, known = np.empty(n, np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
-        arrays = (a.ctypes.data for a in (where, distance, gradient, known))
+        stale = np.empty(n, np.uint8)
+        arrays = (a.ctypes.data for a in (where, distance, gradient, known, stale))
         self._library.ggslam_esdf_query(self._handle, self.tsdf.context.handle, n, *arrays)
-        return FieldValues(distance, gradient, known.astype(bool))
+        return FieldValues(distance, gradient, known.astype(bool), stale.astype(bool))
 
     def is_free(self, points: np.ndarray, radius: float) -> np.ndarray:
         """Whether a ball of `radius` metres around each of the points [N, 3] touches no seen surface, and its centre is
@@ -183,10 +238,14 @@ class DistanceField:
         return distance
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """The surface points that distances are measured from: positions float32 [S, 3] in metres (float64 if the
-        origin is not the world's), and unit normals [S, 3] to the side in front; zero where something is thinner than
-        a voxel."""
-        n = int(self._library.ggslam_esdf_sites(self._handle, None, None))
-        points, normals = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
-        self._library.ggslam_esdf_sites(self._handle, points.ctypes.data, normals.ctypes.data)
-        return (points + self.origin if self.origin.any() else points), normals
+        """The points and normals of `discs`."""
+        discs = self.discs()
+        return discs.points, discs.normals
+
+    def discs(self) -> SurfaceDiscs:
+        """The surface that distances are measured from."""
+        n = int(self._library.ggslam_esdf_sites(self._handle, None, None, None))
+        points, normals, radii = (np.empty(shape, np.float32) for shape in ((n, 3), (n, 3), n))
+        arrays = (a.ctypes.data for a in (points, normals, radii))
+        self._library.ggslam_esdf_sites(self._handle, *arrays)
+        return SurfaceDiscs(points + self.origin if self.origin.any() else points, normals, radii)

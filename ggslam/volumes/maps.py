@@ -155,7 +155,7 @@ class VolumeMaps:
         every = self.settings.esdf_every
         if self.field is not None and every and self._on_device is None and number % every == every - 1:
             start = time.perf_counter()
-            self.field.update()
+            self.field.update(self._time_left(row["tsdf"]), T_world_camera[:3, 3])
             row["esdf"] = time.perf_counter() - start
         if self.occupancy is not None:
             start = time.perf_counter()
@@ -163,6 +163,11 @@ class VolumeMaps:
             row["occupancy"] = time.perf_counter() - start
         self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
+
+    def _time_left(self, spent: float) -> float | None:
+        """Milliseconds of a frame's budget that the TSDF has left to the field; at least a little."""
+        budget = self.settings.esdf.budget_ms
+        return max(budget - 1e3 * spent, 1e-3) if budget else None
 
     def _fuse(
         self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray | None,

@@ -48,7 +48,8 @@ struct FieldStats {
   int64_t changed_sites;      // surface points that came, went or moved
   int64_t recomputed_blocks;  // of the field
   int64_t blocks;             // the field has now
-  int64_t transformed;        // voxels through the transform, with those computed again
+  int64_t computed_voxels;    // of the field
+  int64_t stale_blocks;       // for which there was no time
   double sites_ms, select_ms, transform_ms;
 };
 
@@ -177,7 +178,14 @@ GGSLAM_EXPORT int ggslam_esdf_destroy(void* handle);
 GGSLAM_EXPORT int ggslam_esdf_clear(void* handle);
 GGSLAM_EXPORT int64_t ggslam_esdf_size(void* handle);
 GGSLAM_EXPORT int64_t ggslam_esdf_bytes(void* handle);
-GGSLAM_EXPORT int ggslam_esdf_update(void* handle, void* context, ggslam::volumes::FieldStats* stats);
+
+// Brings the field up to date. budget_ms: of the whole update, not positive: as long as it takes; place [3] in metres: what
+// is near it comes first, null: in any order.
+GGSLAM_EXPORT int ggslam_esdf_update(void* handle, void* context, double budget_ms, const double* place,
+                                     ggslam::volumes::FieldStats* stats);
+
+// Computes all blocks anew from the surface points that the field holds.
+GGSLAM_EXPORT int ggslam_esdf_recompute(void* handle, void* context, ggslam::volumes::FieldStats* stats);
 
 // Coordinates [n, 3] of all blocks.
 GGSLAM_EXPORT int ggslam_esdf_list(void* handle, int32_t* at);
@@ -185,12 +193,14 @@ GGSLAM_EXPORT int ggslam_esdf_list(void* handle, int32_t* at);
 // Distances [n, 512] of the blocks at coordinates [n, 3]; NaN: unknown.
 GGSLAM_EXPORT int ggslam_esdf_read(void* handle, int64_t n, const int32_t* at, float* distance);
 
-// Number of surface points of all blocks; their positions [n, 3] (metres) and normals [n, 3], unless null.
-GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* normals);
+// Number of surface points of all blocks; their positions [n, 3] and the radii of the discs around them [n] (metres) and
+// normals [n, 3], unless null.
+GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* normals, float* radii);
 
-// At points [n, 3] in metres: distances [n] (metres), gradients [n, 3] and whether they are known [n].
+// At points [n, 3] in metres: distances [n] (metres), gradients [n, 3], whether they are known [n], and whether what is
+// known is of an earlier update, which the last one had no time for [n].
 GGSLAM_EXPORT int ggslam_esdf_query(void* handle, void* context, int64_t n, const double* points, float* distance,
-                                    float* gradient, uint8_t* known);
+                                    float* gradient, uint8_t* known, uint8_t* stale);
 GGSLAM_EXPORT void* ggslam_occupancy_create(double resolution);
 GGSLAM_EXPORT int ggslam_occupancy_destroy(void* map);
 

@@ -8,7 +8,7 @@
 #include "volumes/esdf.hpp"
 
 GGSLAM_DECLARE_KERNEL(void esdf_query(const ggslam::volumes::QueryInput& in, std::size_t begin, std::size_t end,
-                                      float* distance, float* gradient, uint8_t* known))
+                                      float* distance, float* gradient, uint8_t* known, uint8_t* stale))
 
 using namespace ggslam;
 using namespace ggslam::volumes;
@@ -45,8 +45,18 @@ GGSLAM_EXPORT int64_t ggslam_esdf_bytes(void* handle) try {
   return static_cast<int64_t>(field(handle).bytes());
 } GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int ggslam_esdf_update(void* handle, void* context, FieldStats* stats) try {
-  object_of<FieldStats>(stats) = field(handle).update(object_of<ggslam::Context>(context));
+GGSLAM_EXPORT int ggslam_esdf_update(void* handle, void* context, double budget_ms, const double* place,
+                                     FieldStats* stats) try {
+  Esdf& f = field(handle);
+  double voxels[3];
+  if (place != nullptr) (ggslam::Vec3d::from(place) / static_cast<double>(f.voxel())).to(voxels);
+  object_of<FieldStats>(stats) =
+      f.update(object_of<ggslam::Context>(context), {budget_ms, place == nullptr ? nullptr : voxels});
+  return 0;
+} GGSLAM_CATCH_ALL
+
+GGSLAM_EXPORT int ggslam_esdf_recompute(void* handle, void* context, FieldStats* stats) try {
+  object_of<FieldStats>(stats) = field(handle).recompute(object_of<ggslam::Context>(context));
   return 0;
 } GGSLAM_CATCH_ALL
 
@@ -72,17 +82,17 @@ GGSLAM_EXPORT int ggslam_esdf_read(void* handle, int64_t n, const int32_t* at, f
   return 0;
 } GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* normals) try {
+GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* normals, float* radii) try {
   const Esdf& f = field(handle);
-  check_array("normals", points == nullptr ? &f : static_cast<const void*>(normals), 1);
+  if (points != nullptr) check_array("normals", normals, 1), check_array("radii", radii, 1);
   int64_t n = 0;
   for (std::size_t row = 0; row < f.size(); ++row) {
-    const BlockCoordinates b = f.table().at(row);
+    const ggslam::Vec3f first = ggslam::cast<float>(kSide * vector_of(f.table().at(row))) + ggslam::Vec3f::all(0.5f);
     for (const Site& site : f.block(row).sites) {
       if (points != nullptr) {
-        const ggslam::Vec3f voxel = ggslam::cast<float>(kSide * vector_of(b) + voxel_of(site.voxel));
-        (f.voxel() * (voxel + ggslam::Vec3f::all(0.5f) + ggslam::Vec3f::from(site.point))).to(points + 3 * n);
+        (f.voxel() * (first + ggslam::Vec3f::from(site.at))).to(points + 3 * n);
         std::copy_n(site.normal, 3, normals + 3 * n);
+        radii[n] = f.voxel() * site.radius;
       }
       ++n;
     }
@@ -91,17 +101,19 @@ GGSLAM_EXPORT int64_t ggslam_esdf_sites(void* handle, float* points, float* norm
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_esdf_query(void* handle, void* context_, int64_t n, const double* points, float* distance,
-                                    float* gradient, uint8_t* known) try {
+                                    float* gradient, uint8_t* known, uint8_t* stale) try {
   ggslam::Context& context = object_of<ggslam::Context>(context_);
   const Esdf& f = field(handle);
-  const void* const arrays[] = {points, distance, gradient, known};
+  const void* const arrays[] = {points, distance, gradient, known, stale};
   for (const void* array : arrays) check_array("points", array, n);
   std::vector<const FieldVoxels*> voxels(f.size());
-  for (std::size_t row = 0; row < f.size(); ++row) voxels[row] = f.block(row).voxels.get();
-  const QueryInput in{f.table().view(), voxels.data(), f.voxel(), points};
+  std::vector<uint8_t> blocks_stale(f.size());
+  for (std::size_t row = 0; row < f.size(); ++row)
+    voxels[row] = f.block(row).voxels.get(), blocks_stale[row] = f.block(row).stale;
+  const QueryInput in{f.table().view(), voxels.data(), blocks_stale.data(), f.voxel(), points};
   const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_query);
   context.pool.parallel_for(static_cast<std::size_t>(n), 4096, [&](std::size_t begin, std::size_t end, int) {
-    kernel(in, begin, end, distance, gradient, known);
+    kernel(in, begin, end, distance, gradient, known, stale);
   });
   return 0;
 } GGSLAM_CATCH_ALL

@@ -1,15 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 // Which surface points came, went or moved since the last update of the distance field.
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 
 #include "volumes/esdf.hpp"
 
 GGSLAM_DECLARE_KERNEL(int esdf_crossings(const int16_t* values, ggslam::volumes::Site* out, uint64_t* known,
-                                         uint64_t* negative))
+                                         uint64_t* negative, float unit))
 
 namespace ggslam::volumes {
 namespace {
+
+// A site keeps its place until its disc has moved by this, voxels.
+constexpr float kHeld = 1.0f / 16;
 
 constexpr BlockCoordinates kFaces[6] = {{-1, 0, 0}, {1, 0, 0}, {0, -1, 0}, {0, 1, 0}, {0, 0, -1}, {0, 0, 1}};
 
@@ -32,22 +36,39 @@ void copy_values(const Tsdf& map, int64_t row, const Box3i& box, BlockCoordinate
       }
 }
 
-bool same_site(const Site& a, const Site& b) {
-  return a.voxel == b.voxel && Vec3f::from(a.point) == Vec3f::from(b.point) &&
-         Vec3f::from(a.normal) == Vec3f::from(b.normal);
+// How far two discs are from each other at most, voxels.
+float distance_between(const Site& a, const Site& b) {
+  const Vec3f moved = Vec3f::from(a.at) - Vec3f::from(b.at), turned = Vec3f::from(a.normal) - Vec3f::from(b.normal);
+  return std::sqrt(dot(moved, moved)) + std::max(a.radius, b.radius) * std::sqrt(dot(turned, turned)) +
+         std::fabs(a.radius - b.radius);
 }
 
-// How many came, went or moved. Both are in order of their voxels.
-int64_t count_changes(const std::vector<Site>& before, const std::vector<Site>& now) {
+// Takes over the sites of a block. One that hardly moved stays where it was: the rounding of values would move half of
+// them with every view, and voxels without number with them. Returns how many came, went or moved.
+int64_t take_sites(FieldBlock& block, std::vector<Site>& now, std::vector<Site>& came) {
   int64_t changed = 0;
   std::size_t b = 0;
-  for (const Site& site : now) {
-    for (; b < before.size() && before[b].voxel < site.voxel; ++b) ++changed;
-    const bool both = b < before.size() && before[b].voxel == site.voxel;
-    if (!both || !same_site(before[b], site)) ++changed;
-    b += both;
+  const auto lose = [&](const Site& site) {
+    block.gone[site.voxel >> 6] |= uint64_t{1} << (site.voxel & 63);
+    ++changed;
+  };
+  for (Site& site : now) {
+    for (; b < block.sites.size() && block.sites[b].voxel < site.voxel; ++b) lose(block.sites[b]);
+    if (b < block.sites.size() && block.sites[b].voxel == site.voxel) {
+      const Site& held = block.sites[b++];
+      if (distance_between(held, site) <= kHeld) {
+        site = held;
+        continue;
+      }
+      lose(held);
+    } else {
+      ++changed;
+    }
+    came.push_back(site);
   }
-  return changed + static_cast<int64_t>(before.size() - b);
+  for (; b < block.sites.size(); ++b) lose(block.sites[b]);
+  if (changed > 0) block.sites = now;
+  return changed;
 }
 
 // Of a block that has not changed.
@@ -73,15 +94,34 @@ void Esdf::gather(BlockCoordinates at, int16_t* values) const {
   }
 }
 
+FieldBlock& Esdf::insert(BlockCoordinates at) {
+  if (free_slots_.empty()) {
+    free_slots_.push_back(static_cast<uint32_t>(slots_.size()));
+    slots_.push_back(nullptr);
+  }
+  table_.insert(at);
+  blocks_.push_back(std::make_unique<FieldBlock>());
+  FieldBlock& block = *blocks_.back();
+  block.at = at;
+  block.slot = free_slots_.back();
+  free_slots_.pop_back();
+  slots_[block.slot] = &block;
+  return block;
+}
+
+// Slots stay taken until the end of the update: voxels elsewhere have owners there.
 void Esdf::erase_gone(FieldStats& stats, std::vector<BlockCoordinates>& touched) {
   for (std::size_t row = blocks_.size(); row-- > 0;) {
     const BlockCoordinates at = table_.at(row);
     if (tsdf_.find(at) >= 0) continue;
     touched.push_back(at);
     ++stats.changed_blocks;
-    stats.changed_sites += static_cast<int64_t>(blocks_[row].sites.size());
-    if (!blocks_[row].sites.empty()) site_changes_.push_back(at);
+    FieldBlock& block = *blocks_[row];
+    std::vector<Site> none, came;
+    stats.changed_sites += take_sites(block, none, came);
+    block.touched = true;
     table_.erase(row);
+    erased_.push_back(std::move(blocks_[row]));
     blocks_[row] = std::move(blocks_.back());
     blocks_.pop_back();
   }
@@ -93,16 +133,17 @@ std::vector<int32_t> Esdf::find_crossings(Context& context, const std::vector<in
   found.resize(rows.size());
   std::vector<uint8_t> differ(rows.size());
   const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_crossings);
+  const float unit = tsdf_.truncation / tsdf_.voxel / kFreeValue;
   context.pool.parallel_for(rows.size(), 16, [&](std::size_t begin, std::size_t end, int) {
     int16_t values[kHalo * kHalo * kHalo];
     std::vector<Site> sites(kVoxels + 1);
     for (std::size_t i = begin; i < end; ++i) {
       gather(table_.at(rows[i]), values);
-      const int n = kernel(values, sites.data(), found[i].known, found[i].negative);
+      const int n = kernel(values, sites.data(), found[i].known, found[i].negative, unit);
       found[i].sites.assign(sites.begin(), sites.begin() + n);
       uint64_t crossed[kSide] = {};
       for (const Site& site : found[i].sites) crossed[site.voxel >> 6] |= uint64_t{1} << (site.voxel & 63);
-      FieldBlock& block = blocks_[rows[i]];
+      FieldBlock& block = *blocks_[rows[i]];
       differ[i] = std::memcmp(crossed, block.crossed, sizeof crossed) != 0;
       std::memcpy(block.crossed, crossed, sizeof crossed);
     }
@@ -113,14 +154,13 @@ std::vector<int32_t> Esdf::find_crossings(Context& context, const std::vector<in
   return changed;
 }
 
-std::vector<int32_t> Esdf::find_sites(Context& context, FieldStats& stats) {
-  site_changes_.clear();
+void Esdf::find_sites(Context& context, FieldStats& stats) {
   std::vector<BlockCoordinates> touched;
   for (std::size_t row = 0; row < tsdf_.size(); ++row) {
     const Block& block = tsdf_.block(row);
     const bool is_new = table_.find(block.at) < 0;
     if (!is_new && block.revision <= revision_) continue;
-    if (is_new) table_.insert(block.at), blocks_.emplace_back();
+    if (is_new) insert(block.at);
     touched.push_back(block.at);
   }
   stats.changed_blocks = static_cast<int64_t>(touched.size());
@@ -141,29 +181,25 @@ std::vector<int32_t> Esdf::find_sites(Context& context, FieldStats& stats) {
   const std::size_t own = rows.size();
   for (const int32_t row : find_crossings(context, rows, found))
     for (const BlockCoordinates& face : kFaces) list(table_.at(row) + face);
-  for (std::size_t i = own; i < rows.size(); ++i) found.push_back(crossings_of(blocks_[rows[i]]));
-  std::vector<int64_t> moved(rows.size());
-  std::vector<uint8_t> seen_changed(rows.size());
+  for (std::size_t i = own; i < rows.size(); ++i) found.push_back(crossings_of(*blocks_[rows[i]]));
+  std::vector<int64_t> changes(rows.size());
   context.pool.parallel_for(rows.size(), 16, [&](std::size_t begin, std::size_t end, int) {
+    std::vector<Site> came;
     for (std::size_t i = begin; i < end; ++i) {
-      FieldBlock& block = blocks_[rows[i]];
+      FieldBlock& block = *blocks_[rows[i]];
       BlockSites& now = found[i];
       add_thin(rows[i], now);
-      moved[i] = count_changes(block.sites, now.sites);
-      seen_changed[i] = block.voxels == nullptr || std::memcmp(now.known, block.known, sizeof now.known) != 0 ||
-                        std::memcmp(now.negative, block.negative, sizeof now.negative) != 0;
       std::memcpy(block.known, now.known, sizeof now.known);
       std::memcpy(block.negative, now.negative, sizeof now.negative);
-      if (moved[i] > 0) block.sites = now.sites;
+      came.clear();
+      changes[i] = take_sites(block, now.sites, came);
+      if (changes[i] == 0) continue;
+      block.touched = true;
+      make_leaves(block.sites, kMostInLeaf, slack_, block.tree);
+      make_leaves(came, kMostThatCame, slack_, block.arrived);
     }
   });
-  std::vector<int32_t> changed;
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    if (moved[i] > 0) site_changes_.push_back(table_.at(rows[i]));
-    if (seen_changed[i]) changed.push_back(rows[i]);
-    stats.changed_sites += moved[i];
-  }
-  return changed;
+  for (const int64_t n : changes) stats.changed_sites += n;
 }
 
 }  // namespace ggslam::volumes

@@ -28,9 +28,10 @@ Site site_of(int voxel, uint8_t octants) {
   for (int o = 0; o < 8; ++o) {
     if (!(octants >> o & 1)) continue;
     ++n;
-    for (int a = 0; a < 3; ++a) site.point[a] += o >> a & 1 ? 0.25f : -0.25f;
+    for (int a = 0; a < 3; ++a) site.at[a] += o >> a & 1 ? 0.25f : -0.25f;
   }
-  for (float& p : site.point) p = n > 0 ? p / static_cast<float>(n) : 0.0f;
+  const Vec3f place = cast<float>(voxel_of(voxel));
+  for (int a = 0; a < 3; ++a) site.at[a] = place[a] + (n > 0 ? site.at[a] / static_cast<float>(n) : 0.0f);
   return site;
 }
 
@@ -49,9 +50,9 @@ void Esdf::add_thin(int32_t row, BlockSites& found) const {
   static constexpr uint64_t kNone[kSide] = {};
   const auto crossed = [&](int x, int y, int z) {
     const int32_t other = table_.find({at.x + x, at.y + y, at.z + z});
-    return other < 0 ? kNone : blocks_[other].crossed;
+    return other < 0 ? kNone : blocks_[other]->crossed;
   };
-  const uint64_t *own = blocks_[row].crossed, *left = crossed(-1, 0, 0), *right = crossed(1, 0, 0),
+  const uint64_t *own = blocks_[row]->crossed, *left = crossed(-1, 0, 0), *right = crossed(1, 0, 0),
                  *before = crossed(0, -1, 0), *after = crossed(0, 1, 0);
   const std::size_t crossings = found.sites.size();
   for (int k = 0; k < kSide; ++k) {

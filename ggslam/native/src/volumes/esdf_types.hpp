@@ -11,79 +11,102 @@ namespace ggslam::volumes {
 constexpr int kHalo = kSide + 2;         // side of a block with one voxel around it
 constexpr int16_t kUnseen = -32768;      // among values of the TSDF
 
-// Largest distance of a site's point from its voxel's centre: a mean of crossings, each within half an edge.
-constexpr float kSiteOffset = 0.5f;
-// Around its point, as far as this, the surface of a site is taken to be its tangent disc.
-constexpr float kDiscRadius = 0.9f;
-// The result of a voxel whose nearest site is d away depends on sites up to d + kReading away (voxel centres): the
-// search ends at points within d + kSiteOffset, whose centres are kSiteOffset farther, whose neighbours sqrt(3).
-constexpr float kReading = 2 * kSiteOffset + 1.7321f;
-// The distance of the nearest site's centre is larger than the field's distance by this at most.
-constexpr float kCentreSlack = kSiteOffset + kDiscRadius;
+// The surface of a site is taken to be its tangent disc, which reaches half way to the next sites: a larger one would
+// stand out of what is curved.
+constexpr float kDiscRadius = 0.7f;
+// Gradients are those of discs larger by this, so that they do not turn in the gaps between discs.
+constexpr float kSmoothRim = 0.25f;
+// Half the diagonal of a block: from its middle to the centres of its corner voxels.
+constexpr float kBlockReach = 6.0622f;
+// Voxels of a part of a block along an edge, and half the diagonal of a part.
+constexpr int kPart = 4;
+constexpr float kPartReach = 2.5981f;
 
-// The surface within a voxel: a point of it and its normal there.
+// The surface within a voxel: a disc. The field is the distance to the nearest of all discs.
 struct Site {
-  float point[3];   // from the voxel's centre
-  float normal[3];  // unit vector to the side in front; zero: unknown
+  float at[3];      // its middle, from the centre of the block's first voxel
+  float normal[3];  // unit vector to the side in front; zero: unknown, and a point rather than a disc
+  float radius;
   int32_t voxel;    // its row in the block
 };
 
-// A voxel of a box.
-struct SiteCell {
-  int16_t x, y, z;
+// A disc of some thickness with sites in it: what is farther from it than a distance is farther from all of them.
+struct Node {
+  float middle[3];  // as Site.at
+  float normal[3];
+  float radius, half;  // half the thickness
+  float within[3];  // the middle of one of the sites
 };
 
-// A site in a box. Positions are differences of whole voxels plus `point`, so that results do not depend on the box.
-struct BoxSite {
-  SiteCell cell;
-  int16_t neighbour_count;
-  int32_t neighbours;  // where its list of neighbours begins
-  float point[3], normal[3];
+// Sites of a block: those from the end of the last leaf to the end of this.
+struct Leaf {
+  Node node;
+  int32_t end;
 };
+
+constexpr int kSiteColumns = 7;  // at, normal, radius
+
+// A leaf as a search reads it.
+struct SiteGroup {
+  const Node* node;
+  const Site* sites;
+  const float* columns;  // of the sites, `stride` apart, with room for a full vector behind the last
+  std::size_t stride;
+  int32_t count;
+  BlockCoordinates at;   // of their block
+  uint32_t first;        // its voxel 0 among owners
+};
+
+// Nodes as arrays, from the centre of a block's first voxel; `column[c]` has room for a full vector behind `count`.
+struct NodeColumns {
+  static constexpr int kColumns = 11;  // as Node
+  const float* column[kColumns];
+  int count;
+};
+
+// Whose distance a voxel has: voxel of a block's slot, 512 slot + row.
+constexpr uint32_t kNobody = 0xffffffffu;
 
 // Distances and gradients of a block. NaN: unknown.
 struct FieldVoxels {
   float distance[kVoxels];     // metres, negative behind the surface
   uint32_t gradient[kVoxels];  // 10 bits for each of x, y, z: 511 (1 + component)
+  uint32_t owner[kVoxels];     // of the nearest site; kNobody: none is near enough
 };
 
-// Lines of voxels along one axis of a box, x by x; see esdf_envelopes.
-struct EnvelopeLines {
-  const int32_t* in;         // nearest sites so far: in[position * in_stride + x]; -1: none
-  std::size_t in_stride;
-  const int32_t* positions;  // on the line where there may be sites, ascending
-  int count;
-  int32_t* out;              // out[(position - first) * out_stride + x]; may be `in`
-  std::size_t out_stride;
-  int first, last;           // positions to write, half-open
-  int x, columns;            // lines at x ... x + columns - 1
-  int y;                     // of the lines, where they run along z
-  const SiteCell* cells;
-  int limit;                 // sites farther than the root of this are dropped
+// The sites of a block, in the order of their voxels.
+struct SiteList {
+  const Site* sites;
+  int32_t count;
+  BlockCoordinates at;
 };
 
-// A block whose nearest sites are known.
-struct RefineInput {
-  const BoxSite* sites;
-  const SiteCell* cells;
-  const int32_t* neighbours;
-  const int32_t* nearest;    // of voxel (0, 0, 0); -1: none
-  std::size_t stride_y, stride_z;
-  int origin[3];             // of the block in the box
+// A block to bring up to date.
+struct NearestInput {
+  BlockCoordinates at;
+  NodeColumns all, arrived;      // of groups of all sites, of those that came or moved: what may be near enough
+  const int32_t *all_numbers, *arrived_numbers;  // of the groups in the columns
+  const SiteGroup *groups, *arrivals;  // by number
+  const SiteList* slots;         // of the owners that voxels have
   const uint64_t *known, *negative;
-  int low[3], high[3];       // sites outside of these voxels are not in the box; half-open
-  float voxel;               // metres
+  const uint64_t *search;        // voxels whose nearest site may be any
+  const uint64_t* orphans;       // those of them whose site moved or went: no site that stayed is nearer than it was
+  const uint64_t* redo;          // voxels to be measured again from the site they have
+  float voxel;                   // metres
   float max_distance;
+  float farthest;                // no known voxel is farther from its site
+  float slack;                   // for roundings
 };
 
-struct RefineOutput {
-  float required;  // how far around the block sites must be known, as far as can be told
-  float missing;   // how much farther they should have been known; valid if not positive
+struct NearestOutput {
+  float farthest;  // the largest distance of a known voxel, not its sign
+  int32_t computed;  // voxels that were
 };
 
 struct QueryInput {
   TableView table;
   const FieldVoxels* const* voxels;  // by row
+  const uint8_t* stale;              // by row
   float voxel;
   const double* points;  // [n, 3], metres
 };

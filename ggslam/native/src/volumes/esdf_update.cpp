@@ -1,203 +1,270 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which blocks of the distance field an update computes.
+// An update of the distance field: finds the sites that changed and the blocks they concern, and brings those up to date,
+// the nearest first, until the time is over.
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <numeric>
+#include <limits>
 
 #include "volumes/esdf.hpp"
+
+GGSLAM_DECLARE_KERNEL(ggslam::volumes::NearestOutput esdf_nearest(const ggslam::volumes::NearestInput& in,
+                                                                  ggslam::volumes::FieldVoxels& out))
 
 namespace ggslam::volumes {
 namespace {
 
 using Clock = std::chrono::steady_clock;
 
-// How far around a block that was never computed, and whose neighbours neither, sites are looked for first, voxels.
-constexpr float kFirstPad = 24;
+// A block that an update had no time for comes nearer by this at the next, in blocks, so that all have their turn.
+constexpr double kNearerByWaiting = 4;
+// Blocks that a thread takes at once.
+constexpr std::size_t kAtOnce = 4;
 
 double milliseconds(Clock::time_point since) {
   return std::chrono::duration<double, std::milli>(Clock::now() - since).count();
 }
 
-// Squared gap between a block and the nearest of `sources`, in voxels; of blocks up to `window` away, in `range`.
-class BlockGaps {
- public:
-  // `range` encloses the sources.
-  BlockGaps(const std::vector<BlockCoordinates>& sources, const Box3i& range, int window)
-      : window_(window), range_(range), size_(cast<std::size_t>(range.high - range.low)),
-        gap_(size_[0] * size_[1] * size_[2], kFar) {
-    for (const BlockCoordinates& at : sources) gap_[index(at)] = 0;
-  }
+void forget(FieldVoxels& voxels, int row) {
+  voxels.distance[row] = std::numeric_limits<float>::quiet_NaN();
+  voxels.gradient[row] = 511u | 511u << 10 | 511u << 20;
+  voxels.owner[row] = kNobody;
+}
 
-  void spread(ThreadPool& pool) {
-    const std::size_t strides[3] = {1, size_[0], size_[0] * size_[1]};
-    for (int a = 0; a < 3; ++a) {
-      const int b = a == 0 ? 1 : 0, c = a == 2 ? 1 : 2;
-      pool.parallel_for(size_[c], 1, [&](std::size_t begin, std::size_t end, int) {
-        std::vector<int> line(size_[a]);
-        for (std::size_t k = begin; k < end; ++k)
-          for (std::size_t j = 0; j < size_[b]; ++j) spread_line(&gap_[k * strides[c] + j * strides[b]], strides[a], line);
-      });
-    }
-  }
+template <class Do>
+void each_bit(const uint64_t* words, const Do& f) {
+  for (int k = 0; k < kSide; ++k)
+    for (uint64_t left = words[k]; left != 0; left &= left - 1) f(kSide * kSide * k + __builtin_ctzll(left));
+}
 
-  int gap(BlockCoordinates at) const {
-    return range_.contains(box_of(at)) ? gap_[index(at)] : kFar;
-  }
-
- private:
-  static constexpr int kFar = 1 << 29;
-  const int window_;
-  const Box3i range_;
-  const Vec3<std::size_t> size_;
-  std::vector<int> gap_;
-
-  std::size_t index(BlockCoordinates at) const {
-    const Vec3i p = vector_of(at) - range_.low;
-    return p[0] + size_[0] * (p[1] + size_[1] * p[2]);
-  }
-
-  void spread_line(int* values, std::size_t stride, std::vector<int>& line) const {
-    const int n = static_cast<int>(line.size());
-    std::fill(line.begin(), line.end(), kFar);
-    for (int i = 0; i < n; ++i) {
-      const int height = values[i * stride];
-      if (height == kFar) continue;
-      for (int p = std::max(0, i - window_); p < std::min(n, i + window_ + 1); ++p) {
-        const int steps = std::abs(p - i), gap = steps == 0 ? 0 : kSide * (steps - 1) + 1;
-        line[p] = std::min(line[p], height + gap * gap);
-      }
-    }
-    for (int i = 0; i < n; ++i) values[i * stride] = line[i];
-  }
+// What a thread keeps from one block to the next.
+struct Worker {
+  NearSearch search;
+  NodeTable all, arrived;
+  int64_t blocks = 0, voxels = 0;
 };
 
-// Calls found(row, gap) for blocks with the gap to the nearest of `sources`, if that is up to `window` blocks away. Where
-// the blocks lie far apart they are halved until what lies around each part fits the memory that is meant for it: the
-// space between them costs nothing. Gaps do not depend on the parts.
-class GapSearch {
+// Brings one block up to date.
+class BlockUpdate {
  public:
-  GapSearch(ThreadPool& pool, const BlockTable& table, int window) : pool_(pool), table_(table), window_(window) {}
+  // `touched`: by slot, whether it is.
+  BlockUpdate(const std::vector<FieldBlock*>& slots, const std::vector<uint8_t>& touched, FieldBlock& block)
+      : slots_(slots), touched_(touched), block_(block) {}
 
-  template <class Found>
-  void search(std::vector<int32_t> rows, const std::vector<BlockCoordinates>& sources, const Found& found) const {
-    Box3i box = Box3i::empty();
-    for (const int32_t row : rows) box.include(box_of(table_.at(row)));
-    const Box3i around = box.is_empty() ? box : box.grow(window_);
-    std::vector<BlockCoordinates> near;
-    Box3i range = Box3i::empty();
-    for (const BlockCoordinates& at : sources)
-      if (around.contains(box_of(at))) near.push_back(at), range.include(box_of(at).grow(window_));
-    if (near.empty()) return;
-    range = intersection(range, around);
-    const int axis = longest_axis(box);
-    if (1.0 * range.size(0) * range.size(1) * range.size(2) > kMostBlocks && box.size(axis) > 1) {
-      const int middle = box.low[axis] + static_cast<int>(box.size(axis) / 2);
-      const auto upper = std::partition(
-          rows.begin(), rows.end(), [&](int32_t row) { return vector_of(table_.at(row))[axis] < middle; });
-      search({rows.begin(), upper}, near, found);
-      search({upper, rows.end()}, near, found);
+  // What has to be done: voxels to search for, to measure again, and to forget.
+  void plan() {
+    if (block_.stale || !block_.voxels) {
+      if (!block_.voxels) block_.voxels = std::make_unique<FieldVoxels>();
+      for (int row = 0; row < kVoxels; ++row) forget(*block_.voxels, row);
+      std::copy_n(block_.known, kSide, search_);
       return;
     }
-    BlockGaps gaps(near, range, window_);
-    gaps.spread(pool_);
-    for (const int32_t row : rows) found(row, gaps.gap(table_.at(row)));
+    uint64_t gone[kSide];
+    for (int k = 0; k < kSide; ++k) {
+      search_[k] = block_.known[k] & ~block_.done_known[k];
+      gone[k] = block_.done_known[k] & ~block_.known[k];
+    }
+    each_bit(gone, [&](int row) { forget(*block_.voxels, row); });
+    if (std::any_of(block_.owners.begin(), block_.owners.end(), [&](uint32_t slot) { return touched_[slot]; }))
+      find_orphans();
+    for (int k = 0; k < kSide; ++k)
+      redo_[k] = block_.known[k] & ~search_[k] & (block_.negative[k] ^ block_.done_negative[k]);
+  }
+
+  NearestInput input() const {
+    NearestInput in{};
+    in.at = block_.at;
+    in.known = block_.known, in.negative = block_.negative;
+    in.search = search_, in.orphans = orphans_, in.redo = redo_;
+    return in;
+  }
+
+  bool works() const {
+    return searches() || std::any_of(redo_, redo_ + kSide, [](uint64_t word) { return word != 0; });
+  }
+
+  bool searches() const {
+    return std::any_of(search_, search_ + kSide, [](uint64_t word) { return word != 0; });
+  }
+
+  void finish() {
+    std::copy_n(block_.known, kSide, block_.done_known);
+    std::copy_n(block_.negative, kSide, block_.done_negative);
+    block_.stale = false, block_.waits = 0;
+  }
+
+  void finish(const NearestOutput& result) {
+    finish();
+    if (result.computed == 0) return;
+    block_.farthest = result.farthest;
+    block_.owners.clear();
+    uint32_t last = kNobody;
+    for (const uint32_t owner : block_.voxels->owner) {
+      const uint32_t slot = owner / kVoxels;
+      if (owner == kNobody || slot == last) continue;
+      last = slot;
+      if (std::find(block_.owners.begin(), block_.owners.end(), slot) == block_.owners.end())
+        block_.owners.push_back(slot);
+    }
   }
 
  private:
-  static constexpr double kMostBlocks = 1 << 25;
-  ThreadPool& pool_;
-  const BlockTable& table_;
-  const int window_;
+  const std::vector<FieldBlock*>& slots_;
+  const std::vector<uint8_t>& touched_;
+  FieldBlock& block_;
+  uint64_t search_[kSide] = {}, orphans_[kSide] = {}, redo_[kSide] = {};
 
-  static int longest_axis(const Box3i& box) {
-    const int a = box.size(1) > box.size(0) ? 1 : 0;
-    return box.size(2) > box.size(a) ? 2 : a;
+  // Voxels whose site went or moved.
+  void find_orphans() {
+    for (int k = 0; k < kSide; ++k) {
+      uint64_t orphans = 0;
+      const uint32_t* owners = block_.voxels->owner + kSide * kSide * k;
+      uint32_t last = kNobody;  // slot; neighbours mostly have theirs in the same block
+      const uint64_t* gone = nullptr;
+      for (int row = 0; row < kSide * kSide; ++row) {
+        const uint32_t owner = owners[row];
+        if (owner == kNobody) continue;
+        if (owner / kVoxels != last) {
+          last = owner / kVoxels;
+          gone = touched_[last] ? slots_[last]->gone : nullptr;
+        }
+        if (gone != nullptr) orphans |= (gone[owner % kVoxels >> 6] >> (owner & 63) & 1) << row;
+      }
+      orphans_[k] = orphans & block_.known[k] & ~search_[k];
+      search_[k] |= orphans_[k];
+    }
   }
 };
 
 }  // namespace
 
-float Esdf::first_pad(int32_t row) const {
-  const float most = max_distance_ + kCentreSlack + kReading;
-  if (blocks_[row].required > 0) return std::min(blocks_[row].required, most);
-  const BlockCoordinates at = table_.at(row);
-  float pad = 0;
-  for (int face = 0; face < 6; ++face) {
-    BlockCoordinates next = at;
-    (face / 2 == 0 ? next.x : face / 2 == 1 ? next.y : next.z) += face % 2 ? 1 : -1;
-    const int32_t other = table_.find(next);
-    if (other >= 0) pad = std::max(pad, blocks_[other].required);
+Esdf::Esdf(const Tsdf& tsdf, float max_distance)
+    : tsdf_(tsdf), max_distance_(max_distance / tsdf.voxel),
+      slack_(0.01f + 3e-7f * (max_distance / tsdf.voxel) * (max_distance / tsdf.voxel)) {}
+
+// Those near the place come first, and those that have waited.
+void Esdf::sort(std::vector<int32_t>& rows, const Deadline& deadline) const {
+  if (deadline.place == nullptr) return;
+  std::vector<std::pair<double, int32_t>> order;
+  order.reserve(rows.size());
+  for (const int32_t row : rows) {
+    double square = 0;
+    for (int a = 0; a < 3; ++a) {
+      const double away = vector_of(blocks_[row]->at)[a] + 0.5 - deadline.place[a] / kSide;
+      square += away * away;
+    }
+    order.emplace_back(std::sqrt(square) - kNearerByWaiting * blocks_[row]->waits, row);
   }
-  return std::min(pad > 0 ? pad + kSide : kFirstPad, most);
+  std::sort(order.begin(), order.end());
+  for (std::size_t i = 0; i < rows.size(); ++i) rows[i] = order[i].second;
 }
 
-// Those whose known voxels changed, and those that changed sites may be near enough to: a result depends on the sites
-// not farther than its nearest one and kReading more, `required` at most. That holds whether sites come, go or move: one that goes was at
-// the nearest one's distance, not nearer.
-std::vector<Task> Esdf::affected(Context& context, const std::vector<int32_t>& changed) const {
-  std::vector<uint8_t> listed(blocks_.size(), 0);
-  std::vector<Task> tasks;
-  for (int32_t row : changed) listed[row] = 1;
-  if (!site_changes_.empty()) {
-    const int window = static_cast<int>((max_distance_ + kCentreSlack + kReading) / kSide) + 1;
-    std::vector<int32_t> rows(blocks_.size());
-    std::iota(rows.begin(), rows.end(), 0);
-    GapSearch(context.pool, table_, window).search(std::move(rows), site_changes_, [&](int32_t row, int gap) {
-      const float reading = blocks_[row].required;
-      if (static_cast<float>(gap) <= reading * reading) listed[row] = 1;
-    });
+void Esdf::compute(Context& context, std::vector<int32_t>& rows, const Deadline& deadline, FieldStats& stats) {
+  const auto start = Clock::now();
+  const double left = deadline.milliseconds > 0 ? deadline.milliseconds - stats.sites_ms - stats.select_ms
+                                                : std::numeric_limits<double>::infinity();
+  sort(rows, deadline);
+  std::vector<Worker> workers(context.pool.size());
+  std::vector<uint8_t> done(rows.size(), 0);
+  const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_nearest);
+  context.pool.parallel_for(rows.size(), kAtOnce, [&](std::size_t begin, std::size_t end, int thread) {
+    Worker& worker = workers[thread];
+    for (std::size_t i = begin; i < end; ++i) {
+      // However late it is, something is done, or what is left over would never end.
+      if (i >= kAtOnce && milliseconds(start) >= left) return;
+      FieldBlock& block = *blocks_[rows[i]];
+      const Quarter& quarter = quarters_[quarter_of_[rows[i]]];
+      BlockUpdate update(slots_, touched_, block);
+      const bool anew = block.stale;
+      update.plan();
+      NearestInput in = update.input();
+      const Vec3f middle = middle_in(block, quarter);
+      const Vec3f shift = Vec3f::all(0.5f * (kSide - 1)) - middle;
+      worker.arrived.clear(0), worker.all.clear(0);
+      if (!anew)
+        worker.search.list(context, quarter.arrived, middle.v, kBlockReach, block.farthest, shift.v, worker.arrived);
+      if (update.searches())
+        worker.search.list(context, quarter.all, middle.v, kBlockReach, max_distance_, shift.v, worker.all);
+      in.all = worker.all.columns(), in.all_numbers = worker.all.numbers();
+      in.arrived = worker.arrived.columns(), in.arrived_numbers = worker.arrived.numbers();
+      in.groups = groups_.data(), in.arrivals = arrivals_.data(), in.slots = lists_.data();
+      in.voxel = tsdf_.voxel, in.max_distance = max_distance_;
+      in.slack = slack_;
+      in.farthest = anew ? max_distance_ : block.farthest;
+      done[i] = 1;
+      if (!anew && worker.arrived.count() == 0 && !update.works()) {
+        update.finish();
+        continue;
+      }
+      const NearestOutput result = kernel(in, *block.voxels);
+      update.finish(result);
+      worker.blocks += result.computed > 0 || anew, worker.voxels += result.computed;
+    }
+  });
+  left_ = 0;
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    if (done[i]) continue;
+    blocks_[rows[i]]->stale = true;
+    ++blocks_[rows[i]]->waits;
+    ++left_;
   }
-  for (std::size_t row = 0; row < blocks_.size(); ++row)
-    if (listed[row]) tasks.push_back({static_cast<int32_t>(row), first_pad(static_cast<int32_t>(row))});
-  return tasks;
-}
-
-void Esdf::compute(Context& context, std::vector<Task> tasks, FieldStats& stats) {
-  bounds_ = Box3i::empty();
-  for (std::size_t row = 0; row < blocks_.size(); ++row)
-    if (!blocks_[row].sites.empty()) bounds_.include(box_of(table_.at(row)));
-  if (bounds_.is_empty()) bounds_ = Box3i{};
-  std::vector<Task> again;
-  while (!tasks.empty()) {
-    again.clear();
-    for (const TaskBox& box : split_into_boxes(tasks, table_, bounds_))
-      solve(context, {tasks.begin() + box.begin, tasks.begin() + box.end}, box.box, stats, again);
-    tasks.swap(again);
-  }
-}
-
-FieldStats Esdf::update(Context& context) {
-  FieldStats stats{};
-  if (tsdf_.revision == revision_) {
-    stats.blocks = static_cast<int64_t>(blocks_.size());
-    return stats;
-  }
-  auto start = Clock::now();
-  const std::vector<int32_t> changed = find_sites(context, stats);
-  stats.sites_ms = milliseconds(start);
-  start = Clock::now();
-  std::vector<Task> tasks = affected(context, changed);
-  stats.select_ms = milliseconds(start);
-  stats.recomputed_blocks = static_cast<int64_t>(tasks.size());
-  stats.blocks = static_cast<int64_t>(blocks_.size());
-  start = Clock::now();
-  compute(context, std::move(tasks), stats);
+  for (const Worker& worker : workers) stats.recomputed_blocks += worker.blocks, stats.computed_voxels += worker.voxels;
   stats.transform_ms = milliseconds(start);
-  revision_ = tsdf_.revision;
+}
+
+void Esdf::forget_changes() {
+  for (const auto& block : blocks_) {
+    if (!block->touched) continue;
+    block->touched = false;
+    std::fill_n(block->gone, kSide, 0);
+    make_leaves({}, kMostThatCame, slack_, block->arrived);
+  }
+  for (const auto& block : erased_) {
+    slots_[block->slot] = nullptr;
+    free_slots_.push_back(block->slot);
+  }
+  erased_.clear();
+}
+
+FieldStats Esdf::update(Context& context, const Deadline& deadline) {
+  FieldStats stats{};
+  if (tsdf_.revision != revision_ || left_ > 0) {
+    auto start = Clock::now();
+    find_sites(context, stats);
+    stats.sites_ms = milliseconds(start);
+    start = Clock::now();
+    std::vector<int32_t> rows = select(context);
+    stats.select_ms = milliseconds(start);
+    compute(context, rows, deadline, stats);
+    forget_changes();
+    revision_ = tsdf_.revision;
+  }
+  stats.blocks = static_cast<int64_t>(blocks_.size());
+  stats.stale_blocks = left_;
+  return stats;
+}
+
+FieldStats Esdf::recompute(Context& context) {
+  for (const auto& block : blocks_) block->stale = true;
+  FieldStats stats{};
+  std::vector<int32_t> rows = select(context);
+  compute(context, rows, {0, nullptr}, stats);
+  stats.blocks = static_cast<int64_t>(blocks_.size());
   return stats;
 }
 
 void Esdf::clear() {
   table_.clear();
-  blocks_.clear();
-  revision_ = 0;
+  blocks_.clear(), slots_.clear(), free_slots_.clear(), erased_.clear();
+  revision_ = 0, left_ = 0;
 }
 
 std::size_t Esdf::bytes() const {
-  std::size_t total = table_.bytes() + blocks_.capacity() * sizeof(FieldBlock);
-  for (const FieldBlock& block : blocks_)
-    total += block.sites.capacity() * sizeof(Site) + (block.voxels ? sizeof(FieldVoxels) : 0);
+  std::size_t total = table_.bytes() + slots_.capacity() * sizeof(FieldBlock*);
+  for (const auto& block : blocks_)
+    total += sizeof(FieldBlock) + (block->sites.capacity() + block->tree.sites.capacity()) * sizeof(Site) +
+             block->tree.leaves.capacity() * sizeof(Leaf) + block->tree.columns.capacity() * sizeof(float) + block->owners.capacity() * sizeof(uint32_t) +
+             (block->voxels ? sizeof(FieldVoxels) : 0);
   return total;
 }
 

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Surface points of a block of the TSDF: zero crossings on the edges between voxels.
+#include <algorithm>
 #include <cmath>
 
 #include "volumes/esdf_types.hpp"
@@ -11,10 +12,17 @@ using namespace ggslam::volumes;
 
 constexpr int kSteps[3] = {1, kHalo, kHalo * kHalo};
 
+constexpr float kHalfRoot = 0.70710678f;
+constexpr float kRim[8][2] = {{1, 0}, {-1, 0}, {0, 1}, {0, -1}, {kHalfRoot, kHalfRoot}, {-kHalfRoot, kHalfRoot},
+                              {kHalfRoot, -kHalfRoot}, {-kHalfRoot, -kHalfRoot}};
+// How far a rim may stand out of the surface, voxels: less is noise.
+constexpr float kMayStandOut = 0.2f;
+constexpr float kRadiusSteps = 8;
+
 bool seen(int16_t value) { return value != kUnseen; }
 
-// Gradient of the values, central where both neighbours were seen.
-void normal_of(const int16_t* v, float normal[3]) {
+// Gradient of the values, central where both neighbours were seen; false if it is zero.
+bool normal_of(const int16_t* v, float normal[3]) {
   float length = 0;
   for (int a = 0; a < 3; ++a) {
     const int16_t after = v[kSteps[a]], before = v[-kSteps[a]];
@@ -27,6 +35,7 @@ void normal_of(const int16_t* v, float normal[3]) {
   }
   const float scale = length > 0 ? 1 / std::sqrt(length) : 0.0f;
   for (int a = 0; a < 3; ++a) normal[a] *= scale;
+  return length > 0;
 }
 
 // Mean of the crossings on the edges of voxel v that are nearer to it than to the neighbour; false if there are none.
@@ -46,11 +55,46 @@ bool point_of(const int16_t* v, float point[3]) {
   return n > 0;
 }
 
+// How far the disc of a site reaches before it stands out of the surface, as it would beyond a convex edge: where values
+// on its rim tell of free space. `point` is the site's from its voxel v, `unit` turns values into voxels.
+float radius_of(const int16_t* v, const float point[3], const float normal[3], float unit) {
+  // Two directions across the normal.
+  const int least = std::fabs(normal[0]) <= std::fabs(normal[1])
+                        ? (std::fabs(normal[0]) <= std::fabs(normal[2]) ? 0 : 2)
+                        : (std::fabs(normal[1]) <= std::fabs(normal[2]) ? 1 : 2);
+  const int b = (least + 1) % 3, c = (least + 2) % 3;
+  const float length = std::sqrt(normal[b] * normal[b] + normal[c] * normal[c]);
+  float across[2][3] = {};
+  across[0][b] = normal[c] / length, across[0][c] = -normal[b] / length;
+  for (int a = 0; a < 3; ++a) {
+    const int d = (a + 1) % 3, e = (a + 2) % 3;
+    across[1][a] = normal[d] * across[0][e] - normal[e] * across[0][d];
+  }
+  float radius = kDiscRadius;
+  for (int direction = 0; direction < 8; ++direction) {
+    const float x = kRim[direction][0], y = kRim[direction][1];
+    float beside = 0;  // of the voxel that the rim is in, in front of the disc's plane
+    int step = 0;
+    for (int a = 0; a < 3; ++a) {
+      const float rim = point[a] + kDiscRadius * (x * across[0][a] + y * across[1][a]);
+      const int place = rim > 0.5f ? 1 : rim < -0.5f ? -1 : 0;
+      step += place * kSteps[a];
+      beside += normal[a] * (static_cast<float>(place) - rim);
+    }
+    if (!seen(v[step])) continue;
+    const float out = unit * v[step] - beside;
+    if (out > kMayStandOut) radius = std::min(radius, kDiscRadius - (out - kMayStandOut));
+  }
+  // In steps, or the noise of values would change it with every view.
+  return std::max(1.0f, std::floor(radius * (kRadiusSteps / kDiscRadius) + 0.5f)) * (kDiscRadius / kRadiusSteps);
+}
+
 }  // namespace
 
-// Sites of the block in the middle of `values` [10, 10, 10] (x fastest; kUnseen where not seen; the corners and edges of
-// the halo are not read); returns their number, at most 512. Known and negative voxels go to bit i + 8 j of word k.
-int esdf_crossings(const int16_t* values, Site* out, uint64_t* known, uint64_t* negative) {
+// Sites of the block in the middle of `values` [10, 10, 10] (x fastest; kUnseen where not seen, and in the corners and
+// edges of the halo), `unit` voxels each; returns their number, at most 512. Known and negative voxels go to bit i + 8 j of
+// word k.
+int esdf_crossings(const int16_t* values, Site* out, uint64_t* known, uint64_t* negative, float unit) {
   int n = 0;
   for (int k = 0; k < kSide; ++k) {
     known[k] = negative[k] = 0;
@@ -60,8 +104,10 @@ int esdf_crossings(const int16_t* values, Site* out, uint64_t* known, uint64_t* 
       known[k] |= uint64_t{1} << row;
       if (*v < 0) negative[k] |= uint64_t{1} << row;
       Site& site = out[n];
-      if (!point_of(v, site.point)) continue;
-      normal_of(v, site.normal);
+      if (!point_of(v, site.at)) continue;
+      const int place[3] = {row % kSide, row / kSide, k};
+      site.radius = normal_of(v, site.normal) ? radius_of(v, site.at, site.normal, unit) : 0.0f;
+      for (int a = 0; a < 3; ++a) site.at[a] += static_cast<float>(place[a]);
       site.voxel = row + kSide * kSide * k;
       ++n;
     }

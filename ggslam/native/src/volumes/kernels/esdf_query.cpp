@@ -23,13 +23,14 @@ struct Reader {
   const QueryInput& in;
   BlockCoordinates at{0, 0, 0};
   const FieldVoxels* block = nullptr;
-  bool valid = false;
+  bool valid = false, stale = false;
 
   bool read(const int v[3], Sample& out) {
     const BlockCoordinates wanted{v[0] >> 3, v[1] >> 3, v[2] >> 3};
     if (!valid || wanted.x != at.x || wanted.y != at.y || wanted.z != at.z) {
       const int32_t row = block_row(in.table, wanted);
       block = row < 0 ? nullptr : in.voxels[row];
+      stale = row >= 0 && in.stale[row];
       at = wanted, valid = true;
     }
     if (block == nullptr) return false;
@@ -72,10 +73,10 @@ void interpolate(Reader& reader, const double place[3], const int home[3], const
 
 }  // namespace
 
-// Points begin ... end - 1: distance [n] in metres, gradient [n, 3], known [n]. A point is known if the voxel that it
-// is in is.
+// Points begin ... end - 1: distance [n] in metres, gradient [n, 3], known [n], stale [n]. A point is known, or stale,
+// if the voxel that it is in is.
 void esdf_query(const QueryInput& in, std::size_t begin, std::size_t end, float* distance, float* gradient,
-                uint8_t* known) {
+                uint8_t* known, uint8_t* stale) {
   Reader reader{in};
   const double most = std::numeric_limits<int>::max() / 2;
   for (std::size_t n = begin; n < end; ++n) {
@@ -89,6 +90,7 @@ void esdf_query(const QueryInput& in, std::size_t begin, std::size_t end, float*
     }
     Sample centre, out{std::numeric_limits<float>::quiet_NaN(), {0, 0, 0}};
     known[n] = finite && reader.read(home, centre);
+    stale[n] = known[n] && reader.stale;
     if (known[n]) interpolate(reader, place, home, centre, in.voxel, out);
     distance[n] = out.distance;
     float square = 0;

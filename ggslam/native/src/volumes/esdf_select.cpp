@@ -1,0 +1,132 @@
+// SPDX-License-Identifier: Apache-2.0
+// Which blocks of the distance field an update concerns: those with voxels whose site went or moved, that sites came near
+// enough to, or of which other voxels are known.
+#include <algorithm>
+#include <cmath>
+#include <cstdlib>
+#include <cstring>
+
+#include "volumes/esdf.hpp"
+
+GGSLAM_DECLARE_KERNEL(int esdf_near(const ggslam::volumes::NodeColumns& nodes, const float middle[3], float reach,
+                                    float most, float* scratch, int32_t* out))
+
+namespace ggslam::volumes {
+namespace {
+
+constexpr int kQuarter = 4;  // blocks along an edge
+constexpr float kQuarterMiddle = 0.5f * (kQuarter * kSide - 1), kQuarterReach = 1.7321f * kQuarterMiddle;
+
+BlockCoordinates quarter_at(BlockCoordinates at) {
+  return {at.x >> 2, at.y >> 2, at.z >> 2};
+}
+
+bool same_words(const uint64_t* a, const uint64_t* b) { return std::memcmp(a, b, kSide * sizeof *a) == 0; }
+
+// The groups that may matter to a quarter with no voxel farther from its site than `most`.
+void list_near(Context& context, const std::vector<SiteGroup>& groups, const Quarter& quarter, float most,
+               NodeTable& out) {
+  NodeTable around;
+  around.clear(groups.size());
+  const int window = static_cast<int>((most + kQuarterReach) / kSide) + kQuarter + 2;
+  for (std::size_t g = 0; g < groups.size(); ++g) {
+    const Vec3i away = vector_of(groups[g].at) - vector_of(quarter.at);
+    if (std::abs(away[0]) > window || std::abs(away[1]) > window || std::abs(away[2]) > window) continue;
+    around.add(*groups[g].node, cast<float>(kSide * away).v, static_cast<int32_t>(g));
+  }
+  const float middle[3] = {kQuarterMiddle, kQuarterMiddle, kQuarterMiddle}, here[3] = {0, 0, 0};
+  NearSearch search;
+  search.list(context, around, middle, kQuarterReach, most, here, out);
+}
+
+}  // namespace
+
+// The middle of a block, from the first voxel of its quarter.
+Vec3f middle_in(const FieldBlock& block, const Quarter& quarter) {
+  return cast<float>(kSide * (vector_of(block.at) - vector_of(quarter.at))) + Vec3f::all(0.5f * (kSide - 1));
+}
+
+// All sites in groups, and those that came or moved.
+void Esdf::list_groups() {
+  groups_.clear(), arrivals_.clear();
+  const auto add = [](const FieldBlock& block, const SiteLeaves& leaves, std::vector<SiteGroup>& to) {
+    int32_t begin = 0;
+    for (const Leaf& leaf : leaves.leaves) {
+      to.push_back({&leaf.node, leaves.sites.data() + begin, leaves.columns.data() + begin, leaves.stride,
+                    leaf.end - begin, block.at, block.slot * static_cast<uint32_t>(kVoxels)});
+      begin = leaf.end;
+    }
+  };
+  for (const auto& block : blocks_) add(*block, block->tree, groups_), add(*block, block->arrived, arrivals_);
+  touched_.resize(slots_.size());
+  for (std::size_t slot = 0; slot < slots_.size(); ++slot) touched_[slot] = slots_[slot] && slots_[slot]->touched;
+  lists_.resize(slots_.size());
+  for (std::size_t slot = 0; slot < slots_.size(); ++slot)
+    if (const FieldBlock* block = slots_[slot])
+      lists_[slot] = {block->sites.data(), static_cast<int32_t>(block->sites.size()), block->at};
+}
+
+// Puts the blocks into quarters, with the groups that came near them.
+void Esdf::divide(Context& context) {
+  BlockTable places;
+  quarters_.clear();
+  quarter_of_.resize(blocks_.size());
+  for (std::size_t row = 0; row < blocks_.size(); ++row) {
+    const BlockCoordinates at = quarter_at(blocks_[row]->at);
+    const std::size_t q = places.insert(at);
+    if (q == quarters_.size()) quarters_.push_back({{at.x * kQuarter, at.y * kQuarter, at.z * kQuarter}, {}, {}, 0});
+    quarter_of_[row] = static_cast<int32_t>(q);
+    if (!blocks_[row]->stale) quarters_[q].farthest = std::max(quarters_[q].farthest, blocks_[row]->farthest);
+  }
+  context.pool.parallel_for(quarters_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t q = begin; q < end; ++q)
+      list_near(context, arrivals_, quarters_[q], quarters_[q].farthest, quarters_[q].arrived);
+  });
+}
+
+int NearSearch::find(Context& context, const NodeTable& nodes, const float middle[3], float reach, float most) {
+  least_.resize(nodes.count() + 16), found_.resize(nodes.count());
+  const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_near);
+  return kernel(nodes.columns(), middle, reach, most, least_.data(), found_.data());
+}
+
+void NearSearch::list(Context& context, const NodeTable& nodes, const float middle[3], float reach, float most,
+                      const float shift[3], NodeTable& out) {
+  const int n = find(context, nodes, middle, reach, most);
+  out.clear(n);
+  for (int i = 0; i < n; ++i) out.add(nodes, found_[i], shift);
+}
+
+// Whether something may be different in a block.
+bool Esdf::concerns(Context& context, const FieldBlock& block, const Quarter& quarter,
+                    NearSearch& search) const {
+  if (block.stale || !same_words(block.known, block.done_known) || !same_words(block.negative, block.done_negative))
+    return true;
+  for (const uint32_t slot : block.owners)
+    if (touched_[slot]) return true;
+  float middle[3];
+  middle_in(block, quarter).to(middle);
+  return search.find(context, quarter.arrived, middle, kBlockReach, block.farthest) > 0;
+}
+
+std::vector<int32_t> Esdf::select(Context& context) {
+  list_groups();
+  divide(context);
+  std::vector<uint8_t> concerned(blocks_.size(), 0);
+  context.pool.parallel_for(blocks_.size(), 64, [&](std::size_t begin, std::size_t end, int) {
+    NearSearch search;
+    for (std::size_t row = begin; row < end; ++row)
+      concerned[row] = concerns(context, *blocks_[row], quarters_[quarter_of_[row]], search);
+  });
+  std::vector<int32_t> rows;
+  std::vector<uint8_t> wanted(quarters_.size(), 0);
+  for (std::size_t row = 0; row < blocks_.size(); ++row)
+    if (concerned[row]) rows.push_back(static_cast<int32_t>(row)), wanted[quarter_of_[row]] = 1;
+  context.pool.parallel_for(quarters_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
+    for (std::size_t q = begin; q < end; ++q)
+      if (wanted[q]) list_near(context, groups_, quarters_[q], max_distance_, quarters_[q].all);
+  });
+  return rows;
+}
+
+}  // namespace ggslam::volumes
