@@ -82,7 +82,7 @@ def circles() -> list[str]:
 PURPOSES = {
     "SLAM": "sight slam tracking mapping loops movers objects rendering scene geometry features native cuda",
     "recordings, files and stores": "sequences formats coding runs submaps system abi errors __init__ __main__",
-    "work on finished runs": "jobs localization merging changes volumes evaluation viewer reporting",
+    "work on finished runs": "jobs localization merging changes driving volumes evaluation viewer reporting",
     "command line": "cli",
     "generated recordings": "synthetic",
 }
@@ -109,7 +109,7 @@ def lines_by_purpose() -> dict[str, int]:
     return dict(found)
 
 
-ONLY_FOR_USERS = {"ggslam.volumes.raycast"}
+ONLY_FOR_USERS = {"ggslam.volumes.raycast", "ggslam.driving.robot"}
 """Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it."""
 
 
