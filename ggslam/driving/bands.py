@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from ggslam.abi.core import BEHIND_BIT, SEEN_BIT
 from ggslam.driving.robot import Robot
+from ggslam.errors import InputError
 from ggslam.scene.poses import inverse
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.cell_grid import CellGrid, SlicePlane
@@ -39,9 +40,9 @@ class BandMap:
 
     Attributes:
         grid: the cells, on the floor.
-        robot: whose band it is.
-        occupied: bool [H, W], whether a cell has a surface in it: a surface point between the robot's lowest and
-            highest obstacle, or a measured point, lies in it or within half a cell (three quarters of a voxel, if
+        heights: lowest and highest obstacle that counts, metres above the floor.
+        occupied: bool [H, W], whether a cell has a surface in it: a surface point, or a measured point, between these
+            heights lies in it or within half a cell (three quarters of a voxel, if
             that is more) of its centre.
         known: bool [H, W], whether it was seen at one of the heights at least.
         behind: bool [H, W], whether it is behind a surface at one of them, at one that no point was measured near, or
@@ -52,7 +53,7 @@ class BandMap:
     """
 
     grid: CellGrid
-    robot: Robot
+    heights: tuple[float, float]
     occupied: np.ndarray
     known: np.ndarray
     behind: np.ndarray
@@ -62,7 +63,7 @@ class BandMap:
     @property
     def free(self) -> np.ndarray:
         """Cells that were seen, with no surface in them and not behind one, bool [H, W]. A cell that was seen at some
-        of the robot's heights only may be free."""
+        of the heights only may be free."""
         return self.known & ~self.occupied & ~self.behind
 
     @property
@@ -101,7 +102,17 @@ class HeightLayers:
 
     def band(self, robot: Robot) -> BandMap:
         """What a robot meets."""
-        low, high = robot.band
+        return self.between(*robot.band)
+
+    def between(self, low: float, high: float) -> BandMap:
+        """What there is between two heights above the floor, metres; a robot that meets all of it.
+
+        Raises:
+            InputError: the lower one is not the first.
+        """
+        if not low <= high:
+            raise InputError(f"expected two heights, the lower first, found {low} and {high}")
+        low, high = max(low, min(self._reach[0], high)), min(high, max(self._reach[1], low))
         seen = self._see(low, high)
         known, behind = (seen & SEEN_BIT) > 0, (seen & BEHIND_BIT) > 0
         near = self._surface.near_points(self.grid, low, high)
@@ -115,11 +126,11 @@ class HeightLayers:
         distance = self._distance(points)
         occupied = (sited & ~unseen) | measured
         occupied |= distance <= max(self.grid.resolution / 2, BandTuning.reach_voxels * self._field.voxel)
-        return BandMap(self.grid, robot, occupied, known, behind | unseen | near, distance, points)
+        return BandMap(self.grid, (low, high), occupied, known, behind | unseen | near, distance, points)
 
     def _see(self, low: float, high: float) -> np.ndarray:
         """What the voxels of a band are, together, uint8 [H, W]: layers a voxel apart, or the one at its middle."""
-        low, high, spacing = max(low, self._reach[0]), min(high, self._reach[1]), self._field.voxel
+        spacing = self._field.voxel
         first, last = int(np.ceil(low / spacing - 1e-6)), int(np.floor(high / spacing + 1e-6))
         if first > last:
             first = last = int(np.rint((low + high) / 2 / spacing))

@@ -4,7 +4,7 @@ points beside them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -36,13 +36,12 @@ class SeenSurface:
     def of(field: DistanceField, plane: SlicePlane) -> SeenSurface:
         """What a field and its TSDF have."""
         points, normals = field.surface()
-        octants = measured_octants(field.tsdf)
-        thin = _thin_octants(octants, points[~normals.any(1)].astype(float) - field.origin, field.voxel)
-        axes = np.stack([plane.x_axis, plane.y_axis, plane.normal])
-        sites = plane.coordinates(points.astype(float))
-        return SeenSurface(
-            sites, plane.coordinates(octants + field.origin), thin, field.voxel / 4 * np.abs(axes).sum(1)
-        )
+        # Seen from the field's origin, so that a map far from zero gives the same bits.
+        sites, octants = (points - field.origin).astype(np.float32).astype(float), measured_octants(field.tsdf)
+        plane = replace(plane, origin=plane.origin - field.origin)
+        thin = _thin_octants(octants, sites[~normals.any(1)], field.voxel)
+        reach = field.voxel / 4 * np.abs(np.stack([plane.x_axis, plane.y_axis, plane.normal])).sum(1)
+        return SeenSurface(plane.coordinates(sites), plane.coordinates(octants), thin, reach)
 
     def near_points(self, grid: CellGrid, low: float, high: float) -> np.ndarray:
         """Cells, bool [H, W], that may have a measured point in them between two heights: none of them is free."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plane slices through the distance field: arrays, pictures, and maps for ROS's map_server.
+"""Plane slices through the distance field: arrays and pictures.
 
 A slice is a grid of square cells on an oriented plane. Arrays are [H, W] with row 0 at the top, where y is largest, as
 in pictures; column 0 is where x is smallest.
@@ -8,26 +8,16 @@ in pictures; column 0 is where x is smallest.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
 
 import cv2
 import numpy as np
 
 from ggslam.errors import InputError
-from ggslam.system.atomic import write_bytes, write_text
 from ggslam.volumes.cell_grid import CellGrid, SlicePlane
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
 from ggslam.volumes.seen_surface import SeenSurface, unseen_surface
 from ggslam.volumes.tsdf import SIDE
-
-OCCUPIED: Final = 0
-"""Grey of an occupied cell in a ROS map."""
-FREE: Final = 254
-"""Grey of a free cell there."""
-UNKNOWN: Final = 205
-"""Grey of an unknown cell there."""
 
 
 @dataclass(frozen=True)
@@ -130,13 +120,18 @@ def slice_picture(cut: FieldSlice, full_scale: float, smallest_side: int = 480) 
     inner = cv2.erode(cut.occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     picture[cut.occupied & ~inner] = 0
     picture[~cut.known] = 128
-    times = max(1, -(-smallest_side // min(cut.known.shape)))
-    times = max(1, min(times, 4000 // max(cut.known.shape)))
+    times = magnification(cut.known.shape, smallest_side)
     picture = picture.repeat(times, 0).repeat(times, 1)
-    return np.concatenate([picture, _scale(picture.shape[1], full_scale, cut.resolution)])
+    return np.concatenate([picture, _scale(picture.shape[1], full_scale)])
 
 
-def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
+def magnification(shape: tuple[int, ...], smallest_side: int) -> int:
+    """By how much cells [H, W] are magnified so that the shorter side has `smallest_side` pixels, if the longer one
+    has not more than 4000 then."""
+    return max(1, min(-(-smallest_side // min(shape)), 4000 // max(shape)))
+
+
+def _scale(width: int, full_scale: float) -> np.ndarray:
     """The colours of distances with marks in metres."""
     bar = np.full((46, width, 3), 255, np.uint8)
     ramp = cv2.applyColorMap(np.linspace(255, 0, width).astype(np.uint8)[None], cv2.COLORMAP_TURBO)[..., ::-1]
@@ -148,33 +143,3 @@ def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
         x = int(np.clip(i * (width - 1) / (marks - 1) - size / 2, 2, max(2, width - size - 2)))
         cv2.putText(bar, text, (x, 38), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
     return bar
-
-
-def ros_map(cut: FieldSlice) -> np.ndarray:
-    """A slice as a ROS map: uint8 [H, W], 0 occupied, 254 free, 205 unknown."""
-    return np.where(cut.occupied, OCCUPIED, np.where(cut.free, FREE, UNKNOWN)).astype(np.uint8)
-
-
-def write_ros_map(cut: FieldSlice, path: str | Path) -> tuple[Path, Path]:
-    """Writes a map that ROS's map_server reads: `path` with the endings .pgm (binary) and .yaml.
-
-    The map's frame is that of the plane: x and y along its axes, in metres from its origin; the yaml's origin is the
-    lower left corner of the lower left pixel.
-
-    Returns:
-        The two files.
-
-    Raises:
-        RunFolderError: a file cannot be written.
-    """
-    path = Path(path)
-    image, description = path.with_name(path.name + ".pgm"), path.with_name(path.name + ".yaml")
-    pixels = ros_map(cut)
-    write_bytes(image, f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n".encode() + pixels.tobytes())
-    x, y = cut.plane.low
-    write_text(
-        description,
-        f"image: {image.name}\nmode: trinary\nresolution: {cut.resolution:.6g}\norigin: [{x:.6f}, {y:.6f}, 0.0]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
-    )
-    return image, description

@@ -224,3 +224,29 @@ def test_a_band_higher_than_the_room_is_cut(room: Path, tmp_path: Path) -> None:
     made(room, "--out", tmp_path / "a", "--stop", 3, *QUICK, "--esdf", "--band", "0.1,900000")
     low, high = record(tmp_path / "a")["esdf"]["band"]
     assert 0 < low < high < 10
+
+
+def test_robots_get_maps_of_their_own(room: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a"
+    robots = ["--robot", "0.3,0.1", "--robot", "tall:1.4,0.2,0.1"]
+    assert "tall:" in made(room, "--out", out, "--stop", 6, *QUICK, "--esdf", *robots)
+    names = {"map_robot.pgm", "map_robot.yaml", "costmap_robot.png", "costmap_robot.yaml", "robot_robot.png"}
+    names |= {name.replace("_robot", "_tall") for name in names}
+    found = record(out)
+    assert names <= set(found["files"]) and all((out / name).is_file() for name in names)
+    assert set(found["esdf"]["robots"]) == {"robot", "tall"} and found["esdf"]["robots"]["tall"]["step"] == 0.1
+    low, tall = (cv2.imread(str(out / f"map_{name}.pgm"), cv2.IMREAD_UNCHANGED) for name in ("robot", "tall"))
+    costs = cv2.imread(str(out / "costmap_tall.png"), cv2.IMREAD_UNCHANGED)
+    assert low.shape == tall.shape == costs.shape[:2] and not np.array_equal(low, tall)
+    assert np.array_equal(tall == 0, (costs[..., 0] == 0) & (costs[..., 3] == 255))
+    made(room, "--out", out, "--stop", 6, *QUICK, "--esdf")
+    assert not (out / "map_tall.pgm").exists()
+
+
+def test_wrong_robots_are_refused(room: Path, tmp_path: Path) -> None:
+    few = [room, "--out", tmp_path / "a", "--stop", 1, *QUICK]
+    one_error(ggslam("volumes", *few, "--robot", "1,0.2"), "robot", "esdf")
+    one_error(ggslam("volumes", *few, "--esdf", "--robot", "tall"), "HEIGHT,RADIUS")
+    one_error(ggslam("volumes", *few, "--esdf", "--robot", "a:1,0.2", "--robot", "A:1,0.3"), "twice")
+    one_error(ggslam("volumes", *few, "--esdf", "--robot", "1,0.2", "--inflation", "1"), "RADIUS,FACTOR")
+    assert not (tmp_path / "a" / "volumes.json").exists()

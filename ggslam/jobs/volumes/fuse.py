@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.driving.inflation import parse_inflation
 from ggslam.errors import ConfigError, RunFolderError, SequenceError
 from ggslam.formats.mesh_files import check_mesh_path
 from ggslam.geometry.scene_size import scene_scale
@@ -18,6 +19,7 @@ from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.volumes.frames import FrameSource, frames_of_recording, frames_of_run
 from ggslam.jobs.volumes.live import LiveVolumes
 from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, Surface, prepare_folder, write_outputs
+from ggslam.jobs.volumes.robot_maps import parse_robots
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
@@ -53,6 +55,8 @@ class VolumesRequest:
         onto: file of a TSDF to go on in.
         slice_height: metres above the floor of the slice through the distance field; None: as high as the camera was.
         band: lowest and highest obstacle of the ROS map, metres above the floor.
+        robots: that get maps of their own, see `driving.robot.parse_robot`.
+        inflation: how costs fall off in their costmaps, see `driving.inflation.parse_inflation`.
         frame: of meshes and occupancy: "map", or "floor" (z up, 0 on the floor); see `volumes.floor_frame`.
         latency: whether it is to be known how long all maps take with a frame.
         device: of torch, for the TSDF, e.g. cuda; None: the compiled core.
@@ -76,6 +80,8 @@ class VolumesRequest:
     onto: Path | None = None
     slice_height: float | None = None
     band: tuple[float, float] = (0.1, 1.5)
+    robots: tuple[str, ...] = ()
+    inflation: str = "0.55,10"
     frame: str = "map"
     latency: bool = False
     device: str | None = None
@@ -181,7 +187,8 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
         if frame is OutputFrame.floor and source is not None:
             _level_occupancy(maps, source, len(fused.poses), surface.T_floor_map, observer)
         wanted = OutputRequest(
-            request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame
+            request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame,
+            parse_robots(request.robots), parse_inflation(request.inflation),
         )
         outputs = write_outputs(maps, surface, out, wanted, _record(request, config, fused), observer)
     return _outcome(out, fused, outputs)
@@ -227,6 +234,9 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
             raise ConfigError("`slice_height` needs `esdf`")
         if not abs(request.slice_height) < 1e4:
             raise ConfigError(f"`slice_height`: expected a height in metres, found {request.slice_height:g}")
+    parse_inflation(request.inflation)
+    if parse_robots(request.robots) and not request.esdf:
+        raise ConfigError("`robot` needs `esdf`")
     if request.recording is not None and not is_run:
         raise ConfigError(f"`recording` says where the recording of a run is; {request.source} is no run")
     if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
