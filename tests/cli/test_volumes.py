@@ -250,3 +250,24 @@ def test_wrong_robots_are_refused(room: Path, tmp_path: Path) -> None:
     one_error(ggslam("volumes", *few, "--esdf", "--robot", "a:1,0.2", "--robot", "A:1,0.3"), "twice")
     one_error(ggslam("volumes", *few, "--esdf", "--robot", "1,0.2", "--inflation", "1"), "RADIUS,FACTOR")
     assert not (tmp_path / "a" / "volumes.json").exists()
+
+
+def test_the_robots_own_body_is_left_out(room: Path, tmp_path: Path) -> None:
+    """A box before the lower half of the camera hides the floor and what stands on it."""
+    few = [room, "--stop", 4, *QUICK, "--occupancy", 0.1]
+    made(*few, "--out", tmp_path / "a")
+    made(*few, "--out", tmp_path / "b", "--body", "-2,0,0.3,2,1,0.5")
+    whole, cut = (read_mesh(tmp_path / name / "mesh.ply") for name in "ab")
+    assert whole is not None and cut is not None and 0.1 < len(cut.vertices) / len(whole.vertices) < 0.8
+    urdf = tmp_path / "cart.urdf"
+    urdf.write_text(
+        '<robot name="a"><link name="camera"><collision><origin xyz="0 0.5 0.4"/><geometry><box size="4 1 0.2"/>'
+        "</geometry></collision></link></robot>"
+    )
+    made(*few, "--out", tmp_path / "c", "--body", urdf, "--body-frame", "camera")
+    same = read_mesh(tmp_path / "c" / "mesh.ply")
+    assert same is not None and np.array_equal(same.vertices, cut.vertices)
+    bad = [*few, "--out", tmp_path / "d", "--body"]
+    one_error(ggslam("volumes", *bad, tmp_path / "no.urdf", "--body-frame", "a"), "no.urdf")
+    one_error(ggslam("volumes", *bad, "1,2"), "XMIN")
+    assert not (tmp_path / "d").exists()
