@@ -111,7 +111,7 @@ class Body:
         """Those of a scan's points [n, 3 or more], in the sensor's frame, that tell something."""
         return np.asarray(points[~self.hides(points[:, :3])])
 
-    def seen_from(self, T_new_sensor: np.ndarray) -> Body:
+    def in_frame(self, T_new_sensor: np.ndarray) -> Body:
         """The same in another sensor's frame."""
         shapes = tuple(replace(s, T_sensor_shape=T_new_sensor @ s.T_sensor_shape) for s in self.shapes)
         return Body(shapes, self.margin)
@@ -147,7 +147,7 @@ class CameraBody:
     """
 
     def __init__(self, body: Body, T_first_camera: np.ndarray | None = None) -> None:
-        self._bodies = [body] if T_first_camera is None else [body.seen_from(T) for T in inverse(T_first_camera)]
+        self._bodies = [body] if T_first_camera is None else [body.in_frame(T) for T in inverse(T_first_camera)]
 
     def without(self, frame: Frame) -> Frame:
         """A frame whose depth, and where its sensor found nothing, leave out what the body hides."""
