@@ -20,6 +20,7 @@ from ggslam.mapping.keyframe import make_keyframe
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import se3_exp
 from ggslam.sequences import open_sequence
+from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.loop_closing import LoopEvent
 from ggslam.slam.result import StepReport, TrackedFrame
 from ggslam.volumes.maps import VolumeMaps
@@ -101,6 +102,19 @@ def test_the_robots_body_is_left_out_live_and_after_a_correction(frames: list[Fr
     for frame in frames[:2]:
         straight.add(cut.without(frame), frame.T_world_camera, frame.load_mask())
     assert len(maps.times.rebuilds) == 1 and values(maps).keys() == values(straight).keys()
+
+
+def test_what_moves_is_left_out_live(frames: list[Frame]) -> None:
+    pixels, left = MovingPixels(), np.zeros(frames[0].depth.shape, bool)
+    left[:, : left.shape[1] // 2] = True
+    pixels.add(1, left)
+    maps, slam = VolumeMaps(SETTINGS), Played()
+    live = LiveVolumes(maps, lambda frame, T: None, objects=False, still=lambda slam, frame: pixels.without(frame))
+    slam.play(live, frames[1], frames[1].T_world_camera)
+    halved = VolumeMaps(SETTINGS)
+    halved.add(pixels.without(frames[1]), frames[1].T_world_camera)
+    assert values(maps).keys() == values(halved).keys() and len(values(maps)) > 10
+    assert not (frames[1].depth[left] == 0).all()
 
 
 def test_lost_frames_are_left_out(frames: list[Frame]) -> None:

@@ -320,7 +320,10 @@ def _level_occupancy(
 def _live(request: VolumesRequest, maps: VolumeMaps, body: Body | None, observer: Observer) -> _Fused:
     """Tracks the recording into a run folder and fuses on the way."""
     fused = _Fused(maps, str(request.source))
-    follower = LiveVolumes(maps, fused.saw, request.objects, request.voxel is None, body)
+    follower = LiveVolumes(
+        maps, fused.saw, request.objects, request.voxel is None, body,
+        lambda slam, frame: slam.movers.pixels.without(frame),
+    )  # fmt: skip
     pace = [] if request.realtime is None else [f"realtime_fps={request.realtime}"]
     run = RunRequest(
         request.sequence, request.out, request.config, [*request.overrides, *pace], evaluate=False,

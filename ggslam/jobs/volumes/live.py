@@ -29,14 +29,15 @@ class LiveVolumes:
         objects: whether object ids are voted for.
         fit_voxel: whether voxels, unless set, follow the size of the scene.
         body: of the robot, which is left out of depth; None: nothing is.
+        still: gives a frame that was tracked without what moves in it; None: as it came.
     """
 
     def __init__(
         self, maps: VolumeMaps, saw: Callable[[Frame, np.ndarray], None], objects: bool = True,
-        fit_voxel: bool = True, body: Body | None = None,
+        fit_voxel: bool = True, body: Body | None = None, still: Callable[[Slam, Frame], Frame] | None = None,
     ) -> None:  # fmt: skip
         self.maps = maps
-        self._body, self._seen_body = body, None if body is None else CameraBody(body)
+        self._still, self._body, self._seen_body = still, body, None if body is None else CameraBody(body)
         self._saw, self._objects, self._fit_voxel = saw, objects, fit_voxel
         self._corrections = 0
         self._no_returns = NoReturns()
@@ -44,7 +45,7 @@ class LiveVolumes:
 
     def __call__(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         """A frame went through `slam.step`, or its real-time counterpart."""
-        frame = self._without_body(slam, frame)
+        frame = self._without_body(slam, frame if self._still is None else self._still(slam, frame))
         if slam.mapper.identity is not None:
             self._current = slam.mapper.identity.current
         start = time.perf_counter()
