@@ -30,6 +30,8 @@ class BandTuning(Tuning):
     reach_voxels = 0.75
     """Distance from a surface point in voxels up to which a cell is occupied: with less, walls have holes where cells
     are smaller than voxels, for the points are up to 1.4 voxels apart."""
+    most_layer_bytes = 256 << 20
+    """Most memory for what was seen at the heights of a volume; of large maps each band looks again."""
     same_place = 1 / 16
     """Surface points above one another count as one if they are this share of a cell apart."""
 
@@ -119,13 +121,13 @@ class HeightLayers:
         sites = self._surface.sites
         sites = sites[(sites[:, 2] >= low) & (sites[:, 2] <= high), :2]
         sited = self.grid.mark(sites)
-        unseen = unseen_surface(sited, near)
+        sites = self._outside(sites, unseen_surface(sited, near))
         measured = self._surface.with_points(self.grid, low, high)
-        points = np.concatenate([self._outside(sites, unseen), self.grid.centres()[measured & ~(sited & ~unseen)]])
-        points = self._thin_out(points)
+        points = self._thin_out(np.concatenate([sites, self.grid.centres()[measured & ~self.grid.mark(sites)]]))
         distance = self._distance(points)
-        occupied = (sited & ~unseen) | measured
-        occupied |= distance <= max(self.grid.resolution / 2, BandTuning.reach_voxels * self._field.voxel)
+        reached = distance <= max(self.grid.resolution / 2, BandTuning.reach_voxels * self._field.voxel)
+        unseen = unseen_surface(sited | reached, near)
+        occupied = ((sited | reached) & ~unseen) | measured
         return BandMap(self.grid, (low, high), occupied, known, behind | unseen | near, distance, points)
 
     def _see(self, low: float, high: float) -> np.ndarray:
@@ -134,12 +136,18 @@ class HeightLayers:
         first, last = int(np.ceil(low / spacing - 1e-6)), int(np.floor(high / spacing + 1e-6))
         if first > last:
             first = last = int(np.rint((low + high) / 2 / spacing))
-        missing = [number for number in range(first, last + 1) if number not in self._layers]
-        if missing:
-            start, count = missing[0], missing[-1] + 1 - missing[0]
-            found = seen_above(self._field.tsdf, self.grid, start * spacing, spacing, count)
-            self._layers |= {start + k: layer for k, layer in enumerate(found)}
-        return np.bitwise_or.reduce([self._layers[number] for number in range(first, last + 1)])
+        most = max(1, BandTuning.most_layer_bytes // max(1, self.grid.shape[0] * self.grid.shape[1]))
+        found = np.zeros(self.grid.shape, np.uint8)
+        for start in range(first, last + 1, most):
+            count = min(most, last + 1 - start)
+            if any(number not in self._layers for number in range(start, start + count)):
+                new = seen_above(self._field.tsdf, self.grid, start * spacing, spacing, count)
+                if len(self._layers) + count > most:
+                    self._layers = {}
+                self._layers |= {start + k: layer for k, layer in enumerate(new)}
+            for number in range(start, start + count):
+                found |= self._layers[number]
+        return found
 
     def _outside(self, places: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """Those of places [N, 2] that lie in none of some cells, bool [H, W]."""

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ggslam.errors import InputError
 from ggslam.volumes.cell_grid import CellGrid, SlicePlane
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
@@ -27,11 +26,11 @@ class FieldSlice:
     Attributes:
         plane: where; its rectangle is that of the cells.
         resolution: edge of a cell, metres.
-        distance: float32 [H, W], metres, at the cells' centres; of a band, the least over the heights. NaN: not known.
+        distance: float32 [H, W], metres, at the cells' centres. NaN: not known.
         known: bool [H, W].
         occupied: bool [H, W], whether a cell has a surface in it.
-        behind: bool [H, W], whether a cell is behind a surface (at one of the heights), at one that no point was
-            measured near, or may have a measured point in it: not free, whatever is known.
+        behind: bool [H, W], whether a cell is behind a surface, at one that no point was measured near, or may have a
+            measured point in it: not free, whatever is known.
     """
 
     plane: SlicePlane
@@ -68,40 +67,26 @@ def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> Slic
     return SlicePlane(field.origin + height * z, x, y, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
 
 
-def slice_field(
-    field: DistanceField, plane: SlicePlane, resolution: float, band: tuple[float, float] | None = None
-) -> FieldSlice:
+def slice_field(field: DistanceField, plane: SlicePlane, resolution: float) -> FieldSlice:
     """Slices the field.
 
     A cell is occupied if its centre is from half a cell before a surface (or half a voxel, if that is more) to a cell
     behind it, or if a point was measured in it: the middle of an eighth of a voxel that has points lies in it, or any
-    part of one that is a thin thing. No cell that overlaps an eighth with points is free. With a band, heights from
-    `low` to `high` are looked at, a voxel apart: a cell is occupied if it is at any of them, and free if it is known at
-    one at least, and occupied or behind a surface at none. A robot as high as the band may therefore drive over a cell
-    that was seen at some of its heights only.
+    part of one that is a thin thing. No cell that overlaps an eighth with points is free. What there is between two
+    heights, `driving.bands` tells.
 
     Args:
         field: to slice.
         plane: where.
         resolution: edge of a cell, metres.
-        band: lowest and highest offset along the plane's normal, metres; None: the plane alone.
 
     Raises:
-        InputError: a resolution or band that is not positive, or more than 50 million cells.
+        InputError: a resolution that is not positive, or more than 50 million cells.
     """
-    if band is not None and not band[0] <= band[1]:
-        raise InputError(f"expected an ascending band, found {band} (resolution {resolution})")
-    grid, (low, high) = CellGrid.over(plane, resolution), band or (0.0, 0.0)
-    centres = grid.places().reshape(-1, 3)
-    offsets = np.linspace(low, high, int(np.ceil((high - low) / field.voxel - 1e-6)) + 1)
-    least = np.full(len(centres), np.nan, np.float32)
-    hit, cell = np.zeros(len(centres), bool), max(resolution, field.voxel)
-    for offset in offsets:
-        found = field.query(centres + offset * plane.normal).distance
-        least = np.fmin(least, found)
-        hit |= (found <= cell / 2) & (found >= -cell)
-    distance, occupied, surface = least.reshape(grid.shape), hit.reshape(grid.shape), SeenSurface.of(field, plane)
-    near, points = surface.near_points(grid, low, high), surface.with_points(grid, low, high)
+    grid, surface, cell = CellGrid.over(plane, resolution), SeenSurface.of(field, plane), max(resolution, field.voxel)
+    distance = field.query(grid.places().reshape(-1, 3)).distance.reshape(grid.shape)
+    occupied = (distance <= cell / 2) & (distance >= -cell)
+    near, points = surface.near_points(grid, 0.0, 0.0), surface.with_points(grid, 0.0, 0.0)
     unseen = unseen_surface(occupied, near)
     occupied, behind = (occupied & ~unseen) | points, (distance < 0) | unseen | near
     return FieldSlice(grid.plane, resolution, distance, ~np.isnan(distance), occupied, behind)

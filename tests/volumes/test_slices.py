@@ -70,20 +70,6 @@ def test_planes_are_oriented_as_told(field: DistanceField) -> None:
     assert cut.distance[at(cut, 0.3, 0.4)] == pytest.approx(truth, abs=0.02)
 
 
-def test_any_obstacle_in_the_band_counts(field: DistanceField) -> None:
-    level = plane_at_height(field, np.array([0, 0, 1]), 0.0)
-    alone, band = slice_field(field, level, 0.05), slice_field(field, level, 0.05, (-0.4, 0.3))
-    low_box = at(alone, -0.85, 0.28)
-    assert not alone.occupied[low_box] and band.occupied[low_box]
-    assert band.occupied[at(band, 0.7 - 0.17, 0.5)]
-    assert not band.occupied[at(band, 0, 0)] and band.known[at(band, 0, 0)]
-    assert slice_field(field, level, 0.05, (-0.7, 0.3)).occupied[at(band, 0, 0)]  # the floor is in the band
-    high = slice_field(field, plane_at_height(field, np.array([0, 0, 1]), 0.9), 0.05)
-    assert not high.known.any() and not high.occupied.any()
-    partly = slice_field(field, plane_at_height(field, np.array([0, 0, 1]), 0.9), 0.05, (-0.3, 0.0))
-    assert partly.known[at(partly, 0, 0)] and not partly.occupied[at(partly, 0, 0)]
-
-
 def test_pictures_show_distances_and_what_is_unknown(field: DistanceField, tmp_path: Path) -> None:
     upright = SlicePlane(np.array([0.7, 0, 0]), np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), (-1.0, -0.9), (1.0, 0.9))
     cut = slice_field(field, upright, 0.02)
@@ -101,8 +87,8 @@ def test_pictures_show_distances_and_what_is_unknown(field: DistanceField, tmp_p
 
 def test_wrong_numbers_are_refused(field: DistanceField) -> None:
     level = plane_at_height(field, np.array([0, 0, 1]), 0.0)
-    for resolution, band in ((0.0, None), (float("nan"), None), (0.1, (1.0, 0.0)), (1e-5, None)):
+    for resolution in (0.0, float("nan"), 1e-5):
         with pytest.raises(ValueError, match="resolution"):
-            slice_field(field, level, resolution, band)
+            slice_field(field, level, resolution)
     empty = DistanceField(TsdfMap())
     assert not slice_field(empty, plane_at_height(empty, np.array([1, 0, 0]), 0.0), 0.1).known.any()
