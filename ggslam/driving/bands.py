@@ -95,7 +95,7 @@ class HeightLayers:
     def __init__(self, field: DistanceField, plane: SlicePlane, resolution: float) -> None:
         self.grid = CellGrid.over(plane, resolution)
         self._field = field
-        self._surface = SeenSurface.of(field, self.grid.plane)
+        self._surface = SeenSurface(field, self.grid.plane)
         self._layers: dict[int, np.ndarray] = {}
         edge = SIDE * field.voxel
         middles = (field.coordinates() + 0.5) * edge + field.origin
@@ -118,8 +118,7 @@ class HeightLayers:
         seen = self._see(low, high)
         known, behind = (seen & SEEN_BIT) > 0, (seen & BEHIND_BIT) > 0
         near = self._surface.near_points(self.grid, low, high)
-        sites = self._surface.sites
-        sites = sites[(sites[:, 2] >= low) & (sites[:, 2] <= high), :2]
+        sites = self._surface.sites(low, high)
         sited = self.grid.mark(sites)
         sites = self._outside(sites, unseen_surface(sited, near))
         measured = self._surface.with_points(self.grid, low, high)
@@ -165,7 +164,9 @@ class HeightLayers:
     def _distance(self, points: np.ndarray) -> np.ndarray:
         if not len(points):
             return np.full(self.grid.shape, np.inf, np.float32)
-        found = cKDTree(points).query(self.grid.centres().reshape(-1, 2), workers=2)[0]
+        found = cKDTree(points, compact_nodes=False, balanced_tree=False).query(
+            self.grid.centres().reshape(-1, 2), workers=2
+        )[0]
         return found.astype(np.float32).reshape(self.grid.shape)
 
 

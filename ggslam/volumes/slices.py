@@ -83,7 +83,7 @@ def slice_field(field: DistanceField, plane: SlicePlane, resolution: float) -> F
     Raises:
         InputError: a resolution that is not positive, or more than 50 million cells.
     """
-    grid, surface, cell = CellGrid.over(plane, resolution), SeenSurface.of(field, plane), max(resolution, field.voxel)
+    grid, surface, cell = CellGrid.over(plane, resolution), SeenSurface(field, plane), max(resolution, field.voxel)
     distance = field.query(grid.places().reshape(-1, 3)).distance.reshape(grid.shape)
     occupied = (distance <= cell / 2) & (distance >= -cell)
     near, points = surface.near_points(grid, 0.0, 0.0), surface.with_points(grid, 0.0, 0.0)
