@@ -65,7 +65,7 @@ def _common(enter: np.ndarray, leave: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _slab_span(start: np.ndarray, way: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of start [k] + t way [..., k] within +- half [k]."""
     enter, leave = np.full(way.shape[:-1], -np.inf), np.full(way.shape[:-1], np.inf)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         for axis in range(len(half)):
             # Along a slab: everywhere in it, or nowhere.
             still, inside = way[..., axis] == 0, abs(start[axis]) <= half[axis]
@@ -79,7 +79,7 @@ def _slab_span(start: np.ndarray, way: np.ndarray, half: np.ndarray) -> tuple[np
 def _round_span(start: np.ndarray, way: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Of start [k] + t way [..., k] within `radius` of zero."""
     a, b, c = (way**2).sum(-1), way @ start, float(start @ start) - radius**2
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         root = np.sqrt(b * b - a * c)
         enter, leave = (-b - root) / a, (-b + root) / a
     still = a == 0  # along a cylinder's axis, or of no length
