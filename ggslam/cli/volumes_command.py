@@ -254,7 +254,8 @@ def _print(outcome: VolumesOutcome) -> None:
          ", ".join(f"{ms:.1f}" for ms in part["by_window_ms"][:8])]
         for name, part in outcome.times.items()
     ]  # fmt: skip
-    console.print(table("ms a frame", ["", "mean", "95 %", "largest", f"by {outcome.window} frames"], rows))
+    unit = f"{'an' if outcome.unit == 'instant' else 'a'} {outcome.unit}"
+    console.print(table(f"ms {unit}", ["", "mean", "95 %", "largest", f"by {outcome.window} {outcome.unit}s"], rows))
     for line in outcome.lines:
         console.print(line, highlight=False, markup=False)
     console.print(f"wrote {quantity(len(outcome.files), 'file')} to {outcome.out}", highlight=False, markup=False)

@@ -9,7 +9,7 @@ images the mapper keeps, are fused again where they are now.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,7 +17,6 @@ import numpy as np
 import torch
 
 from ggslam.errors import ConfigError
-from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.esdf import DistanceField
@@ -104,6 +103,8 @@ class VolumeMaps:
         self.field = DistanceField(self.tsdf, settings.esdf) if esdf else None
         self.occupancy = None if occupancy is None else self._occupancy(occupancy)
         self.times = VolumeTimes()
+        self.points = 0
+        """Measured points that were fused; what was fused anew after a loop closure is not counted again."""
 
     def fit(self, scale: float, voxel: bool = True) -> None:
         """Fits the TSDF's voxels and range to the size of the scene, before the first frame; in rooms, and where a
@@ -144,10 +145,22 @@ class VolumeMaps:
             labels: object ids uint16 [H, W], 0 = none.
             waited: seconds since the frame came.
         """
+        view = PosedView(frame.depth_or_infinity(), frame.camera, T_world_camera, frame.color, labels)
+        self.add_together([view], waited)
+
+    def add_together(self, views: Sequence[PosedView], waited: float = 0.0) -> None:
+        """Fuses what the cameras of a rig see at one instant, one after the other; weights decay and the distance field
+        follows once for all of them. Its times are one row.
+
+        Args:
+            views: of the cameras.
+            waited: seconds since their images came.
+        """
         number = len(self.times.rows)
         row = {"slam": waited} if waited else {}
-        start, depth = time.perf_counter(), frame.depth_or_infinity()
-        self._fuse(depth, frame.camera, T_world_camera, frame.color, labels)
+        start = time.perf_counter()
+        for view in views:
+            self._fuse(view)
         every = self.settings.decay_every
         if every and number % every == every - 1:
             self.tsdf.decay()
@@ -159,20 +172,21 @@ class VolumeMaps:
             row["esdf"] = time.perf_counter() - start
         if self.occupancy is not None:
             start = time.perf_counter()
-            self._insert(depth, frame.camera, T_world_camera)
+            for view in views:
+                self._insert(view)
             row["occupancy"] = time.perf_counter() - start
         self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
+        self.points += sum(view.point_count for view in views)
 
-    def _fuse(
-        self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray | None,
-        labels: np.ndarray | None,
-    ) -> None:  # fmt: skip
-        self._receiver.integrate(depth, camera, T_world_camera, color, labels)
+    def _fuse(self, view: PosedView) -> None:
+        self._receiver.integrate(view.depth, view.camera, view.T_world_camera, view.color, view.labels)
 
-    def _insert(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
+    def _insert(self, view: PosedView) -> None:
         assert self.occupancy is not None
-        self.occupancy.insert_depth(depth, camera, T_world_camera, free_depth=self.settings.tsdf.max_depth)
+        self.occupancy.insert_depth(
+            view.depth, view.camera, view.T_world_camera, free_depth=self.settings.tsdf.max_depth
+        )
 
     def rebuild(self, views: Iterable[PosedView]) -> None:
         """Begins anew from keyframes where they are now, for after a loop was closed."""
@@ -183,9 +197,9 @@ class VolumeMaps:
         if self.occupancy is not None:
             self.occupancy = self._occupancy(self.occupancy.resolution)
         for view in views:
-            self._fuse(view.depth, view.camera, view.T_world_camera, view.color, view.labels)
+            self._fuse(view)
             if self.occupancy is not None:
-                self._insert(view.depth, view.camera, view.T_world_camera)
+                self._insert(view)
         if self.field is not None and self._on_device is None:
             self.field.update()
         self.times.rebuilds.append(time.perf_counter() - start)

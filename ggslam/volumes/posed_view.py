@@ -29,6 +29,11 @@ class PosedView:
     color: np.ndarray | None = None
     labels: np.ndarray | None = None
 
+    @property
+    def point_count(self) -> int:
+        """Number of its pixels with depth."""
+        return int(np.count_nonzero((self.depth > 0) & (self.depth < np.inf)))
+
     def points(self) -> np.ndarray:
         """Where its pixels with depth lie, float64 [n, 3], world frame."""
         seen = self.camera.back_project(self.depth)[(self.depth > 0) & np.isfinite(self.depth)]

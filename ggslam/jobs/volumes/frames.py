@@ -20,8 +20,10 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
+from ggslam.sequences.rig import together_by_instant
 from ggslam.system.plurals import quantity, word_for
 from ggslam.system.tuning import Tuning
+from ggslam.volumes.posed_view import PosedView
 
 
 class FarFrameTuning(Tuning):
@@ -47,6 +49,11 @@ class PosedFrame:
     T_world_camera: np.ndarray
     labels: np.ndarray | None = None
 
+    def view(self) -> PosedView:
+        """What is fused of it."""
+        frame = self.frame
+        return PosedView(frame.depth_or_infinity(), frame.camera, self.T_world_camera, frame.color, self.labels)
+
 
 @dataclass
 class FrameSource:
@@ -70,6 +77,10 @@ class FrameSource:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def instants(self) -> Iterator[list[PosedFrame]]:
+        """The same, those that the cameras of a rig took at one instant together."""
+        return together_by_instant(self, lambda posed: posed.frame)
 
     def __iter__(self) -> Iterator[PosedFrame]:
         """All frames whose pose is known, in order."""

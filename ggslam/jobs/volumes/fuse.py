@@ -18,6 +18,7 @@ from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.volumes.frames import FrameSource, frames_of_recording, frames_of_run
 from ggslam.jobs.volumes.live import LiveVolumes
 from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, Surface, prepare_folder, write_outputs
+from ggslam.jobs.volumes.point_rates import PointRates
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
@@ -92,11 +93,12 @@ class VolumesOutcome:
         out: folder of the results.
         files: that were written.
         lines: facts for people.
-        times: milliseconds a frame, see `VolumeTimes.summary`.
+        times: milliseconds a `unit`, see `VolumeTimes.summary`.
         window: frames that a mean of `by_window_ms` is over.
         map_latency_s: 95 % of the frames were in all maps after this many seconds.
         depth_range_m: 95 % of the depth was nearer.
         error: why fusing stopped early, if it did.
+        unit: of the times: "frame", or "instant" of a rig.
     """
 
     out: Path
@@ -107,16 +109,19 @@ class VolumesOutcome:
     map_latency_s: float
     depth_range_m: float
     error: BaseException | None = None
+    unit: str = "frame"
 
 
 @dataclass
 class _Fused:
-    """Result of fusing: the maps, camera poses, names of objects, and the reason if it stopped early."""
+    """Result of fusing: the maps, camera poses, times of the instants, names of objects, and the reason if it stopped
+    early."""
 
     maps: VolumeMaps
     name: str
     poses: list[np.ndarray] = field(default_factory=list)
     timestamps: list[float] = field(default_factory=list)
+    instant: int | None = None
     depth_ranges: list[float] = field(default_factory=list)
     names: dict[int, str] = field(default_factory=dict)
     error: BaseException | None = None
@@ -124,7 +129,9 @@ class _Fused:
     def saw(self, frame: Frame, T_world_camera: np.ndarray) -> None:
         """Remembers where a frame was seen from, and how far it saw of what was fused."""
         self.poses.append(T_world_camera)
-        self.timestamps.append(frame.timestamp)
+        if frame.instant is None or frame.instant != self.instant:
+            self.timestamps.append(frame.timestamp)
+        self.instant = frame.instant
         limits = self.maps.settings.tsdf
         for seen in (frame.depth[::8, ::8], frame.depth):  # all of it only where none is in range
             seen = seen[(seen >= limits.min_depth) & (seen <= limits.max_depth)]
@@ -271,11 +278,12 @@ def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer, fit_voxel: 
     fused = _Fused(maps, source.name, names=source.names)
     observer.begin("fuse", len(source))
     try:
-        for posed in source:
+        for together in source.instants():
             if not fused.poses:
-                maps.fit(scene_scale(posed.frame.depth), fit_voxel)
-            maps.add(posed.frame, posed.T_world_camera, posed.labels)
-            fused.saw(posed.frame, posed.T_world_camera)
+                maps.fit(scene_scale(together[0].frame.depth), fit_voxel)
+            maps.add_together([posed.view() for posed in together])
+            for posed in together:
+                fused.saw(posed.frame, posed.T_world_camera)
             observer.advance(len(fused.poses), len(source))
     except (Exception, KeyboardInterrupt) as stopped:  # what was fused is written, then it is raised
         fused.error = stopped
@@ -325,7 +333,7 @@ def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str,
     return {
         "source": fused.name, "live": request.live, "frames": len(fused.poses), "onto": request.onto,
         "settings": config_to_dict(replace(config, volumes=fused.maps.settings))["volumes"],
-        "times": fused.maps.times.summary(),
+        "times": fused.maps.times.summary(), "points": PointRates.of(fused.maps).to_dict(),
         "frames_a_window": VolumeTimesTuning.window,
         "blocks_by_window": fused.maps.times.blocks[VolumeTimesTuning.window - 1 :: VolumeTimesTuning.window],
         "rebuilds_s": fused.maps.times.rebuilds,
@@ -334,8 +342,9 @@ def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str,
 
 
 def _outcome(out: Path, fused: _Fused, outputs: Outputs) -> VolumesOutcome:
-    times = fused.maps.times
+    times, lines = fused.maps.times, [PointRates.of(fused.maps).line(), *outputs.lines]
     return VolumesOutcome(
-        out, outputs.files, outputs.lines, times.summary(), VolumeTimesTuning.window, fused.latency(),
+        out, outputs.files, lines, times.summary(), VolumeTimesTuning.window, fused.latency(),
         float(np.median(fused.depth_ranges)) if fused.depth_ranges else 0.0, fused.error,
+        "frame" if fused.instant is None else "instant",
     )  # fmt: skip

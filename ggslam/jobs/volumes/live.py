@@ -36,6 +36,9 @@ class LiveVolumes:
         self._saw, self._objects, self._fit_voxel = saw, objects, fit_voxel
         self._corrections = 0
         self._no_returns = NoReturns()
+        self._together: list[tuple[Frame, PosedView]] = []
+        """Of the instant that is going on; of one camera alone there is one."""
+        self._waited = 0.0
         self._current: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __call__(self, slam: Slam, frame: Frame, report: StepReport) -> None:
@@ -46,16 +49,29 @@ class LiveVolumes:
         if len(slam.corrections) > self._corrections:
             self._corrections = len(slam.corrections)
             self.maps.rebuild(self._views(slam.mapper.keyframes))
-        if report.frame.status == TrackingStatus.LOST.value:
+        if report.frame.status != TrackingStatus.LOST.value:
+            self._together.append((frame, self._view(slam, frame, report)))
+        self._waited += report.seconds + time.perf_counter() - start
+        if frame.instant is None or slam.frames[-1].frame_index == frame.index:
+            self._fuse(slam)
+
+    def _view(self, slam: Slam, frame: Frame, report: StepReport) -> PosedView:
+        newest = slam.mapper.keyframes[-len(slam.cameras) :] if self._objects else []
+        labels = next((keyframe.mask for keyframe in newest if keyframe.frame_index == frame.index), None)
+        return PosedView(frame.depth_or_infinity(), frame.camera, slam.pose_of(report.frame), frame.color, labels)
+
+    def _fuse(self, slam: Slam) -> None:
+        """Fuses the frames of an instant, once all of them went through the step."""
+        together, self._together = self._together, []
+        waited, self._waited = self._waited, 0.0
+        if not together:
             return
         if not self.maps.times.rows:
             self.maps.fit(slam.scale, self._fit_voxel)
-        T = slam.pose_of(report.frame)
-        newest = slam.mapper.keyframes[-len(slam.cameras) :] if self._objects else []
-        labels = next((keyframe.mask for keyframe in newest if keyframe.frame_index == frame.index), None)
-        self.maps.add(frame, T, labels, report.seconds + time.perf_counter() - start)
-        self._no_returns.note(frame, slam.mapper.keyframes)
-        self._saw(frame, T)
+        self.maps.add_together([view for _, view in together], waited)
+        for frame, view in together:
+            self._no_returns.note(frame, slam.mapper.keyframes)
+            self._saw(frame, view.T_world_camera)
 
     def follow_parts(self, result: SlamResult) -> bool:
         """At the end: fuses the keyframes anew if the recording fell into parts, some of which were left out or joined
