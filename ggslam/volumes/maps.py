@@ -22,7 +22,7 @@ from ggslam.system.tuning import Tuning
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
-from ggslam.volumes.posed_view import PosedView
+from ggslam.volumes.posed_view import PosedScan, PosedView
 from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.tsdf_torch import TorchTsdf
 from ggslam.volumes.volume_settings import VolumeSettings
@@ -148,13 +148,13 @@ class VolumeMaps:
         view = PosedView(frame.depth_or_infinity(), frame.camera, T_world_camera, frame.color, labels)
         self.add_together([view], waited)
 
-    def add_together(self, views: Sequence[PosedView], waited: float = 0.0) -> None:
-        """Fuses what the cameras of a rig see at one instant, one after the other; weights decay and the distance field
+    def add_together(self, views: Sequence[PosedView | PosedScan], waited: float = 0.0) -> None:
+        """Fuses what the sensors of a rig see at one instant, one after the other; weights decay and the distance field
         follows once for all of them. Its times are one row.
 
         Args:
-            views: of the cameras.
-            waited: seconds since their images came.
+            views: of the sensors.
+            waited: seconds since what they measured came.
         """
         number = len(self.times.rows)
         row = {"slam": waited} if waited else {}
@@ -179,14 +179,13 @@ class VolumeMaps:
         self.times.rows.append(row)
         self.points += sum(view.point_count for view in views)
 
-    def _fuse(self, view: PosedView) -> None:
-        self._receiver.integrate(view.depth, view.camera, view.T_world_camera, view.color, view.labels)
+    def _fuse(self, view: PosedView | PosedScan) -> None:
+        for image in view.images(self.settings.tsdf, self.context):
+            self._receiver.integrate(image.depth, image.camera, image.T_world_camera, image.color, image.labels)
 
-    def _insert(self, view: PosedView) -> None:
+    def _insert(self, view: PosedView | PosedScan) -> None:
         assert self.occupancy is not None
-        self.occupancy.insert_depth(
-            view.depth, view.camera, view.T_world_camera, free_depth=self.settings.tsdf.max_depth
-        )
+        view.insert_into(self.occupancy, self.settings.tsdf.max_depth)
 
     def rebuild(self, views: Iterable[PosedView]) -> None:
         """Begins anew from keyframes where they are now, for after a loop was closed."""
