@@ -31,11 +31,9 @@ bool hit_again(OccupancyBlock& block, std::uint64_t code, const std::uint64_t* o
   for (int w = 0; w < kMaskWords; ++w)
     for (std::uint64_t left = occupied[w]; left != 0; left &= left - 1) {
       const int bit = 64 * w + __builtin_ctzll(left);
-      const std::int32_t more = std::min(counts.of(code << 9 | bit), update.most_hits) - 1;
       float& value = block.value[bit];
-      if (more < 1 || value >= update.maximum) continue;
-      value = std::min(value + more * update.hit, update.maximum);
-      any = true;
+      std::int32_t more = std::min(counts.of(code << 9 | bit), update.most_hits) - 1;
+      for (; more > 0 && value < update.maximum; --more, any = true) value = std::min(value + update.hit, update.maximum);
     }
   return any;
 }
