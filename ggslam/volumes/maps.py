@@ -9,8 +9,9 @@ images the mapper keeps, are fused again where they are now.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ import torch
 from ggslam.errors import ConfigError
 from ggslam.scene.frame import Frame
 from ggslam.system.tuning import Tuning
+from ggslam.volumes.cell_pager import CellPager
+from ggslam.volumes.cell_rebuild import StoredView
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
@@ -41,8 +44,8 @@ class VolumeTimes:
 
     Attributes:
         rows: for each frame, seconds by part: "slam" (from the frame to its pose and, where they come first, mapping
-            and making the volumes anew after a loop closure), "tsdf", "esdf", "occupancy"; parts that were not done
-            with a frame are missing.
+            and making the volumes anew after a loop closure), "cells" (going to disk and coming back), "tsdf", "esdf",
+            "occupancy"; parts that were not done with a frame are missing.
         blocks: of the TSDF after each frame.
         rebuilds: seconds of each time that the maps were made anew.
         last_update: of the distance field, at the end.
@@ -55,7 +58,8 @@ class VolumeTimes:
 
     def parts(self) -> dict[str, np.ndarray]:
         """Seconds [n] of the frames with which a part was done, by part."""
-        names = [name for name in ("slam", "tsdf", "esdf", "occupancy") if any(name in row for row in self.rows)]
+        all_names = ("slam", "cells", "tsdf", "esdf", "occupancy")
+        names = [name for name in all_names if any(name in row for row in self.rows)]
         return {name: np.array([row[name] for row in self.rows if name in row]) for name in names}
 
     def whole(self) -> np.ndarray:
@@ -77,6 +81,19 @@ def _statistics(seconds: np.ndarray) -> dict[str, Any]:
             "by_window_ms": windows}  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Paging:
+    """What of TSDF and distance field goes to disk.
+
+    Attributes:
+        folder: for it.
+        allowed: bytes that both may take, of those that they take now; None: any.
+    """
+
+    folder: Path
+    allowed: Callable[[int], int | None]
+
+
 class VolumeMaps:
     """TSDF, distance field and occupancy of one recording.
 
@@ -96,6 +113,9 @@ class VolumeMaps:
         onto: TsdfMap | None = None, device: str | None = None,
     ) -> None:  # fmt: skip
         self.settings = settings
+        self.paging: Paging | None = None
+        """What goes to disk; to be set before the first frame, for an empty TSDF of the core."""
+        self.pager: CellPager | None = None
         self._goes_on = onto is not None
         self._on_device = None if device is None else _fusion_on(device, settings, onto, points=esdf)
         self.tsdf = TsdfMap(settings.tsdf, points=esdf) if onto is None else onto
@@ -159,12 +179,17 @@ class VolumeMaps:
         number = len(self.times.rows)
         row = {"slam": waited} if waited else {}
         start = time.perf_counter()
-        for view in views:
-            self._fuse(view)
+        images = [image for view in views for image in view.images(self.settings.tsdf, self.context)]
+        if self.paging is not None:
+            row["cells"] = self._bring(self.paging, images)
+        for image in images:
+            self._integrate(image)
         every = self.settings.decay_every
         if every and number % every == every - 1:
             self.tsdf.decay()
-        row["tsdf"] = time.perf_counter() - start
+            if self.pager is not None:
+                self.pager.decay()
+        row["tsdf"] = time.perf_counter() - start - row.get("cells", 0.0)
         every = self.settings.esdf_every
         if self.field is not None and every and self._on_device is None and number % every == every - 1:
             start = time.perf_counter()
@@ -175,28 +200,45 @@ class VolumeMaps:
             for view in views:
                 self._insert(view)
             row["occupancy"] = time.perf_counter() - start
+        if self.pager is not None:
+            start = time.perf_counter()
+            self.pager.finish_instant(self.field)
+            row["cells"] += time.perf_counter() - start
         self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
         self.points += sum(view.point_count for view in views)
 
-    def _fuse(self, view: PosedView | PosedScan) -> None:
-        for image in view.images(self.settings.tsdf, self.context):
-            self._receiver.integrate(image.depth, image.camera, image.T_world_camera, image.color, image.labels)
+    def _bring(self, paging: Paging, images: Sequence[PosedView]) -> float:
+        """Brings what is on disk of what images may tell of; returns the seconds that took."""
+        start = time.perf_counter()
+        if self.pager is None:
+            distances = 0.0 if self.field is None else self.settings.esdf.max_distance
+            self.pager = CellPager(self.tsdf, paging.folder, paging.allowed, distances)
+        self.pager.bring(images)
+        return time.perf_counter() - start
+
+    def _integrate(self, image: PosedView) -> None:
+        self._receiver.integrate(image.depth, image.camera, image.T_world_camera, image.color, image.labels)
 
     def _insert(self, view: PosedView | PosedScan) -> None:
         assert self.occupancy is not None
         view.insert_into(self.occupancy, self.settings.tsdf.max_depth)
 
-    def rebuild(self, views: Iterable[PosedView]) -> None:
-        """Begins anew from keyframes where they are now, for after a loop was closed."""
+    def rebuild(self, views: Sequence[StoredView]) -> None:
+        """Begins anew from keyframes where they are now, for after a loop was closed. With paging, cells are fused
+        again when they are needed."""
         start = time.perf_counter()
         self.tsdf.clear()
         if self._on_device is not None:
             self._on_device = TorchTsdf(self.settings.tsdf, self._on_device.device, self._on_device.points)
         if self.occupancy is not None:
             self.occupancy = self._occupancy(self.occupancy.resolution)
-        for view in views:
-            self._fuse(view)
+        if self.pager is not None:
+            self.pager.rebuild(views)
+        for stored in views if self.pager is None or self.occupancy is not None else ():
+            view = replace(stored.read(), T_world_camera=stored.T_world_camera)
+            if self.pager is None:
+                self._integrate(view)
             if self.occupancy is not None:
                 self._insert(view)
         if self.field is not None and self._on_device is None:
@@ -204,7 +246,9 @@ class VolumeMaps:
         self.times.rebuilds.append(time.perf_counter() - start)
 
     def finish(self) -> None:
-        """Brings the TSDF from its device, and the distance field up to date."""
+        """Brings the TSDF from its device or disk, and the distance field up to date."""
+        if self.pager is not None:
+            self.pager.bring_all()
         if self._on_device is not None:
             self.tsdf = self._on_device.to_native(self.context)
             self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
@@ -217,6 +261,8 @@ class VolumeMaps:
         Args:
             table: uint16 [65536], new id by old one; 0: none.
         """
+        if self.pager is not None:
+            self.pager.bring_all()
         blocks = self.tsdf.blocks()
         dense = blocks.coordinates[blocks.dense]
         for start in range(0, len(dense), 4096):

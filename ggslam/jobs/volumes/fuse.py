@@ -16,6 +16,7 @@ from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.volumes.frames import FrameSource, PosedFrame, frames_of_recording, frames_of_run
 from ggslam.jobs.volumes.fused import Fused, fuse_source, level_occupancy
 from ggslam.jobs.volumes.live import LiveVolumes
+from ggslam.jobs.volumes.memory import cells_on_disk
 from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, Surface, prepare_folder, write_outputs
 from ggslam.jobs.volumes.point_rates import PointRates
 from ggslam.jobs.volumes.scans import ScanSource, scans_of_recording
@@ -127,39 +128,47 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     is_run = (request.source / MARKER).is_file()
     _check(request, is_run)
     config = _config(request)
+    _check_memory(request, config)
     for note in [] if request.live else settings_notes(config, request.config, request.overrides):
         observer.note(note)  # a live run tells of them itself
     onto = None if request.onto is None else load_tsdf(request.onto)
     maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
-    source: FrameSource | ScanSource | None = None
-    if request.live:
-        fused = _live(request, maps, observer)
-        out = Path(fused.name) / "volumes"
-        make_folder(out)
-        prepare_folder(out)
-    else:
-        source = _source(request, is_run)
-        out = _folder(request, is_run)
-        for note in [*source.warnings, *source.notes]:
-            observer.note(note)
-        fused = fuse_source(source, maps, observer, request.voxel is None)
-    if not fused.poses:
-        raise fused.error if fused.error is not None else SequenceError(f"{request.source}: no frame could be fused")
-    with delay_interrupts():
-        maps.finish()
-        if not len(maps.tsdf) or (onto is None and not fused.depth_ranges):  # free space alone has no floor
-            limits = maps.settings.tsdf
-            raise SequenceError(
-                f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
-            )
-        surface, frame = Surface.of(maps, fused.poses), output_frame(request.frame)
-        if frame is OutputFrame.floor and source is not None:
-            level_occupancy(maps, source, len(fused.poses), surface.T_floor_map, observer)
-        wanted = OutputRequest(
-            request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame
-        )
-        outputs = write_outputs(maps, surface, out, wanted, _record(request, config, fused), observer)
+    source = None if request.live else _source(request, is_run)
+    out = None if request.live else _folder(request, is_run)
+    with cells_on_disk(config, out) as maps.paging:
+        if source is None or out is None:
+            fused = _live(request, maps, observer)
+            out = Path(fused.name) / "volumes"
+            make_folder(out)
+            prepare_folder(out)
+        else:
+            for note in [*source.warnings, *source.notes]:
+                observer.note(note)
+            fused = fuse_source(source, maps, observer, request.voxel is None)
+        if not fused.poses:
+            raise fused.error or SequenceError(f"{request.source}: no frame could be fused")
+        with delay_interrupts():
+            outputs = _write(request, config, fused, source, out, observer)
     return _outcome(out, fused, outputs)
+
+
+def _write(
+    request: VolumesRequest, config: Config, fused: Fused, source: FrameSource | ScanSource | None, out: Path,
+    observer: Observer,
+) -> Outputs:  # fmt: skip
+    """Brings all maps up to date and writes them."""
+    maps = fused.maps
+    maps.finish()
+    if not len(maps.tsdf) or (request.onto is None and not fused.depth_ranges):  # free space alone has no floor
+        limits = maps.settings.tsdf
+        raise SequenceError(
+            f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
+        )
+    surface, frame = Surface.of(maps, fused.poses), output_frame(request.frame)
+    if frame is OutputFrame.floor and source is not None:
+        level_occupancy(maps, source, len(fused.poses), surface.T_floor_map, observer)
+    wanted = OutputRequest(request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame)
+    return write_outputs(maps, surface, out, wanted, _record(request, config, fused), observer)
 
 
 def _config(request: VolumesRequest) -> Config:
@@ -214,6 +223,12 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
         raise ConfigError("`poses` is for recordings whose poses are known, not for runs or `live`")
     if request.mesh is not None:
         _check_mesh(request.mesh, request.source)
+
+
+def _check_memory(request: VolumesRequest, config: Config) -> None:
+    limited = config.memory_limit_mb or config.volumes.budget_mb
+    if limited and (request.onto is not None or request.device is not None):
+        raise ConfigError("`memory_limit_mb` and `volumes.budget_mb` go neither with `onto` nor with `device`")
 
 
 def _check_mesh(path: Path, source: Path) -> None:
