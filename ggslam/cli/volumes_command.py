@@ -32,13 +32,16 @@ EPILOG = """
 
   ggslam volumes data/redkitchen --scale 0.5 --live --esdf      (tracked and fused frame by frame)
 
+  ggslam volumes scans/walk --poses localized/walk/trajectory.txt --occupancy 0.2      (laser scans)
+
   ggslam volumes house.grid --esdf --workers 4      (a grid store, cell by cell)
 """
 
 SourcePath = Annotated[
     Path,
     typer.Argument(
-        metavar="SOURCE", help="Folder that `ggslam run` wrote, folder of a recording, or a grid store made of runs."
+        metavar="SOURCE", help="Folder that `ggslam run` wrote, of a recording or of laser scans, or a grid store "
+        "made of runs."
     ),
 ]
 
@@ -97,6 +100,9 @@ Frame = Annotated[
     typer.Option(help="Frame of meshes and occupancy: map, that of the run; floor: z up, z = 0 on the floor, in which "
                  "the ROS map is in any case. floor.yaml tells where the one is in the other."),
 ]  # fmt: skip
+Poses = Annotated[
+    Path | None, typer.Option(help="Trajectory file of a recording or of laser scans, instead of its own poses.")
+]
 Driving = Annotated[bool, typer.Option("--driving", help="Print how fast a robot may drive with these maps.")]
 Speeds = Annotated[str, typer.Option(help="With --driving: speeds to list, m/s.")]
 Friction = Annotated[float, typer.Option(help="With --driving: friction between wheels and ground.")]
@@ -138,13 +144,13 @@ def volumes(
     config: options.ConfigName = None, settings: options.Settings = None,
     start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
     scale: Scale = None,
-    format_name: options.Format = None,
-    depth_scale: options.DepthScale = None,
+    format_name: options.Format = None, depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
     camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
     depth_kind: options.DepthKind = None, depth_delay: options.DepthDelay = None, upright: options.Upright = False,
     sequence: options.MovedSequence = None,
+    poses: Poses = None, columns: options.Columns = None,
     skip_bad_frames: options.SkipBadFrames = False,
     device: Device = None, overwrite: Overwrite = False,
     engine: options.CellEngine = options.EngineName.local,
@@ -163,12 +169,11 @@ def volumes(
             depth_delay=depth_delay, upright=upright,
     )  # fmt: skip
     request = VolumesRequest(
-        source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,
-        occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live, realtime=realtime,
-        onto=onto, slice_height=slice_height, band=_band(band), robots=tuple(robot or ()),
-        inflation=inflation, body=tuple(body or ()), body_frame=body_frame, frame=frame.value,
-        latency=driving, device=device, config=config,
-        overrides=_overrides(settings, min_weight), overwrite=overwrite,
+        source=source, sequence=reading, scale=scale, recording=sequence, poses=poses, columns=columns, out=out,
+        voxel=voxel, esdf=esdf, occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live,
+        realtime=realtime, onto=onto, slice_height=slice_height, band=_band(band), robots=tuple(robot or ()),
+        inflation=inflation, body=tuple(body or ()), body_frame=body_frame, frame=frame.value, latency=driving,
+        device=device, config=config, overrides=_overrides(settings, min_weight), overwrite=overwrite,
     )  # fmt: skip
     if is_store(source):
         return _make_of_store(request, engine, workers, address)
@@ -264,7 +269,8 @@ def _print(outcome: VolumesOutcome) -> None:
          ", ".join(f"{ms:.1f}" for ms in part["by_window_ms"][:8])]
         for name, part in outcome.times.items()
     ]  # fmt: skip
-    console.print(table("ms a frame", ["", "mean", "95 %", "largest", f"by {outcome.window} frames"], rows))
+    unit = f"{'an' if outcome.unit == 'instant' else 'a'} {outcome.unit}"
+    console.print(table(f"ms {unit}", ["", "mean", "95 %", "largest", f"by {outcome.window} {outcome.unit}s"], rows))
     for line in outcome.lines:
         console.print(line, highlight=False, markup=False)
     console.print(f"wrote {quantity(len(outcome.files), 'file')} to {outcome.out}", highlight=False, markup=False)

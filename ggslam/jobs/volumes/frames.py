@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +12,7 @@ import numpy as np
 
 from ggslam.driving.body import Body, CameraBody
 from ggslam.errors import ConfigError, RunFolderError
+from ggslam.jobs.submaps.given_poses import poses_of_items
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.cpu import CpuRasterizer
@@ -21,9 +22,10 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
-from ggslam.sequences.rig import RigSequence
+from ggslam.sequences.rig import RigSequence, together_by_instant
 from ggslam.system.plurals import quantity, word_for
 from ggslam.system.tuning import Tuning
+from ggslam.volumes.posed_view import PosedView
 
 
 class FarFrameTuning(Tuning):
@@ -48,6 +50,31 @@ class PosedFrame:
     frame: Frame
     T_world_camera: np.ndarray
     labels: np.ndarray | None = None
+
+    @property
+    def timestamp(self) -> float:
+        """Seconds."""
+        return self.frame.timestamp
+
+    @property
+    def instant(self) -> int | None:
+        """Of a rig; None without one."""
+        return self.frame.instant
+
+    @property
+    def depth(self) -> np.ndarray:
+        """How far everything is, metres, float32 [H, W]; 0: unknown."""
+        return self.frame.depth
+
+    @property
+    def T_world_upright(self) -> np.ndarray:
+        """Pose [4, 4] of axes that look like a camera's that is held upright: y roughly down."""
+        return self.T_world_camera
+
+    def view(self) -> PosedView:
+        """What is fused of it."""
+        frame = self.frame
+        return PosedView(frame.depth_or_infinity(), frame.camera, self.T_world_camera, frame.color, self.labels)
 
 
 @dataclass
@@ -74,6 +101,19 @@ class FrameSource:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What seems wrong with the recording."""
+        return self.sequence.warnings
+
+    def instants(self) -> Iterator[list[PosedFrame]]:
+        """The same, those that the cameras of a rig took at one instant together."""
+        return together_by_instant(self, lambda posed: posed.frame)
+
+    def bare(self) -> FrameSource:
+        """The same without object ids."""
+        return replace(self, label=None)
 
     def __iter__(self) -> Iterator[PosedFrame]:
         """All frames whose pose is known, in order."""
@@ -143,15 +183,23 @@ def far_away(poses: Mapping[int, np.ndarray]) -> list[int]:
     ]
 
 
-def frames_of_recording(request: SequenceRequest, objects: bool = True) -> FrameSource:
-    """The frames of a recording at the poses that it tells itself.
+def frames_of_recording(request: SequenceRequest, objects: bool = True, file: Path | None = None) -> FrameSource:
+    """The frames of a recording at the poses that it tells itself, or at those of a file.
+
+    Args:
+        request: the recording.
+        objects: whether object ids are wanted, if it has masks.
+        file: a trajectory; None: the recording's own poses.
 
     Raises:
         SequenceError: it cannot be read.
+        FormatError: the file cannot.
         ConfigError: it tells no poses.
     """
     sequence = request.open()
     truth = sequence.ground_truth
+    if file is not None:
+        truth = poses_of_items(request.path, sequence.timestamps, file, None)
     poses = {} if truth is None else {i: T for i, T in enumerate(truth) if is_valid_pose(T)}
     if not poses:
         why = f" ({sequence.pose_problem})" if sequence.pose_problem else ""
@@ -160,7 +208,8 @@ def frames_of_recording(request: SequenceRequest, objects: bool = True) -> Frame
             "of it"
         )
     source = FrameSource(str(sequence.path), sequence, poses, names=dict(sequence.instance_names))
-    source.notes.append(f"poses of the recording itself ({sequence.pose_source})")
+    whose = f"of the recording itself ({sequence.pose_source})" if file is None else f"of {file}"
+    source.notes.append(f"poses {whose}")
     if len(poses) < len(sequence):
         left_out = len(sequence) - len(poses)
         source.notes.append(f"{quantity(left_out, 'frame')} without a pose {word_for(left_out, 'is', 'are')} left out")
