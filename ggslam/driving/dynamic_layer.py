@@ -241,7 +241,9 @@ class DynamicLayer:
 
 
 def _without_outermost(points: np.ndarray) -> np.ndarray:
-    low, high = np.quantile(points, [DynamicTuning.outermost, 1 - DynamicTuning.outermost], axis=0)
+    share = DynamicTuning.outermost
+    low = np.quantile(points, share, axis=0, method="lower")  # of few points none
+    high = np.quantile(points, 1 - share, axis=0, method="higher")
     inner = points[((points >= low) & (points <= high)).all(1)]
     kept = inner if len(inner) else points
     return np.asarray(kept[:: -(-len(kept) // DynamicTuning.max_points)], np.float64)

@@ -166,6 +166,19 @@ def test_distances_to_a_mover_are_exact() -> None:
     np.testing.assert_allclose(ahead.distance, np.maximum(truth - 0.1, 0), atol=1e-5)
 
 
+def test_a_box_of_few_points_is_held_whole() -> None:
+    """Turned against the axes, where each corner is the outermost in some way; flying pixels are left out."""
+    turn = se3_exp(np.array([0, 0, 0, 0.1, 0.6, 0.2]))
+    sighting = things(0.0)
+    layer = DynamicLayer()
+    layer.take([Sighting(1, turn, sighting.points)], 0.0)
+    np.testing.assert_allclose(layer.obstacles_at(0.0)[0].points, transform_points(sighting.points, turn), atol=1e-12)
+    cloud = np.concatenate([np.random.default_rng(0).uniform(-0.1, 0.1, (3000, 3)), [[5.0, 0, 0], [0, 0, -7.0]]])
+    layer.take([Sighting(2, np.eye(4), cloud)], 0.0)
+    (other,) = (o for o in layer.obstacles_at(0.0) if o.number == 2)
+    assert np.abs(other.points).max() <= 0.1 and np.ptp(other.points, axis=0).min() > 0.19 and len(other.points) <= 2000
+
+
 def test_only_heights_that_the_robot_passes_count() -> None:
     layer = DynamicLayer(DynamicSettings(margin=0.0))
     layer.take([things(0.0, low=0.3)], 0.0)  # between 0.7 and 0.9 above the floor
