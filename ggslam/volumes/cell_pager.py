@@ -52,8 +52,9 @@ class CellPager:
 
     Attributes:
         cells: the grid.
-        written, read: cells that went to disk and came back so far.
+        written, read: cells that went to disk, and that came back because views needed them.
         most_bytes: the most that TSDF and distance field took when an instant was done.
+        exceeded: whether that was more than allowed: what one instant's views need has to be in memory.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class CellPager:
     ) -> None:
         self.cells = VolumeCells.of(tsdf.settings)
         self.written = self.read = self.most_bytes = 0
+        self.exceeded = False
         self._tsdf, self._folder, self._allowed = tsdf, folder, allowed
         self._around = math.ceil(distances / self.cells.edge)
         self._away: dict[CellKey, int] = {}
@@ -87,7 +89,9 @@ class CellPager:
         self._wanted |= with_neighbours(seen, self._around)
         if self._stale is not None:
             self._stale.build(self._wanted, self._tsdf, self._decays)
-        self._load(self._wanted & self._away.keys())
+        coming = self._wanted & self._away.keys()
+        self.read += len(coming)
+        self._load(coming)
 
     def bring_all(self) -> None:
         """Brings all cells, whatever memory that takes."""
@@ -107,7 +111,6 @@ class CellPager:
             put_blocks(self._tsdf, self.arrays(key))
             self._path(key).unlink()
             del self._away[key]
-            self.read += 1
 
     def arrays(self, key: CellKey) -> dict[str, np.ndarray]:
         """What a cell on disk holds, see `take_blocks`, with the weights of now."""
@@ -127,6 +130,7 @@ class CellPager:
         allowed = self._allowed(held)
         if allowed is not None and held > allowed:
             held -= self._free(held - round((1 - CellPagerTuning.slack) * allowed), field)
+            self.exceeded |= held > allowed
         self.most_bytes = max(self.most_bytes, held)
         self._wanted = set()
 
