@@ -159,7 +159,7 @@ def _write(
     """Brings all maps up to date and writes them."""
     maps = fused.maps
     maps.finish()
-    if not len(maps.tsdf) or (request.onto is None and not fused.depth_ranges):  # free space alone has no floor
+    if not maps.block_counts()[0] or (request.onto is None and not fused.depth_ranges):  # free space alone has no floor
         limits = maps.settings.tsdf
         raise SequenceError(
             f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
