@@ -51,9 +51,10 @@ class CellPager:
         distances: metres around what is in view that stay in memory, too.
 
     Attributes:
-        cells: the grid.
-        written, read: cells that went to disk and came back so far.
+        tsdf, cells: the TSDF and its grid.
+        written, read: cells that went to disk, and that came back because views needed them.
         most_bytes: the most that TSDF and distance field took when an instant was done.
+        exceeded: whether that was more than allowed: what one instant's views need has to be in memory.
     """
 
     def __init__(
@@ -61,7 +62,8 @@ class CellPager:
     ) -> None:
         self.cells = VolumeCells.of(tsdf.settings)
         self.written = self.read = self.most_bytes = 0
-        self._tsdf, self._folder, self._allowed = tsdf, folder, allowed
+        self.exceeded = False
+        self.tsdf, self._folder, self._allowed = tsdf, folder, allowed
         self._around = math.ceil(distances / self.cells.edge)
         self._away: dict[CellKey, int] = {}
         """Cells on disk, and how often weights had decayed when they went."""
@@ -79,39 +81,65 @@ class CellPager:
 
     def bring(self, images: Iterable[PosedView]) -> None:
         """Brings what views may tell of, before they are fused."""
-        if not len(self._tsdf) and not self._away and self._stale is None:
+        if not len(self.tsdf) and not self._away and self._stale is None:
             return  # the first view decides where the origin is
         seen: set[CellKey] = set()
         for image in images:
-            seen |= as_keys(self.cells.in_view(image, self._tsdf.origin))
+            seen |= as_keys(self.cells.in_view(image, self.tsdf.origin))
         self._wanted |= with_neighbours(seen, self._around)
         if self._stale is not None:
-            self._stale.build(self._wanted, self._tsdf, self._decays)
-        self._load(self._wanted & self._away.keys())
+            self._stale.build(self._wanted, self.tsdf, self._decays)
+        coming = self._wanted & self._away.keys()
+        self.read += len(coming)
+        self._load(coming)
 
     def bring_all(self) -> None:
         """Brings all cells, whatever memory that takes."""
         if self._stale is not None:
-            self._stale.build_all(self._tsdf, self._decays)
+            self._stale.build_all(self.tsdf, self._decays, lambda: None)
             self._stale = None
         self._load(set(self._away))
 
+    def write_all(self) -> None:
+        """Has all cells on disk, and none in memory, if some are there or are to be fused again; else none is."""
+        if self._stale is not None:
+            self._stale.build_all(self.tsdf, self._decays, lambda: self.finish_instant(None))
+            self._stale = None
+        if self._away:
+            self._instant += 1
+            self._free(self.held_bytes(None) + 1, None)
+
+    def relabel(self, table: np.ndarray) -> None:
+        """Gives objects on disk their new ids, uint16 [65536] by old one; all cells have been fused."""
+        for key in sorted(self._away):
+            arrays = self.arrays(key)
+            self._write(key, {**arrays, "label": table[arrays["label"]]})
+
+    def counts(self) -> tuple[int, int]:
+        """Blocks on disk, and those of them with voxels."""
+        sizes = [[len(self.arrays(key)[name]) for name in ("dense", "free")] for key in self._away]
+        dense, free = np.sum(sizes, axis=0).tolist() if sizes else (0, 0)
+        return dense + free, dense
+
+    def keys(self) -> set[CellKey]:
+        """Cells on disk."""
+        return set(self._away)
+
     def rebuild(self, views: Sequence[StoredView]) -> None:
         """Begins anew from views, after a loop was closed: each cell is fused again when it is needed next."""
-        self._tsdf.clear()
+        self.tsdf.clear()
         self.clear()
-        self._stale = CellRebuild(views, self.cells, self._tsdf.origin)
+        self._stale = CellRebuild(views, self.cells, self.tsdf.origin)
 
     def _load(self, keys: set[CellKey]) -> None:
         for key in sorted(keys):
-            put_blocks(self._tsdf, self.arrays(key))
+            put_blocks(self.tsdf, self.arrays(key))
             self._path(key).unlink()
             del self._away[key]
-            self.read += 1
 
     def arrays(self, key: CellKey) -> dict[str, np.ndarray]:
         """What a cell on disk holds, see `take_blocks`, with the weights of now."""
-        return decay_blocks(read_all_arrays(self._path(key), _CONTENT), self._tsdf, self._decays - self._away[key])
+        return decay_blocks(read_all_arrays(self._path(key), _CONTENT), self.tsdf, self._decays - self._away[key])
 
     # --- going -------------------------------------------------------------------------------------------------------
 
@@ -127,16 +155,17 @@ class CellPager:
         allowed = self._allowed(held)
         if allowed is not None and held > allowed:
             held -= self._free(held - round((1 - CellPagerTuning.slack) * allowed), field)
+            self.exceeded |= held > allowed
         self.most_bytes = max(self.most_bytes, held)
         self._wanted = set()
 
     def held_bytes(self, field: DistanceField | None) -> int:
         """Bytes of the TSDF's blocks, and of the field's."""
-        return self._bytes_of(self._tsdf.dense_blocks, len(self._tsdf), self._field_bytes(field))
+        return self._bytes_of(self.tsdf.dense_blocks, len(self.tsdf), self._field_bytes(field))
 
     def _bytes_of(self, dense: int, blocks: int, field_bytes: float) -> int:
         t = CellPagerTuning
-        each = t.voxel_bytes + (t.point_bytes if self._tsdf.points else 0)
+        each = t.voxel_bytes + (t.point_bytes if self.tsdf.points else 0)
         return round(dense * each + blocks * (t.block_bytes + field_bytes))
 
     @staticmethod
@@ -146,7 +175,7 @@ class CellPager:
 
     def _free(self, bytes_: int, field: DistanceField | None) -> int:
         """Writes cells to disk until so many bytes are free; returns how many are."""
-        blocks, each = self._tsdf.blocks(), self._field_bytes(field)
+        blocks, each = self.tsdf.blocks(), self._field_bytes(field)
         keys, cell_of = np.unique(self.cells.keys_of(blocks.coordinates), axis=0, return_inverse=True)
         order = sorted(range(len(keys)), key=lambda k: self._last_seen.get(_key(keys[k]), 0))
         by_cell, freed = np.argsort(cell_of.ravel(), kind="stable"), 0
@@ -157,11 +186,11 @@ class CellPager:
             if freed >= bytes_ or self._last_seen.get(key, 0) == self._instant:
                 break
             rows = by_cell[ends[number - 1] if number else 0 : ends[number]]
-            self._write(key, take_blocks(self._tsdf, blocks, rows))
+            self._write(key, take_blocks(self.tsdf, blocks, rows))
             freed += self._bytes_of(int(blocks.dense[rows].sum()), len(rows), each)
             gone.append(blocks.coordinates[rows])
         if gone:
-            self._tsdf.erase(np.concatenate(gone))
+            self.tsdf.erase(np.concatenate(gone))
         return freed
 
     def _write(self, key: CellKey, arrays: dict[str, np.ndarray]) -> None:

@@ -81,8 +81,8 @@ class CellRebuild:
             margin = CellRebuildTuning.margin
             self._build_box(missing.min(0) - margin, missing.max(0) + margin, tsdf, decays)
 
-    def build_all(self, tsdf: TsdfMap, decays: int) -> None:
-        """Fuses all cells that are not yet."""
+    def build_all(self, tsdf: TsdfMap, decays: int, after: Callable[[], None]) -> None:
+        """Fuses all cells that are not yet; calls `after` each time that some are."""
         seen: set[CellKey] = set()
         for view in self._views:
             seen |= as_keys(self._cells.in_frustum(view.camera, view.T_world_camera, self._reach(view), self._origin))
@@ -90,6 +90,7 @@ class CellRebuild:
         missing = np.array(sorted(seen - self._built)).reshape(-1, 3)
         for box in np.unique(np.floor_divide(missing, side), axis=0):
             self._build_box(side * box, side * box + side - 1, tsdf, decays)
+            after()
 
     def _build_box(self, low: np.ndarray, high: np.ndarray, tsdf: TsdfMap, decays: int) -> None:
         """Fuses the cells from `low` to `high` [3] that are not yet, of the views that see some of them."""

@@ -20,6 +20,7 @@ import torch
 from ggslam.errors import ConfigError
 from ggslam.scene.frame import Frame
 from ggslam.system.tuning import Tuning
+from ggslam.volumes.cell_export import mesh_of_cells, save_cells
 from ggslam.volumes.cell_pager import CellPager
 from ggslam.volumes.cell_rebuild import StoredView
 from ggslam.volumes.esdf import DistanceField
@@ -27,6 +28,7 @@ from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.posed_view import PosedScan, PosedView
 from ggslam.volumes.tsdf import TsdfMap
+from ggslam.volumes.tsdf_file import save_tsdf
 from ggslam.volumes.tsdf_torch import TorchTsdf
 from ggslam.volumes.volume_settings import VolumeSettings
 
@@ -145,7 +147,21 @@ class VolumeMaps:
 
     def mesh(self, min_triangles: int = 0) -> Mesh:
         """The surface of the TSDF; see `volumes.mesh.extract_mesh`."""
+        if self.pager is not None and len(self.pager):
+            return mesh_of_cells(self.pager, self.settings.min_weight or None, min_triangles)
         return extract_mesh(self.tsdf, self.settings.min_weight or None, min_triangles)
+
+    def save_tsdf(self, path: Path) -> None:
+        """Writes the finished TSDF."""
+        if self.pager is not None and len(self.pager):
+            save_cells(path, self.pager)
+        else:
+            save_tsdf(path, self.tsdf)
+
+    def block_counts(self) -> tuple[int, int]:
+        """Blocks of the finished TSDF, and those of them with voxels."""
+        of_disk = (0, 0) if self.pager is None else self.pager.counts()
+        return len(self.tsdf) + of_disk[0], self.tsdf.dense_blocks + of_disk[1]
 
     @property
     def _receiver(self) -> TsdfMap | TorchTsdf:
@@ -246,9 +262,10 @@ class VolumeMaps:
         self.times.rebuilds.append(time.perf_counter() - start)
 
     def finish(self) -> None:
-        """Brings the TSDF from its device or disk, and the distance field up to date."""
+        """Brings the TSDF from its device, and the distance field up to date. A field takes the whole TSDF into memory;
+        without one, what went to disk stays there."""
         if self.pager is not None:
-            self.pager.bring_all()
+            self.pager.write_all() if self.field is None else self.pager.bring_all()
         if self._on_device is not None:
             self.tsdf = self._on_device.to_native(self.context)
             self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
@@ -262,7 +279,8 @@ class VolumeMaps:
             table: uint16 [65536], new id by old one; 0: none.
         """
         if self.pager is not None:
-            self.pager.bring_all()
+            self.pager.write_all()
+            self.pager.relabel(table)
         blocks = self.tsdf.blocks()
         dense = blocks.coordinates[blocks.dense]
         for start in range(0, len(dense), 4096):

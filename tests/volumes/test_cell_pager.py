@@ -19,7 +19,7 @@ from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf_file import tsdf_to_bytes
 from ggslam.volumes.volume_settings import VolumeSettings
 
-LENGTH = 24.0
+LENGTH = 14.0
 SETTINGS = VolumeSettings(tsdf=TsdfSettings(voxel=0.08, max_depth=4.0))
 CAMERA = small_camera(120, 90)
 
@@ -74,8 +74,14 @@ def test_what_was_on_disk_is_as_if_it_had_stayed(
     assert pager.most_bytes <= budget < (10_000 if esdf else 5120) * whole.tsdf.dense_blocks
     assert len(list((tmp_path / "cells").iterdir())) == len(pager)
     paged.finish(), whole.finish()
+    paged.save_tsdf(tmp_path / "tsdf.npz")
+    assert (tmp_path / "tsdf.npz").read_bytes() == tsdf_to_bytes(whole.tsdf)
+    assert paged.block_counts() == (len(whole.tsdf), whole.tsdf.dense_blocks)
+    assert triangles(paged.mesh(20)) == triangles(whole.mesh(20))
+    assert not esdf or len(pager) == 0
+    assert esdf or (len(paged.tsdf) == 0 and pager.most_bytes <= budget)  # files are made of what is on disk
+    pager.bring_all()
     assert len(pager) == 0 and tsdf_to_bytes(paged.tsdf) == tsdf_to_bytes(whole.tsdf)
-    assert triangles(paged.mesh()) == triangles(whole.mesh())
     if esdf:
         assert paged.field is not None and whole.field is not None
         at = whole.field.coordinates()
@@ -105,22 +111,36 @@ def test_a_correction_moves_cells_with_their_keyframes(seen: list[PosedView], tm
     where the keyframes are now."""
     drifted = [
         replace(view, T_world_camera=se3_exp(np.array([0, 0.004 * k, 0, 0, 0, 0.001 * k])) @ view.T_world_camera)
-        for k, view in enumerate(seen[:60])
+        for k, view in enumerate(seen[:34])
     ]
-    stored = [StoredView(v.camera, v.T_world_camera, float(v.depth.max()), lambda v=v: v) for v in seen[:60]]
+    stored = [StoredView(v.camera, v.T_world_camera, float(v.depth.max()), lambda v=v: v) for v in seen[:34]]
     paged = fuse(drifted, Paging(tmp_path / "cells", lambda held: 1_500_000))
     off = np.abs(corridor().distance(paged.mesh(20).vertices.astype(float)))
     assert np.median(off) > 0.02  # what it is about
     paged.rebuild(stored)
     assert len(paged.tsdf) == 0 and not list(tmp_path.glob("cells/*"))  # nothing is fused before it is needed
-    whole = fuse(seen[:60])
-    for view in seen[60:90]:
+    whole = fuse(seen[:34])
+    for view in seen[34:50]:
         paged.add_together([view]), whole.add_together([view])
         assert paged.pager is not None and paged.pager.most_bytes < 4_000_000
     paged.finish(), whole.finish()
-    assert tsdf_to_bytes(paged.tsdf) == tsdf_to_bytes(whole.tsdf)
+    paged.save_tsdf(tmp_path / "tsdf.npz")
+    assert (tmp_path / "tsdf.npz").read_bytes() == tsdf_to_bytes(whole.tsdf)
     off = np.abs(corridor().distance(paged.mesh(20).vertices.astype(float)))
     assert np.median(off) < 0.002 and np.percentile(off, 95) < 0.03  # metres, of voxels of 8 cm
+
+
+def test_objects_on_disk_get_their_new_ids(seen: list[PosedView], tmp_path: Path) -> None:
+    labelled = [replace(view, labels=np.where(view.depth < 2.5, 3, 7).astype(np.uint16)) for view in seen[:50]]
+    table = np.arange(65536, dtype=np.uint16)
+    table[3], table[7] = 9, 0
+    paged, whole = fuse(labelled, Paging(tmp_path / "cells", lambda held: 1_500_000)), fuse(labelled)
+    for maps in (paged, whole):
+        maps.relabel(table)
+        maps.finish()
+    paged.save_tsdf(tmp_path / "tsdf.npz")
+    assert whole.mesh().objects() == [9]
+    assert (tmp_path / "tsdf.npz").read_bytes() == tsdf_to_bytes(whole.tsdf)
 
 
 def test_nothing_goes_while_all_fits(seen: list[PosedView], tmp_path: Path) -> None:

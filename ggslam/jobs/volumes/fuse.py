@@ -19,7 +19,7 @@ from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.volumes.frames import FrameSource, PosedFrame, body_of, frames_of_recording, frames_of_run
 from ggslam.jobs.volumes.fused import Fused, fuse_source, level_occupancy
 from ggslam.jobs.volumes.live import LiveVolumes
-from ggslam.jobs.volumes.memory import cells_on_disk
+from ggslam.jobs.volumes.memory import cells_on_disk, lines_of_cells
 from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, Surface, prepare_folder, write_outputs
 from ggslam.jobs.volumes.point_rates import PointRates
 from ggslam.jobs.volumes.robot_maps import parse_robots
@@ -171,7 +171,7 @@ def _write(
     """Brings all maps up to date and writes them."""
     maps = fused.maps
     maps.finish()
-    if not len(maps.tsdf) or (request.onto is None and not fused.depth_ranges):  # free space alone has no floor
+    if not maps.block_counts()[0] or (request.onto is None and not fused.depth_ranges):  # free space alone has no floor
         limits = maps.settings.tsdf
         raise SequenceError(
             f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
@@ -320,7 +320,7 @@ def _record(request: VolumesRequest, config: Config, fused: Fused) -> dict[str, 
 
 
 def _outcome(out: Path, fused: Fused, outputs: Outputs) -> VolumesOutcome:
-    times, lines = fused.maps.times, [PointRates.of(fused.maps).line(), *outputs.lines]
+    times, lines = fused.maps.times, [PointRates.of(fused.maps).line(), *lines_of_cells(fused.maps), *outputs.lines]
     return VolumesOutcome(
         out, outputs.files, lines, times.summary(), VolumeTimesTuning.window, fused.latency(),
         float(np.median(fused.depth_ranges)) if fused.depth_ranges else 0.0, fused.error,

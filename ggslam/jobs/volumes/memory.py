@@ -13,7 +13,7 @@ from ggslam.slam.config import Config
 from ggslam.slam.memory_budget import MB, MemoryBudget
 from ggslam.system.staging import make_staging
 from ggslam.system.tuning import Tuning
-from ggslam.volumes.maps import Paging
+from ggslam.volumes.maps import Paging, VolumeMaps
 
 
 class VolumeMemoryTuning(Tuning):
@@ -43,6 +43,20 @@ class VolumeBudget:
         elif self._calls > VolumeMemoryTuning.measured_after:
             self.budget.check(held)
         return self.budget.map_bytes
+
+
+def lines_of_cells(maps: VolumeMaps) -> list[str]:
+    """What happened to cells, for people; nothing if all stay in memory."""
+    if maps.paging is None or maps.pager is None:
+        return []
+    pager, allowed = maps.pager, maps.paging.allowed
+    notes = allowed.budget.notes if isinstance(allowed, VolumeBudget) else []
+    exceeded = f"; views need {pager.most_bytes / MB:.0f} MB" if pager.exceeded else ""
+    line = (
+        f"cells of {pager.cells.edge:.2f} m: {pager.written} went to disk, {pager.read} came back; TSDF and distance "
+        f"field took {pager.most_bytes / MB:.0f} MB at most while frames were fused{exceeded}"
+    )
+    return [*notes, line]
 
 
 @contextmanager

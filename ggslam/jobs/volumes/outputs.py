@@ -55,7 +55,6 @@ from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.octomap_files import write_octomap
 from ggslam.volumes.output_frame import OutputFrame
 from ggslam.volumes.slices import FieldSlice, plane_at_height, slice_field, slice_picture
-from ggslam.volumes.tsdf_file import save_tsdf
 from ggslam.volumes.upright import Upright, estimate_up
 
 RECORD = VolumesRecord.FILE
@@ -179,12 +178,11 @@ class _Writer:
 
     def tsdf(self, maps: VolumeMaps) -> None:
         """The signed distances."""
-        tsdf = maps.tsdf
-        save_tsdf(self.path("tsdf.npz"), tsdf)
-        held = tsdf.memory_bytes / 1e6
+        maps.save_tsdf(self.path("tsdf.npz"))
+        (blocks, dense), held = maps.block_counts(), maps.tsdf.memory_bytes / 1e6
         self.tell(
-            f"TSDF: {quantity(len(tsdf), 'block')} of 8^3 voxels, {tsdf.dense_blocks} near surfaces, {held:.0f} MB",
-            tsdf={"blocks": len(tsdf), "dense_blocks": tsdf.dense_blocks, "memory_mb": held},
+            f"TSDF: {quantity(blocks, 'block')} of 8^3 voxels, {dense} near surfaces, {held:.0f} MB",
+            tsdf={"blocks": blocks, "dense_blocks": dense, "memory_mb": held},
         )
 
     def mesh(self) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ggslam.volumes.maps import VolumeMaps
 
-_NAMES = {"tsdf": "TSDF", "esdf": "distance field", "occupancy": "occupancy"}
+_NAMES = {"cells": "disk", "tsdf": "TSDF", "esdf": "distance field", "occupancy": "occupancy"}
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class PointRates:
 
     Attributes:
         points: measured points that were fused.
-        seconds: by map ("tsdf", "esdf", "occupancy"), in all; without reading and tracking.
+        seconds: by map ("cells" to disk and back, "tsdf", "esdf", "occupancy"), in all; without reading and tracking.
     """
 
     points: int
