@@ -28,7 +28,11 @@ EPILOG = """
 
   ggslam volumes data/livingroom --esdf --slice 0.5        (poses of the recording itself)
 
+  ggslam volumes runs/kitchen --esdf --robot 0.4,0.18 --robot tall:1.2,0.3      (a map and a costmap for each)
+
   ggslam volumes data/redkitchen --scale 0.5 --live --esdf      (tracked and fused frame by frame)
+
+  ggslam volumes scans/walk --poses localized/walk/trajectory.txt --occupancy 0.2      (laser scans)
 
   ggslam volumes house.grid --esdf --workers 4      (a grid store, cell by cell)
 """
@@ -36,7 +40,8 @@ EPILOG = """
 SourcePath = Annotated[
     Path,
     typer.Argument(
-        metavar="SOURCE", help="Folder that `ggslam run` wrote, folder of a recording, or a grid store made of runs."
+        metavar="SOURCE", help="Folder that `ggslam run` wrote, of a recording or of laser scans, or a grid store "
+        "made of runs."
     ),
 ]
 
@@ -80,11 +85,24 @@ Band = Annotated[
     str, typer.Option(metavar="LOW,HIGH", help="Heights, metres above the floor, between which the ROS map looks for "
                       "obstacles."),
 ]  # fmt: skip
+Robots = Annotated[
+    list[str] | None,
+    typer.Option("--robot", metavar="[NAME:]HEIGHT,RADIUS", help="Robot, metres: with --esdf it gets a map of what it "
+                 "meets (map_NAME.pgm) and a costmap (costmap_NAME.png), for map_server. A third number is the height "
+                 "of the lowest obstacle (default 0.05). May be repeated."),
+]  # fmt: skip
+Inflation = Annotated[
+    str, typer.Option("--inflation", metavar="RADIUS,FACTOR", help="With --robot: inflation_radius (m) and "
+                      "cost_scaling_factor of nav2's inflation layer."),
+]  # fmt: skip
 Frame = Annotated[
     OutputFrame,
     typer.Option(help="Frame of meshes and occupancy: map, that of the run; floor: z up, z = 0 on the floor, in which "
                  "the ROS map is in any case. floor.yaml tells where the one is in the other."),
 ]  # fmt: skip
+Poses = Annotated[
+    Path | None, typer.Option(help="Trajectory file of a recording or of laser scans, instead of its own poses.")
+]
 Driving = Annotated[bool, typer.Option("--driving", help="Print how fast a robot may drive with these maps.")]
 Speeds = Annotated[str, typer.Option(help="With --driving: speeds to list, m/s.")]
 Friction = Annotated[float, typer.Option(help="With --driving: friction between wheels and ground.")]
@@ -110,37 +128,33 @@ def volumes(
     occupancy: Occupancy = None,
     mesh: Mesh = None,
     min_weight: MinWeight = None,
-    object_meshes: ObjectMeshes = False,
-    objects: Objects = True,
-    live: Live = False,
-    realtime: Realtime = None,
+    object_meshes: ObjectMeshes = False, objects: Objects = True,
+    live: Live = False, realtime: Realtime = None,
     onto: Onto = None,
     slice_height: SliceHeight = None,
     band: Band = "0.1,1.5",
+    robot: Robots = None,
+    inflation: Inflation = "0.55,10",
+    body: options.Body = None, body_frame: options.BodyFrame = None,
     frame: Frame = OutputFrame.map,
     driving: Driving = False,
     speeds: Speeds = "0.5,1,2,4",
     friction: Friction = 0.5,
-    sensor_ms: SensorMs = 33.0,
-    plan_ms: PlanMs = 50.0,
-    network_ms: NetworkMs = 0.0,
-    config: options.ConfigName = None,
-    settings: options.Settings = None,
+    sensor_ms: SensorMs = 33.0, plan_ms: PlanMs = 50.0, network_ms: NetworkMs = 0.0,
+    config: options.ConfigName = None, settings: options.Settings = None,
     start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
     scale: Scale = None,
-    format_name: options.Format = None,
-    depth_scale: options.DepthScale = None,
+    format_name: options.Format = None, depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
     camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
     depth_kind: options.DepthKind = None, depth_delay: options.DepthDelay = None, upright: options.Upright = False,
     sequence: options.MovedSequence = None,
+    poses: Poses = None, columns: options.Columns = None,
     skip_bad_frames: options.SkipBadFrames = False,
-    device: Device = None,
-    overwrite: Overwrite = False,
+    device: Device = None, overwrite: Overwrite = False,
     engine: options.CellEngine = options.EngineName.local,
-    workers: options.CellWorkers = None,
-    address: options.CellAddress = None,
+    workers: options.CellWorkers = None, address: options.CellAddress = None,
 ) -> None:  # fmt: skip
     """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
     from ggslam.jobs.submaps.stores import is_store
@@ -155,10 +169,11 @@ def volumes(
             depth_delay=depth_delay, upright=upright,
     )  # fmt: skip
     request = VolumesRequest(
-        source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,
-        occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live, realtime=realtime,
-        onto=onto, slice_height=slice_height, band=_band(band), frame=frame.value, latency=driving, device=device,
-        config=config, overrides=_overrides(settings, min_weight), overwrite=overwrite,
+        source=source, sequence=reading, scale=scale, recording=sequence, poses=poses, columns=columns, out=out,
+        voxel=voxel, esdf=esdf, occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live,
+        realtime=realtime, onto=onto, slice_height=slice_height, band=_band(band), robots=tuple(robot or ()),
+        inflation=inflation, body=tuple(body or ()), body_frame=body_frame, frame=frame.value, latency=driving,
+        device=device, config=config, overrides=_overrides(settings, min_weight), overwrite=overwrite,
     )  # fmt: skip
     if is_store(source):
         return _make_of_store(request, engine, workers, address)
@@ -254,7 +269,8 @@ def _print(outcome: VolumesOutcome) -> None:
          ", ".join(f"{ms:.1f}" for ms in part["by_window_ms"][:8])]
         for name, part in outcome.times.items()
     ]  # fmt: skip
-    console.print(table("ms a frame", ["", "mean", "95 %", "largest", f"by {outcome.window} frames"], rows))
+    unit = f"{'an' if outcome.unit == 'instant' else 'a'} {outcome.unit}"
+    console.print(table(f"ms {unit}", ["", "mean", "95 %", "largest", f"by {outcome.window} {outcome.unit}s"], rows))
     for line in outcome.lines:
         console.print(line, highlight=False, markup=False)
     console.print(f"wrote {quantity(len(outcome.files), 'file')} to {outcome.out}", highlight=False, markup=False)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, SupportsIndex
+from typing import Any, SupportsIndex, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from ggslam.sequences.rig_file import RigCamera, RigFile, find_rig_file, read_ri
 from ggslam.sequences.rig_times import find_instants, gaps
 from ggslam.sequences.sequence import OnBadFrame, ReadMasks, Sequence, SkippedFrame
 from ggslam.system.tuning import Tuning
+
+T = TypeVar("T")
 
 NAME = "rig"
 """Of the format."""
@@ -226,13 +228,19 @@ def one_camera(sequence: Sequence, what: str) -> Sequence:
 
 def by_instant(frames: Iterable[Frame]) -> Iterator[list[Frame]]:
     """The frames of a recording, in order: those of one instant of a rig together, others at once and alone."""
-    together: list[Frame] = []
-    for frame in frames:
-        if together and frame.instant != together[0].instant:
+    return together_by_instant(frames, lambda frame: frame)
+
+
+def together_by_instant(items: Iterable[T], frame_of: Callable[[T], Frame]) -> Iterator[list[T]]:
+    """The same of things that each have a frame."""
+    together: list[T] = []
+    for item in items:
+        instant = frame_of(item).instant
+        if together and instant != frame_of(together[0]).instant:
             yield together
             together = []
-        together.append(frame)
-        if frame.instant is None:
+        together.append(item)
+        if instant is None:
             yield together
             together = []
     if together:

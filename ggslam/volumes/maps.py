@@ -9,22 +9,26 @@ images the mapper keeps, are fused again where they are now.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from ggslam.errors import ConfigError
-from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.system.tuning import Tuning
+from ggslam.volumes.cell_export import mesh_of_cells, save_cells
+from ggslam.volumes.cell_pager import CellPager
+from ggslam.volumes.cell_rebuild import StoredView
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.mesh import Mesh, extract_mesh
 from ggslam.volumes.occupancy import OccupancyMap
-from ggslam.volumes.posed_view import PosedView
+from ggslam.volumes.posed_view import PosedScan, PosedView
 from ggslam.volumes.tsdf import TsdfMap
+from ggslam.volumes.tsdf_file import save_tsdf
 from ggslam.volumes.tsdf_torch import TorchTsdf
 from ggslam.volumes.volume_settings import VolumeSettings
 
@@ -42,8 +46,8 @@ class VolumeTimes:
 
     Attributes:
         rows: for each frame, seconds by part: "slam" (from the frame to its pose and, where they come first, mapping
-            and making the volumes anew after a loop closure), "tsdf", "esdf", "occupancy"; parts that were not done
-            with a frame are missing.
+            and making the volumes anew after a loop closure), "cells" (going to disk and coming back), "tsdf", "esdf",
+            "occupancy"; parts that were not done with a frame are missing.
         blocks: of the TSDF after each frame.
         rebuilds: seconds of each time that the maps were made anew.
         last_update: of the distance field, at the end.
@@ -56,7 +60,8 @@ class VolumeTimes:
 
     def parts(self) -> dict[str, np.ndarray]:
         """Seconds [n] of the frames with which a part was done, by part."""
-        names = [name for name in ("slam", "tsdf", "esdf", "occupancy") if any(name in row for row in self.rows)]
+        all_names = ("slam", "cells", "tsdf", "esdf", "occupancy")
+        names = [name for name in all_names if any(name in row for row in self.rows)]
         return {name: np.array([row[name] for row in self.rows if name in row]) for name in names}
 
     def whole(self) -> np.ndarray:
@@ -78,6 +83,19 @@ def _statistics(seconds: np.ndarray) -> dict[str, Any]:
             "by_window_ms": windows}  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Paging:
+    """What of TSDF and distance field goes to disk.
+
+    Attributes:
+        folder: for it.
+        allowed: bytes that both may take, of those that they take now; None: any.
+    """
+
+    folder: Path
+    allowed: Callable[[int], int | None]
+
+
 class VolumeMaps:
     """TSDF, distance field and occupancy of one recording.
 
@@ -97,6 +115,9 @@ class VolumeMaps:
         onto: TsdfMap | None = None, device: str | None = None,
     ) -> None:  # fmt: skip
         self.settings = settings
+        self.paging: Paging | None = None
+        """What goes to disk; to be set before the first frame, for an empty TSDF of the core."""
+        self.pager: CellPager | None = None
         self._goes_on = onto is not None
         self._on_device = None if device is None else _fusion_on(device, settings, onto, points=esdf)
         self.tsdf = TsdfMap(settings.tsdf, points=esdf) if onto is None else onto
@@ -104,6 +125,8 @@ class VolumeMaps:
         self.field = DistanceField(self.tsdf, settings.esdf) if esdf else None
         self.occupancy = None if occupancy is None else self._occupancy(occupancy)
         self.times = VolumeTimes()
+        self.points = 0
+        """Measured points that were fused; what was fused anew after a loop closure is not counted again."""
 
     def fit(self, scale: float, voxel: bool = True) -> None:
         """Fits the TSDF's voxels and range to the size of the scene, before the first frame; in rooms, and where a
@@ -124,7 +147,21 @@ class VolumeMaps:
 
     def mesh(self, min_triangles: int = 0) -> Mesh:
         """The surface of the TSDF; see `volumes.mesh.extract_mesh`."""
+        if self.pager is not None and len(self.pager):
+            return mesh_of_cells(self.pager, self.settings.min_weight or None, min_triangles)
         return extract_mesh(self.tsdf, self.settings.min_weight or None, min_triangles)
+
+    def save_tsdf(self, path: Path) -> None:
+        """Writes the finished TSDF."""
+        if self.pager is not None and len(self.pager):
+            save_cells(path, self.pager)
+        else:
+            save_tsdf(path, self.tsdf)
+
+    def block_counts(self) -> tuple[int, int]:
+        """Blocks of the finished TSDF, and those of them with voxels."""
+        of_disk = (0, 0) if self.pager is None else self.pager.counts()
+        return len(self.tsdf) + of_disk[0], self.tsdf.dense_blocks + of_disk[1]
 
     @property
     def _receiver(self) -> TsdfMap | TorchTsdf:
@@ -144,59 +181,97 @@ class VolumeMaps:
             labels: object ids uint16 [H, W], 0 = none.
             waited: seconds since the frame came.
         """
+        view = PosedView(frame.depth_or_infinity(), frame.camera, T_world_camera, frame.color, labels)
+        self.add_together([view], waited)
+
+    def add_together(self, views: Sequence[PosedView | PosedScan], waited: float = 0.0) -> None:
+        """Fuses what the sensors of a rig see at one instant, one after the other; weights decay and the distance field
+        follows once for all of them. Its times are one row.
+
+        Args:
+            views: of the sensors.
+            waited: seconds since what they measured came.
+        """
         number = len(self.times.rows)
         row = {"slam": waited} if waited else {}
-        start, depth = time.perf_counter(), frame.depth_or_infinity()
-        self._fuse(depth, frame.camera, T_world_camera, frame.color, labels)
+        start = time.perf_counter()
+        images = [image for view in views for image in view.images(self.settings.tsdf, self.context)]
+        if self.paging is not None:
+            row["cells"] = self._bring(self.paging, images)
+        for image in images:
+            self._integrate(image)
         every = self.settings.decay_every
         if every and number % every == every - 1:
             self.tsdf.decay()
-        row["tsdf"] = time.perf_counter() - start
+            if self.pager is not None:
+                self.pager.decay()
+        row["tsdf"] = time.perf_counter() - start - row.get("cells", 0.0)
         every = self.settings.esdf_every
         if self.field is not None and every and self._on_device is None and number % every == every - 1:
             start = time.perf_counter()
-            self.field.update(self._time_left(row["tsdf"]), T_world_camera[:3, 3])
+            here = images[0].T_world_camera[:3, 3] if images else None
+            self.field.update(self._time_left(row["tsdf"]), here)
             row["esdf"] = time.perf_counter() - start
         if self.occupancy is not None:
             start = time.perf_counter()
-            self._insert(depth, frame.camera, T_world_camera)
+            for view in views:
+                self._insert(view)
             row["occupancy"] = time.perf_counter() - start
+        if self.pager is not None:
+            start = time.perf_counter()
+            self.pager.finish_instant(self.field)
+            row["cells"] += time.perf_counter() - start
         self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
+        self.points += sum(view.point_count for view in views)
 
     def _time_left(self, spent: float) -> float | None:
         """Milliseconds of a frame's budget that the TSDF has left to the field; at least a little."""
         budget = self.settings.esdf.budget_ms
         return max(budget - 1e3 * spent, 1e-3) if budget else None
 
-    def _fuse(
-        self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray, color: np.ndarray | None,
-        labels: np.ndarray | None,
-    ) -> None:  # fmt: skip
-        self._receiver.integrate(depth, camera, T_world_camera, color, labels)
+    def _bring(self, paging: Paging, images: Sequence[PosedView]) -> float:
+        """Brings what is on disk of what images may tell of; returns the seconds that took."""
+        start = time.perf_counter()
+        if self.pager is None:
+            distances = 0.0 if self.field is None else self.settings.esdf.max_distance
+            self.pager = CellPager(self.tsdf, paging.folder, paging.allowed, distances)
+        self.pager.bring(images)
+        return time.perf_counter() - start
 
-    def _insert(self, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray) -> None:
+    def _integrate(self, image: PosedView) -> None:
+        self._receiver.integrate(image.depth, image.camera, image.T_world_camera, image.color, image.labels)
+
+    def _insert(self, view: PosedView | PosedScan) -> None:
         assert self.occupancy is not None
-        self.occupancy.insert_depth(depth, camera, T_world_camera, free_depth=self.settings.tsdf.max_depth)
+        view.insert_into(self.occupancy, self.settings.tsdf.max_depth)
 
-    def rebuild(self, views: Iterable[PosedView]) -> None:
-        """Begins anew from keyframes where they are now, for after a loop was closed."""
+    def rebuild(self, views: Sequence[StoredView]) -> None:
+        """Begins anew from keyframes where they are now, for after a loop was closed. With paging, cells are fused
+        again when they are needed."""
         start = time.perf_counter()
         self.tsdf.clear()
         if self._on_device is not None:
             self._on_device = TorchTsdf(self.settings.tsdf, self._on_device.device, self._on_device.points)
         if self.occupancy is not None:
             self.occupancy = self._occupancy(self.occupancy.resolution)
-        for view in views:
-            self._fuse(view.depth, view.camera, view.T_world_camera, view.color, view.labels)
+        if self.pager is not None:
+            self.pager.rebuild(views)
+        for stored in views if self.pager is None or self.occupancy is not None else ():
+            view = replace(stored.read(), T_world_camera=stored.T_world_camera)
+            if self.pager is None:
+                self._integrate(view)
             if self.occupancy is not None:
-                self._insert(view.depth, view.camera, view.T_world_camera)
+                self._insert(view)
         if self.field is not None and self._on_device is None:
             self.field.update()
         self.times.rebuilds.append(time.perf_counter() - start)
 
     def finish(self) -> None:
-        """Brings the TSDF from its device, and the distance field up to date."""
+        """Brings the TSDF from its device, and the distance field up to date. A field takes the whole TSDF into memory;
+        without one, what went to disk stays there."""
+        if self.pager is not None:
+            self.pager.write_all() if self.field is None else self.pager.bring_all()
         if self._on_device is not None:
             self.tsdf = self._on_device.to_native(self.context)
             self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
@@ -209,6 +284,9 @@ class VolumeMaps:
         Args:
             table: uint16 [65536], new id by old one; 0: none.
         """
+        if self.pager is not None:
+            self.pager.write_all()
+            self.pager.relabel(table)
         blocks = self.tsdf.blocks()
         dense = blocks.coordinates[blocks.dense]
         for start in range(0, len(dense), 4096):

@@ -238,8 +238,9 @@ class OccupancyMap:
         limits = (s.probability_hit, s.probability_miss, s.probability_minimum, s.probability_maximum)
         where = (ctypes.c_float * 3)(*(np.asarray(origin, np.float64).reshape(3) - self.origin).astype(np.float32))
         return InsertSettings(
-            -1.0 if max_range is None else max_range, where, *map(log_odds, limits), int(s.quantize), int(s.last_voxel)
-        )
+            -1.0 if max_range is None else max_range, where, *map(log_odds, limits), int(s.quantize), int(s.last_voxel),
+            s.most_hits,
+        )  # fmt: skip
 
     def _insert(
         self, insert: Callable[[object, object], int], origin: np.ndarray, max_range: float | None

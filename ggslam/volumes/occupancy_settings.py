@@ -29,6 +29,9 @@ class OccupancyTuning:
     """Upper bound of a voxel's occupancy, so that changes show within a few scans."""
     quantize: bool = True
     """Cast one ray per occupied voxel instead of one per point."""
+    most_hits: int = setting(1, 1, 1000)
+    """With `quantize`, a voxel is hit in one scan as many times as points lie in it, but no more than this many times;
+    1: once, as when OctoMap inserts a scan."""
     last_voxel: bool = True
     """Rays cut at the range free the voxel they end in; false as in OctoMap."""
 
@@ -48,6 +51,9 @@ class OccupancySettings(OccupancyTuning):
                 f"expected {self.probability_minimum:g} to {self.probability_maximum:g} (the clamping thresholds), "
                 f"found {self.probability_occupied}",
             )
+
+        if self.most_hits > 1 and not self.quantize:
+            raise Conflict("most_hits", f"needs `quantize`, found {self.most_hits} without it")
 
     @classmethod
     def with_raised_odds(cls) -> OccupancySettings:

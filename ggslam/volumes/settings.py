@@ -91,6 +91,12 @@ class TsdfSettings(TsdfTuning):
         return 0.5 / self.max_depth**2
 
     @property
+    def most_depth(self) -> float:
+        """Metres, a truncation beyond the range: what is measured farther away tells no more than at this depth. A view
+        changes voxels up to a truncation behind its depth."""
+        return self.max_depth + self.truncation
+
+    @property
     def truncation(self) -> float:
         """In metres."""
         return self.truncation_voxels * self.voxel

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +23,7 @@ _VERSION: Final = 2
 _ORIGIN = "origin"
 """Where in the world blocks are counted from, float64 [3]; there if it is not zero."""
 _CONTENT = "a TSDF"
-_VOXEL_ARRAYS = {
+VOXEL_ARRAYS = {
     "value": (np.int16, ()), "weight": (np.uint16, ()), "color": (np.uint8, (3,)), "label": (np.uint16, ()),
     "votes": (np.uint8, ()), "hits": (np.uint8, ()), "octants": (np.uint8, ()),
 }  # fmt: skip
@@ -45,19 +46,34 @@ def tsdf_to_bytes(tsdf: TsdfMap) -> bytes:
     # Order in the map depends on its history; in the file it does not.
     order = np.lexsort(blocks.coordinates.T)
     coordinates, dense = blocks.coordinates[order], blocks.dense[order]
-    voxels = tsdf.read(coordinates[dense])
+    voxels = vars(tsdf.read(coordinates[dense]))
+    arrays = tsdf_arrays(tsdf, coordinates[dense], coordinates[~dense], blocks.free_weight[order][~dense], voxels)
+    return arrays_to_bytes(**arrays)
+
+
+def tsdf_arrays(
+    like: TsdfMap, dense: np.ndarray, free: np.ndarray, free_weight: np.ndarray, voxels: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The arrays of the file.
+
+    Args:
+        like: a map of these settings and origin.
+        dense, free: coordinates [n, 3], [m, 3] of the blocks, sorted.
+        free_weight: [m].
+        voxels: of the dense blocks.
+    """
     names = sorted(field.name for field in dataclasses.fields(TsdfSettings))
-    place = {_ORIGIN: tsdf.origin} if tsdf.origin.any() else {}
-    return arrays_to_bytes(
-        version=np.array(_VERSION),
-        setting_names=np.array(names),
-        setting_values=np.array([getattr(tsdf.settings, name) for name in names], float),
-        dense=coordinates[dense],
-        free=coordinates[~dense],
-        free_weight=blocks.free_weight[order][~dense],
-        **{name: getattr(voxels, name) for name in _VOXEL_ARRAYS},
+    place = {_ORIGIN: like.origin} if like.origin.any() else {}
+    return {
+        "version": np.array(_VERSION),
+        "setting_names": np.array(names),
+        "setting_values": np.array([getattr(like.settings, name) for name in names], float),
+        "dense": dense,
+        "free": free,
+        "free_weight": free_weight,
+        **{name: voxels[name] for name in VOXEL_ARRAYS},
         **place,
-    )
+    }
 
 
 def load_tsdf(path: str | Path, frozen: bool = True, context: NativeContext | None = None) -> TsdfMap:
@@ -85,7 +101,7 @@ def tsdf_of_arrays(arrays: dict[str, np.ndarray], path: str | Path, context: Nat
         arrays = {**arrays, **{name: np.zeros((len(dense), VOXELS), np.uint8) for name in _SINCE_2}}
     voxels = {
         name: _check(path, arrays, name, dtype, (len(dense), VOXELS, *tail))
-        for name, (dtype, tail) in _VOXEL_ARRAYS.items()
+        for name, (dtype, tail) in VOXEL_ARRAYS.items()
     }
     free_weight = _check(path, arrays, "free_weight", np.uint16, (len(free),))
     everything = np.concatenate([dense, free])
@@ -103,14 +119,14 @@ def tsdf_of_arrays(arrays: dict[str, np.ndarray], path: str | Path, context: Nat
 def blocks_within(arrays: dict[str, np.ndarray], low: np.ndarray, high: np.ndarray) -> dict[str, np.ndarray]:
     """The arrays of a file without the blocks that lie outside of coordinates low to high [3]."""
     inside = {name: ((arrays[name] >= low) & (arrays[name] <= high)).all(1) for name in ("dense", "free")}
-    chosen = {name: arrays[name][inside["dense"]] for name in ("dense", *_VOXEL_ARRAYS)}
+    chosen = {name: arrays[name][inside["dense"]] for name in ("dense", *VOXEL_ARRAYS)}
     chosen |= {name: arrays[name][inside["free"]] for name in ("free", "free_weight")}
     return {**arrays, **chosen}
 
 
 def join_blocks(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """The arrays of several files, which have no block in common, as of one."""
-    names = ("dense", *_VOXEL_ARRAYS, "free", "free_weight")
+    names = ("dense", *VOXEL_ARRAYS, "free", "free_weight")
     return {**parts[0], **{name: np.concatenate([part[name] for part in parts]) for name in names}}
 
 

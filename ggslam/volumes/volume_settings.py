@@ -29,5 +29,8 @@ class VolumeSettings(VolumeTuning):
     occupancy: OccupancySettings = field(default_factory=OccupancySettings.with_raised_odds)
     esdf_every: int = setting(0, 0, 10**6, "frames")
     """Update the distance field every n-th frame; 0: every frame in live use, else once at the end."""
+    budget_mb: float = setting(0.0, 0, 1e9, "MB")
+    """Memory for TSDF and distance field: what does not fit is kept on disk while frames are fused. 0: automatic: what
+    `memory_limit_mb` leaves, or with `live` a quarter of that; without it no limit."""
     decay_every: int = setting(0, 0, 10**6, "frames")
     """Decay the weights of the TSDF every n-th frame, for live maps of changing places; 0: never."""

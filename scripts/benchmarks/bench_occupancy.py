@@ -4,6 +4,7 @@
 
     python scripts/benchmarks/bench_occupancy.py ../shared/data/redkitchen
     python scripts/benchmarks/bench_occupancy.py ../shared/data/livingroom --voxels 0.08 0.02 --frames 5
+    python scripts/benchmarks/bench_occupancy.py --weights --voxels 0.1 0.05
 
 Ways (all but the last two into a tree of pyoctomap):
     raw        insertPointCloud with every point: the reference, and the map that agreement is measured against
@@ -19,6 +20,8 @@ many times faster than raw. Like for like, which a line of its own has: `every` 
 native against the faster of discretize and quantised (a ray for every voxel). OctoMap uses one thread, ours as many as
 the first line says (--threads). The maps of all ways but raw and `every` must be equal byte for byte, and so must those
 two; a line tells if they are not.
+
+With --weights: what it brings to count a voxel's points, see occupancy_weights.py; takes no recording.
 
 Agreement is that of the quantised with the unquantised map, both native, after more frames: equal voxels among those
 known to both / known to either, with OctoMap's log-odds and with the raised ones in the quantised map.
@@ -41,6 +44,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "volumes"))
 
 import numpy as np
 from agreement import agreement
+from occupancy_weights import print_weights
 from pyoctomap_bridge import insert_batched, insert_rebuilding
 
 from ggslam.native.loader import NativeContext
@@ -160,7 +164,8 @@ def print_agreement(voxel: float, recording: Path, frames: int, context: NativeC
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recording", type=Path)
+    parser.add_argument("recording", type=Path, nargs="?")
+    parser.add_argument("--weights", action="store_true", help="the table of occupancy_weights.py alone")
     parser.add_argument("--voxels", type=float, nargs="+", default=[0.16, 0.08, 0.04, 0.02, 0.01], help="metres")
     parser.add_argument("--frames", type=int, default=3)
     parser.add_argument("--agreement-frames", type=int, default=40)
@@ -168,6 +173,12 @@ def main() -> None:
     parser.add_argument("--threads", type=int, help="of our ways; default: one per processor")
     arguments = parser.parse_args()
     context = NativeContext(arguments.threads)
+    if arguments.weights:
+        for voxel in arguments.voxels:
+            print_weights(voxel, context)
+        return
+    if arguments.recording is None:
+        parser.error("expected a recording, or --weights")
     scans = list(load_scans(arguments.recording, arguments.frames))
     sizes = ", ".join(str(len(scan.points)) for scan in scans)
     print(f"{len(scans)} frames of {sizes} points, {context.threads} threads")

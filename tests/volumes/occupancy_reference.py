@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import numpy as np
 
@@ -34,12 +35,15 @@ def voxels_between(origin: np.ndarray, end: np.ndarray, resolution: float) -> se
 
 
 class ReferenceMap:
-    def __init__(self, resolution: float, quantize: bool) -> None:
-        self.resolution, self.quantize = resolution, quantize
+    """`most_hits`: a voxel is hit as many times as points lie in it, but no more often."""
+
+    def __init__(self, resolution: float, quantize: bool, most_hits: int = 1) -> None:
+        self.resolution, self.quantize, self.most_hits = resolution, quantize, most_hits
         self.values: dict[Key, np.float32] = {}
 
     def insert(self, points: np.ndarray, origin: np.ndarray, max_range: float = math.inf) -> None:
         ends = points.astype(np.float64)
+        counts = Counter(key_of(point, self.resolution) for point in ends)
         if self.quantize:
             ends = np.array([center_of(key, self.resolution) for key in {key_of(p, self.resolution) for p in ends}])
         free: set[Key] = set()
@@ -54,7 +58,8 @@ class ReferenceMap:
         for key in free - occupied:
             self._add(key, MISS)
         for key in occupied:
-            self._add(key, HIT)
+            for _ in range(min(counts[key], self.most_hits)):
+                self._add(key, HIT)
 
     def _add(self, key: Key, update: np.float32) -> None:
         self.values[key] = min(max(self.values.get(key, np.float32(0)) + update, LOW), HIGH)

@@ -45,6 +45,33 @@ def test_log_odds_of_the_reference(name: str, quantize: bool, max_range: float |
     np.testing.assert_array_equal(occupancy.log_odds(centers), list(reference.values.values()))
 
 
+@pytest.mark.parametrize("name", available_instruction_sets())
+@pytest.mark.parametrize("most_hits", [2, 5, 1000])
+def test_points_of_a_voxel_count_as_hits(name: str, most_hits: int) -> None:
+    """As in the reference, which adds them one by one; in any number of threads."""
+    maps = [OccupancyMap(0.2, OccupancySettings(most_hits=most_hits), NativeContext(n, name)) for n in (1, 2)]
+    reference = ReferenceMap(0.2, True, most_hits)
+    for points, origin in random_scans(points=400):
+        for occupancy in maps:
+            occupancy.insert(points, origin)
+        reference.insert(points, origin.astype(np.float64))
+    centers = np.array([center_of(key, 0.2) for key in reference.values])
+    np.testing.assert_array_equal(maps[0].log_odds(centers), list(reference.values.values()))
+    assert full_octomap(maps[0]) == full_octomap(maps[1])
+
+
+def test_blocks_that_points_make_sure_are_one_leaf() -> None:
+    """Seen from within, a cube of 8^3 voxels full of points is occupied for sure after one scan, and takes no block."""
+    grid = (np.stack(np.meshgrid(*[np.arange(8)] * 3), -1).reshape(-1, 3) + 0.5) * 0.1
+    points = np.repeat(grid, 4, axis=0)
+    once, often = OccupancyMap(0.1), OccupancyMap(0.1, OccupancySettings(most_hits=5))
+    once.insert(points, grid[100]), often.insert(np.repeat(points, 2, axis=0), grid[100])
+    assert often.leaves().log_odds == pytest.approx([log_odds(0.971)]) and often.summary().blocks == 0
+    assert once.leaves().log_odds == pytest.approx([log_odds(0.7)])
+    with pytest.raises(ConfigError, match="quantize"):
+        OccupancySettings(most_hits=2, quantize=False)
+
+
 def test_rays_along_the_axes_and_in_the_sensors_own_voxel() -> None:
     occupancy = OccupancyMap(0.5)
     counts = occupancy.insert(

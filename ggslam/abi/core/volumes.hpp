@@ -62,6 +62,14 @@ struct MeshArrays {
   int32_t* triangles;
 };
 
+// How a laser scan becomes depth images of `size` x `size` pixels with a view of 90 degrees. Lengths in metres.
+struct ScanFaceSettings {
+  float nearest, farthest;  // points nearer or farther are left out
+  float max_edge;           // of the triangles between neighbouring points
+  float min_incidence;      // least cosine between a triangle's normal and the ray to it
+  int32_t columns, size;    // columns of points in a turn; pixels
+};
+
 // A camera and its pose.
 struct RaycastView {
   float fx, fy, cx, cy;
@@ -80,6 +88,15 @@ struct SurfaceImages {
   uint16_t* labels;
 };
 
+// Places [layers, rows, columns]: start + layer * layer_step + row * row_step + column * column_step, in voxels from the
+// map's origin.
+struct ColumnGrid {
+  double start[3], layer_step[3], row_step[3], column_step[3];
+  int32_t layers, rows, columns;
+};
+constexpr int kSeenBit = 1;
+constexpr int kBehindBit = 2;
+
 }  // namespace ggslam::volumes
 
 namespace ggslam {
@@ -90,6 +107,7 @@ struct InsertSettings {
   float origin[3];
   float hit, miss, minimum, maximum;
   std::int32_t quantize, last_voxel;  // last_voxel: rays cut at the range free the voxel they end in, too
+  std::int32_t most_hits;             // where `quantize`: points of a voxel that count, each as a hit
 };
 
 // What a scan saw.
@@ -139,6 +157,14 @@ GGSLAM_EXPORT int ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, ui
 GGSLAM_EXPORT int ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at,
                                    const ggslam::volumes::VoxelArrays* out);
 
+// Eighths of occupied voxels that points were measured in: their middles [n, 3] in voxels from the map's origin. Returns n;
+// `middles` may be null.
+GGSLAM_EXPORT int64_t ggslam_tsdf_octants(void* handle, double* middles);
+
+// What the voxels are that places [layers, rows, columns] lie in: kSeenBit, kBehindBit (behind a surface).
+GGSLAM_EXPORT int ggslam_tsdf_columns(void* handle, void* context, const ggslam::volumes::ColumnGrid* grid,
+                                      uint8_t* seen);
+
 // Writes voxels of the blocks at coordinates [n, 3], made where there are none. What `in` lacks stays as it is.
 GGSLAM_EXPORT int ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at,
                                     const ggslam::volumes::VoxelArrays* in);
@@ -171,6 +197,12 @@ GGSLAM_EXPORT int ggslam_mesher_write(void* context, void* mesher, const ggslam:
 GGSLAM_EXPORT int ggslam_mesher_destroy(void* mesher);
 GGSLAM_EXPORT int ggslam_raycast(void* context, void* cells, const ggslam::volumes::RaycastView* view,
                                  const ggslam::volumes::SurfaceImages* out);
+
+// Depth [faces, size, size] of points [n, 3] around the sensor, in metres, 0 where nothing was measured; `faces` [faces,
+// 9]: right, down and forward of each, row by row. Returns the number of triangles between points.
+GGSLAM_EXPORT int64_t ggslam_scan_faces(void* context, const ggslam::volumes::ScanFaceSettings* settings,
+                                        const float* points, std::uint64_t n, const float* faces, std::int32_t count,
+                                        float* depth);
 
 // The TSDF must live as long as the field.
 GGSLAM_EXPORT void* ggslam_esdf_create(void* tsdf, float max_distance);

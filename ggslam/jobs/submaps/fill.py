@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.errors import ConfigError, FormatError, SequenceError
-from ggslam.formats.trajectory import read_trajectory
+from ggslam.driving.body import CameraBody
+from ggslam.driving.body_options import read_body
+from ggslam.errors import ConfigError, FormatError
 from ggslam.jobs.progress import Observer
+from ggslam.jobs.submaps.given_poses import poses_of_items
 from ggslam.jobs.submaps.sensor_settings import in_words, settings_of_cloud, settings_of_scans, with_chosen
 from ggslam.jobs.submaps.stores import (
     INDOORS,
@@ -48,8 +50,6 @@ class StoreFillTuning(Tuning):
 
     max_missed = 0.1
     """Largest share of frames that leave nothing in the store without a note."""
-    max_time_gap_s = 0.02
-    """Largest difference between the times of a frame and of a pose from another file, in seconds."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,8 @@ class SubmapsRequest:
         settings: fields of `SubmapSettings` that are not the default's (of a new store) or the store's.
         sequence: how the recording is read.
         columns: numbers of a point in .bin scans; None: as they tell themselves.
+        body: of the robot, left out of a recording's scans or depth, see `driving.body_options.read_body`;
+            `body_frame`: the sensor's link in a URDF file.
     """
 
     source: Path
@@ -75,6 +77,8 @@ class SubmapsRequest:
     settings: Mapping[str, Any]
     sequence: SequenceRequest
     columns: int | None = None
+    body: tuple[str, ...] = ()
+    body_frame: str | None = None
 
 
 @dataclass(frozen=True)
@@ -144,6 +148,8 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
     cloud = read_cloud(source, request.columns) if is_cloud(source) else None
     settings = _settings(request, cloud, observer)
     recording = None if cloud is not None or (source / MARKER).is_file() else _open(request, settings)
+    if recording is None and request.body:
+        raise ConfigError(f"`body` is left out of a recording's scans or depth; {source} is none")
     with open_or_create(request.store, settings) as store:
         if recording is not None:
             items, poses, sights = recording
@@ -230,41 +236,21 @@ def _open(
     request: SubmapsRequest, settings: SubmapSettings
 ) -> tuple[Iterator[Frame | LaserScan], np.ndarray, FrameSights | ScanSights]:
     """Items, their poses and what takes sights from them."""
-    wanted = request.sequence
+    wanted, body = request.sequence, read_body(request.body, request.body_frame)
     if scan_files(request.source):
         scans = _scans(request)
-        return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights(settings.axes)
+        items = scans.stream()
+        if body is not None:
+            items = (replace(scan, points=body.without(scan.points)) for scan in items)
+        poses = poses_of_items(request.source, scans.timestamps, request.poses, scans.ground_truth)
+        return items, poses, ScanSights(settings.axes)
     refuse_unread_scans(request.source)
     frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())
-    poses = _poses(request, frames.timestamps, frames.ground_truth, frames.pose_problem)
-    return frames.stream(masks=False), poses, sights
-
-
-def _poses(
-    request: SubmapsRequest, timestamps: np.ndarray, own: np.ndarray | None, problem: str = ""
-) -> np.ndarray:
-    """Of the items, [n, 4, 4]; `problem`: why the recording's own cannot be used."""
-    if request.poses is None:
-        if own is None or not np.isfinite(own).all((1, 2)).any():
-            why = f" ({problem})" if problem else ""
-            raise SequenceError(
-                f"{request.source}: no poses{why}; `ggslam localize` finds them, `poses` names their file"
-            )
-        return own
-    found = read_trajectory(request.poses)
-    poses = np.full((len(timestamps), 4, 4), np.nan)
-    order = np.argsort(found.timestamps, kind="stable")
-    times = found.timestamps[order]
-    after = np.clip(np.searchsorted(times, timestamps), 1, max(len(times) - 1, 1))
-    before = after - 1
-    last = np.minimum(after, len(times) - 1)
-    nearest = np.where(np.abs(times[before] - timestamps) <= np.abs(times[last] - timestamps), before, last)
-    near = np.abs(times[nearest] - timestamps) <= StoreFillTuning.max_time_gap_s
-    poses[near] = found.T_world_camera[order][nearest[near]]
-    if not near.any():
-        raise FormatError(f"{request.poses}: none of its times is within {StoreFillTuning.max_time_gap_s} s of a frame")
-    return poses
+    own = frames.ground_truth
+    poses = poses_of_items(request.source, frames.timestamps, request.poses, own, frames.pose_problem)
+    stream = frames.stream(masks=False)
+    return stream if body is None else map(CameraBody(body).without, stream), poses, sights
 
 
 def _words_of_missed(store: GridStore, poses: np.ndarray) -> str:

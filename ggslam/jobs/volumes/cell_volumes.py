@@ -135,7 +135,7 @@ def look_at_frames(task: LookTask) -> np.ndarray:
     for row, (visit, number, T_world_camera) in enumerate(task.views):
         frame = recording_of(task.records[visit]).frame(number, masks=False)
         depth = frame.depth_or_infinity()
-        depth = np.where(depth >= s.min_depth, np.minimum(depth, s.max_depth), 0)
+        depth = np.where(depth >= s.min_depth, np.minimum(depth, s.most_depth), 0)
         if depth.any():
             reach = depth_reach(depth, *CellVolumeTuning.tiles) + s.truncation
             frustums = Frustums.of(frame.camera, inverse(T_world_camera)[None], reach[None])

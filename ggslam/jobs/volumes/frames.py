@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from ggslam.driving.body import Body, CameraBody
 from ggslam.errors import ConfigError, RunFolderError
+from ggslam.jobs.submaps.given_poses import poses_of_items
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.cpu import CpuRasterizer
@@ -20,8 +22,10 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
+from ggslam.sequences.rig import RigSequence, together_by_instant
 from ggslam.system.plurals import quantity, word_for
 from ggslam.system.tuning import Tuning
+from ggslam.volumes.posed_view import PosedView
 
 
 class FarFrameTuning(Tuning):
@@ -47,6 +51,31 @@ class PosedFrame:
     T_world_camera: np.ndarray
     labels: np.ndarray | None = None
 
+    @property
+    def timestamp(self) -> float:
+        """Seconds."""
+        return self.frame.timestamp
+
+    @property
+    def instant(self) -> int | None:
+        """Of a rig; None without one."""
+        return self.frame.instant
+
+    @property
+    def depth(self) -> np.ndarray:
+        """How far everything is, metres, float32 [H, W]; 0: unknown."""
+        return self.frame.depth
+
+    @property
+    def T_world_upright(self) -> np.ndarray:
+        """Pose [4, 4] of axes that look like a camera's that is held upright: y roughly down."""
+        return self.T_world_camera
+
+    def view(self) -> PosedView:
+        """What is fused of it."""
+        frame = self.frame
+        return PosedView(frame.depth_or_infinity(), frame.camera, self.T_world_camera, frame.color, self.labels)
+
 
 @dataclass
 class FrameSource:
@@ -59,6 +88,7 @@ class FrameSource:
         label: object ids of a frame, None if it tells of none; None without objects.
         names: of object ids.
         notes: what a user should know.
+        body: of the robot, which is left out of depth; None: nothing is.
     """
 
     name: str
@@ -67,16 +97,38 @@ class FrameSource:
     label: Callable[[Frame, np.ndarray], np.ndarray | None] | None = None
     names: dict[int, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    body: CameraBody | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What seems wrong with the recording."""
+        return self.sequence.warnings
+
+    def instants(self) -> Iterator[list[PosedFrame]]:
+        """The same, those that the cameras of a rig took at one instant together."""
+        return together_by_instant(self, lambda posed: posed.frame)
+
+    def bare(self) -> FrameSource:
+        """The same without object ids."""
+        return replace(self, label=None)
 
     def __iter__(self) -> Iterator[PosedFrame]:
         """All frames whose pose is known, in order."""
         for frame in self.sequence.stream(masks="lazy" if self.label is not None else False):
             T = self.poses.get(frame.index)
             if T is not None:
+                frame = frame if self.body is None else self.body.without(frame)
                 yield PosedFrame(frame, T, None if self.label is None else self.label(frame, T))
+
+
+def body_of(body: Body | None, sequence: Sequence) -> CameraBody | None:
+    """A body as the cameras of a recording have it."""
+    if body is None:
+        return None
+    return CameraBody(body, sequence.rig.T_first_camera if isinstance(sequence, RigSequence) else None)
 
 
 def frames_of_run(
@@ -131,15 +183,23 @@ def far_away(poses: Mapping[int, np.ndarray]) -> list[int]:
     ]
 
 
-def frames_of_recording(request: SequenceRequest, objects: bool = True) -> FrameSource:
-    """The frames of a recording at the poses that it tells itself.
+def frames_of_recording(request: SequenceRequest, objects: bool = True, file: Path | None = None) -> FrameSource:
+    """The frames of a recording at the poses that it tells itself, or at those of a file.
+
+    Args:
+        request: the recording.
+        objects: whether object ids are wanted, if it has masks.
+        file: a trajectory; None: the recording's own poses.
 
     Raises:
         SequenceError: it cannot be read.
+        FormatError: the file cannot.
         ConfigError: it tells no poses.
     """
     sequence = request.open()
     truth = sequence.ground_truth
+    if file is not None:
+        truth = poses_of_items(request.path, sequence.timestamps, file, None)
     poses = {} if truth is None else {i: T for i, T in enumerate(truth) if is_valid_pose(T)}
     if not poses:
         why = f" ({sequence.pose_problem})" if sequence.pose_problem else ""
@@ -148,7 +208,8 @@ def frames_of_recording(request: SequenceRequest, objects: bool = True) -> Frame
             "of it"
         )
     source = FrameSource(str(sequence.path), sequence, poses, names=dict(sequence.instance_names))
-    source.notes.append(f"poses of the recording itself ({sequence.pose_source})")
+    whose = f"of the recording itself ({sequence.pose_source})" if file is None else f"of {file}"
+    source.notes.append(f"poses {whose}")
     if len(poses) < len(sequence):
         left_out = len(sequence) - len(poses)
         source.notes.append(f"{quantity(left_out, 'frame')} without a pose {word_for(left_out, 'is', 'are')} left out")

@@ -4,29 +4,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ggslam.driving.body import Body
+from ggslam.driving.body_options import read_body
+from ggslam.driving.inflation import parse_inflation
 from ggslam.errors import ConfigError, RunFolderError, SequenceError
 from ggslam.formats.mesh_files import check_mesh_path
-from ggslam.geometry.scene_size import scene_scale
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.run.pipeline import RunRequest, execute
-from ggslam.jobs.volumes.frames import FrameSource, frames_of_recording, frames_of_run
+from ggslam.jobs.volumes.frames import FrameSource, PosedFrame, body_of, frames_of_recording, frames_of_run
+from ggslam.jobs.volumes.fused import Fused, fuse_source, level_occupancy
 from ggslam.jobs.volumes.live import LiveVolumes
+from ggslam.jobs.volumes.memory import cells_on_disk, lines_of_cells
 from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, Surface, prepare_folder, write_outputs
+from ggslam.jobs.volumes.point_rates import PointRates
+from ggslam.jobs.volumes.robot_maps import parse_robots
+from ggslam.jobs.volumes.scans import ScanSource, scans_of_recording
+from ggslam.localization.scans import refuse_unread_scans, scan_files
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
-from ggslam.scene.frame import Frame
 from ggslam.slam.config import Config, config_to_dict, load_config, settings_notes
 from ggslam.system.atomic import make_folder
 from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.opencv import opencv_errors
 from ggslam.volumes.maps import VolumeMaps, VolumeTimesTuning
-from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.output_frame import OutputFrame, output_frame
 from ggslam.volumes.tsdf_file import load_tsdf
 from ggslam.volumes.volume_settings import VolumeSettings
@@ -41,6 +46,8 @@ class VolumesRequest:
         sequence: how to read a recording.
         scale: of the images of a run's recording; None: as the run did.
         recording: where a run's recording is now, if it was moved.
+        poses: trajectory file of a recording; None: its own poses.
+        columns: numbers of a point in .bin scans; None: as they tell themselves.
         out: folder of the results; None: `RUN/volumes`, or `volumes/NAME` of a recording.
         voxel: of the TSDF, metres; None: as the settings say; where they say nothing, as goes with the scene's size.
         esdf: whether a distance field is wanted.
@@ -53,6 +60,10 @@ class VolumesRequest:
         onto: file of a TSDF to go on in.
         slice_height: metres above the floor of the slice through the distance field; None: as high as the camera was.
         band: lowest and highest obstacle of the ROS map, metres above the floor.
+        robots: that get maps of their own, see `driving.robot.parse_robot`.
+        inflation: how costs fall off in their costmaps, see `driving.inflation.parse_inflation`.
+        body: of the robot in view, see `driving.body_options.read_body`.
+        body_frame: the camera's link in a URDF file.
         frame: of meshes and occupancy: "map", or "floor" (z up, 0 on the floor); see `volumes.floor_frame`.
         latency: whether it is to be known how long all maps take with a frame.
         device: of torch, for the TSDF, e.g. cuda; None: the compiled core.
@@ -64,6 +75,8 @@ class VolumesRequest:
     sequence: SequenceRequest
     scale: float | None = None
     recording: Path | None = None
+    poses: Path | None = None
+    columns: int | None = None
     out: Path | None = None
     voxel: float | None = None
     esdf: bool = False
@@ -76,6 +89,10 @@ class VolumesRequest:
     onto: Path | None = None
     slice_height: float | None = None
     band: tuple[float, float] = (0.1, 1.5)
+    robots: tuple[str, ...] = ()
+    inflation: str = "0.55,10"
+    body: tuple[str, ...] = ()
+    body_frame: str | None = None
     frame: str = "map"
     latency: bool = False
     device: str | None = None
@@ -92,11 +109,12 @@ class VolumesOutcome:
         out: folder of the results.
         files: that were written.
         lines: facts for people.
-        times: milliseconds a frame, see `VolumeTimes.summary`.
+        times: milliseconds a `unit`, see `VolumeTimes.summary`.
         window: frames that a mean of `by_window_ms` is over.
         map_latency_s: 95 % of the frames were in all maps after this many seconds.
         depth_range_m: 95 % of the depth was nearer.
         error: why fusing stopped early, if it did.
+        unit: of the times: "frame", or "instant" of a rig.
     """
 
     out: Path
@@ -107,37 +125,7 @@ class VolumesOutcome:
     map_latency_s: float
     depth_range_m: float
     error: BaseException | None = None
-
-
-@dataclass
-class _Fused:
-    """Result of fusing: the maps, camera poses, names of objects, and the reason if it stopped early."""
-
-    maps: VolumeMaps
-    name: str
-    poses: list[np.ndarray] = field(default_factory=list)
-    timestamps: list[float] = field(default_factory=list)
-    depth_ranges: list[float] = field(default_factory=list)
-    names: dict[int, str] = field(default_factory=dict)
-    error: BaseException | None = None
-
-    def saw(self, frame: Frame, T_world_camera: np.ndarray) -> None:
-        """Remembers where a frame was seen from, and how far it saw of what was fused."""
-        self.poses.append(T_world_camera)
-        self.timestamps.append(frame.timestamp)
-        limits = self.maps.settings.tsdf
-        for seen in (frame.depth[::8, ::8], frame.depth):  # all of it only where none is in range
-            seen = seen[(seen >= limits.min_depth) & (seen <= limits.max_depth)]
-            if len(seen):
-                self.depth_ranges.append(float(np.percentile(seen, 95)))
-                break
-
-    def latency(self) -> float:
-        """Seconds after which 95 % of the frames are in all maps, the wait for a distance field that is not updated
-        with every frame included."""
-        whole, every = self.maps.times.whole(), max(1, self.maps.settings.esdf_every)
-        wait = float(np.median(np.diff(self.timestamps))) * (every - 1) if len(self.timestamps) > 1 else 0.0
-        return (float(np.percentile(whole, 95)) if len(whole) else 0.0) + wait
+    unit: str = "frame"
 
 
 @opencv_errors("volumes")
@@ -151,40 +139,51 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     observer = observer or SilentObserver()
     is_run = (request.source / MARKER).is_file()
     _check(request, is_run)
-    config = _config(request)
+    body, config = read_body(request.body, request.body_frame), _config(request)
+    _check_memory(request, config)
     for note in [] if request.live else settings_notes(config, request.config, request.overrides):
         observer.note(note)  # a live run tells of them itself
     onto = None if request.onto is None else load_tsdf(request.onto)
     maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
-    source: FrameSource | None = None
-    if request.live:
-        fused = _live(request, maps, observer)
-        out = Path(fused.name) / "volumes"
-        make_folder(out)
-        prepare_folder(out)
-    else:
-        source = _source(request, is_run)
-        out = _folder(request, is_run)
-        for note in [*source.sequence.warnings, *source.notes]:
-            observer.note(note)
-        fused = _fuse(source, maps, observer, request.voxel is None)
-    if not fused.poses:
-        raise fused.error if fused.error is not None else SequenceError(f"{request.source}: no frame could be fused")
-    with delay_interrupts():
-        maps.finish()
-        if not len(maps.tsdf) or (onto is None and not fused.depth_ranges):  # free space alone has no floor
-            limits = maps.settings.tsdf
-            raise SequenceError(
-                f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
-            )
-        surface, frame = Surface.of(maps, fused.poses), output_frame(request.frame)
-        if frame is OutputFrame.floor and source is not None:
-            _level_occupancy(maps, source, len(fused.poses), surface.T_floor_map, observer)
-        wanted = OutputRequest(
-            request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame
-        )
-        outputs = write_outputs(maps, surface, out, wanted, _record(request, config, fused), observer)
+    source = None if request.live else _source(request, is_run, body)
+    out = None if request.live else _folder(request, is_run)
+    with cells_on_disk(config, out) as maps.paging:
+        if source is None or out is None:
+            fused = _live(request, maps, body, observer)
+            out = Path(fused.name) / "volumes"
+            make_folder(out)
+            prepare_folder(out)
+        else:
+            for note in [*source.warnings, *source.notes]:
+                observer.note(note)
+            fused = fuse_source(source, maps, observer, request.voxel is None)
+        if not fused.poses:
+            raise fused.error or SequenceError(f"{request.source}: no frame could be fused")
+        with delay_interrupts():
+            outputs = _write(request, config, fused, source, out, observer)
     return _outcome(out, fused, outputs)
+
+
+def _write(
+    request: VolumesRequest, config: Config, fused: Fused, source: FrameSource | ScanSource | None, out: Path,
+    observer: Observer,
+) -> Outputs:  # fmt: skip
+    """Brings all maps up to date and writes them."""
+    maps = fused.maps
+    maps.finish()
+    if not maps.block_counts()[0] or (request.onto is None and not fused.depth_ranges):  # free space alone has no floor
+        limits = maps.settings.tsdf
+        raise SequenceError(
+            f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
+        )
+    surface, frame = Surface.of(maps, fused.poses), output_frame(request.frame)
+    if frame is OutputFrame.floor and source is not None:
+        level_occupancy(maps, source, len(fused.poses), surface.T_floor_map, observer)
+    wanted = OutputRequest(
+        request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame,
+        parse_robots(request.robots), parse_inflation(request.inflation),
+    )  # fmt: skip
+    return write_outputs(maps, surface, out, wanted, _record(request, config, fused), observer)
 
 
 def _config(request: VolumesRequest) -> Config:
@@ -227,6 +226,9 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
             raise ConfigError("`slice_height` needs `esdf`")
         if not abs(request.slice_height) < 1e4:
             raise ConfigError(f"`slice_height`: expected a height in metres, found {request.slice_height:g}")
+    parse_inflation(request.inflation)
+    if parse_robots(request.robots) and not request.esdf:
+        raise ConfigError("`robot` needs `esdf`")
     if request.recording is not None and not is_run:
         raise ConfigError(f"`recording` says where the recording of a run is; {request.source} is no run")
     if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
@@ -235,8 +237,16 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
             "`pose_convention`, `camera`, `intrinsics`, `depth_camera`, `depth_kind`, `depth_delay`, `upright` and "
             "`on_bad_frame` are for recordings"
         )
+    if request.poses is not None and (is_run or request.live):
+        raise ConfigError("`poses` is for recordings whose poses are known, not for runs or `live`")
     if request.mesh is not None:
         _check_mesh(request.mesh, request.source)
+
+
+def _check_memory(request: VolumesRequest, config: Config) -> None:
+    limited = config.memory_limit_mb or config.volumes.budget_mb
+    if limited and (request.onto is not None or request.device is not None):
+        raise ConfigError("`memory_limit_mb` and `volumes.budget_mb` go neither with `onto` nor with `device`")
 
 
 def _check_mesh(path: Path, source: Path) -> None:
@@ -261,48 +271,24 @@ def _folder(request: VolumesRequest, is_run: bool) -> Path:
     return out
 
 
-def _source(request: VolumesRequest, is_run: bool) -> FrameSource:
+def _source(request: VolumesRequest, is_run: bool, body: Body | None) -> FrameSource | ScanSource:
+    if not is_run and scan_files(request.source):
+        return replace(scans_of_recording(request.sequence, request.poses, request.columns), body=body)
     if is_run:
-        return frames_of_run(RunFolder.open(request.source), request.recording, request.scale, request.objects)
-    return frames_of_recording(request.sequence, request.objects)
+        source = frames_of_run(RunFolder.open(request.source), request.recording, request.scale, request.objects)
+    else:
+        refuse_unread_scans(request.source)
+        source = frames_of_recording(request.sequence, request.objects, request.poses)
+    return replace(source, body=body_of(body, source.sequence))
 
 
-def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer, fit_voxel: bool) -> _Fused:
-    fused = _Fused(maps, source.name, names=source.names)
-    observer.begin("fuse", len(source))
-    try:
-        for posed in source:
-            if not fused.poses:
-                maps.fit(scene_scale(posed.frame.depth), fit_voxel)
-            maps.add(posed.frame, posed.T_world_camera, posed.labels)
-            fused.saw(posed.frame, posed.T_world_camera)
-            observer.advance(len(fused.poses), len(source))
-    except (Exception, KeyboardInterrupt) as stopped:  # what was fused is written, then it is raised
-        fused.error = stopped
-    return fused
-
-
-def _level_occupancy(
-    maps: VolumeMaps, source: FrameSource, count: int, T_floor_map: np.ndarray, observer: Observer
-) -> None:
-    """Makes the occupancy map anew in the floor's frame of the first `count` frames: its voxels cannot be turned, for
-    OctoMap's lie along the axes of their frame."""
-    if maps.occupancy is None:
-        return
-    level = OccupancyMap(maps.occupancy.resolution, maps.settings.occupancy, maps.context)
-    observer.begin("occupancy on the floor", count)
-    bare = replace(source, label=None)
-    for done, posed in enumerate(islice(bare, count)):
-        T_floor_camera, depth = T_floor_map @ posed.T_world_camera, posed.frame.depth_or_infinity()
-        level.insert_depth(depth, posed.frame.camera, T_floor_camera, free_depth=maps.settings.tsdf.max_depth)
-        observer.advance(done + 1, count)
-    maps.occupancy = level
-
-
-def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fused:
+def _live(request: VolumesRequest, maps: VolumeMaps, body: Body | None, observer: Observer) -> Fused:
     """Tracks the recording into a run folder and fuses on the way."""
-    fused = _Fused(maps, str(request.source))
-    follower = LiveVolumes(maps, fused.saw, request.objects, request.voxel is None)
+    fused = Fused(maps, str(request.source))
+    follower = LiveVolumes(
+        maps, lambda frame, T: fused.saw(PosedFrame(frame, T)), request.objects, request.voxel is None, body,
+        lambda slam, frame: slam.movers.pixels.without(frame),
+    )  # fmt: skip
     pace = [] if request.realtime is None else [f"realtime_fps={request.realtime}"]
     run = RunRequest(
         request.sequence, request.out, request.config, [*request.overrides, *pace], evaluate=False,
@@ -320,12 +306,12 @@ def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fus
     return fused
 
 
-def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str, Any]:
+def _record(request: VolumesRequest, config: Config, fused: Fused) -> dict[str, Any]:
     """What volumes.json says of where the volumes come from."""
     return {
         "source": fused.name, "live": request.live, "frames": len(fused.poses), "onto": request.onto,
         "settings": config_to_dict(replace(config, volumes=fused.maps.settings))["volumes"],
-        "times": fused.maps.times.summary(),
+        "times": fused.maps.times.summary(), "points": PointRates.of(fused.maps).to_dict(),
         "frames_a_window": VolumeTimesTuning.window,
         "blocks_by_window": fused.maps.times.blocks[VolumeTimesTuning.window - 1 :: VolumeTimesTuning.window],
         "rebuilds_s": fused.maps.times.rebuilds,
@@ -333,9 +319,10 @@ def _record(request: VolumesRequest, config: Config, fused: _Fused) -> dict[str,
     }  # fmt: skip
 
 
-def _outcome(out: Path, fused: _Fused, outputs: Outputs) -> VolumesOutcome:
-    times = fused.maps.times
+def _outcome(out: Path, fused: Fused, outputs: Outputs) -> VolumesOutcome:
+    times, lines = fused.maps.times, [PointRates.of(fused.maps).line(), *lines_of_cells(fused.maps), *outputs.lines]
     return VolumesOutcome(
-        out, outputs.files, outputs.lines, times.summary(), VolumeTimesTuning.window, fused.latency(),
+        out, outputs.files, lines, times.summary(), VolumeTimesTuning.window, fused.latency(),
         float(np.median(fused.depth_ranges)) if fused.depth_ranges else 0.0, fused.error,
+        "frame" if fused.instant is None else "instant",
     )  # fmt: skip

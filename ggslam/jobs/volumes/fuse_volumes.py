@@ -25,6 +25,10 @@ def fuse_volumes(
     frame: str = "map",
     band: tuple[float, float] = (0.1, 1.5),
     slice_height: float | None = None,
+    robots: Iterable[str] = (),
+    inflation: str = "0.55,10",
+    poses: str | Path | None = None,
+    columns: int | None = None,
     config: str | None = None,
     overrides: Iterable[str] = (),
     observer: Observer | None = None,
@@ -33,7 +37,7 @@ def fuse_volumes(
     """Fuses the depth of a run or a recording into a TSDF and what is made of it, as `ggslam volumes` does.
 
     Args:
-        source: folder of a run, or a recording with poses.
+        source: folder of a run, or a recording or laser scans with poses.
         out: folder of the results; None: `volumes` in the run, or volumes/ and the recording's name.
         voxel: of the TSDF, metres; None: goes with the size of the scene.
         esdf: whether a distance field is made, with slices and a ROS map.
@@ -44,6 +48,11 @@ def fuse_volumes(
         frame: of meshes and occupancy: "map", or "floor" (z up, 0 on the floor).
         band: lowest and highest obstacle of the ROS map, metres above the floor.
         slice_height: metres above the floor of the slice through the distance field; None: as high as the camera was.
+        robots: such as "0.4,0.18" or "tall:1.2,0.3", height and radius in metres: each gets a map of what it meets
+            and a costmap; needs `esdf`.
+        inflation: `inflation_radius` and `cost_scaling_factor` of the costmaps, as nav2 has them.
+        poses: trajectory file of a recording or of laser scans; None: its own poses.
+        columns: numbers of a point in .bin scans; None: as they tell themselves.
         config: a preset's name, or a YAML file; None: the defaults.
         overrides: settings as "name.of.setting=value".
         observer: receives progress updates.
@@ -59,6 +68,7 @@ def fuse_volumes(
         Path(source), SequenceRequest.of(source, selection, "fuse_volumes"), out=None if out is None else Path(out),
         voxel=voxel, esdf=esdf, occupancy=occupancy, mesh=None if mesh is None else Path(mesh),
         object_meshes=object_meshes, objects=objects, slice_height=slice_height, band=band, frame=frame,
+        robots=tuple(robots), inflation=inflation, poses=None if poses is None else Path(poses), columns=columns,
         config=config, overrides=list(overrides),
     )  # fmt: skip
     outcome = make_volumes(request, observer)

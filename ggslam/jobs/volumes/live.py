@@ -3,19 +3,32 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
+from ggslam.driving.body import Body, CameraBody
 from ggslam.jobs.volumes.no_returns import NoReturns
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.frame import Frame
 from ggslam.slam.result import SlamResult, StepReport
+from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.slam import Slam
+from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackingStatus
+from ggslam.volumes.cell_rebuild import StoredView
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.posed_view import PosedView
+
+
+class LiveVolumeTuning(Tuning):
+    """What is known of keyframes."""
+
+    depth_unit_m = 0.01
+    """Keyframes keep depth as whole numbers of a unit that is smaller than this, in metres."""
 
 
 class LiveVolumes:
@@ -26,43 +39,73 @@ class LiveVolumes:
         saw: receives every frame that was fused, and its T_world_camera.
         objects: whether object ids are voted for.
         fit_voxel: whether voxels, unless set, follow the size of the scene.
+        body: of the robot, which is left out of depth; None: nothing is.
+        still: gives a frame that was tracked without what moves in it; None: as it came.
     """
 
     def __init__(
         self, maps: VolumeMaps, saw: Callable[[Frame, np.ndarray], None], objects: bool = True,
-        fit_voxel: bool = True,
+        fit_voxel: bool = True, body: Body | None = None, still: Callable[[Slam, Frame], Frame] | None = None,
     ) -> None:  # fmt: skip
         self.maps = maps
+        self._still, self._body, self._seen_body = still, body, None if body is None else CameraBody(body)
         self._saw, self._objects, self._fit_voxel = saw, objects, fit_voxel
         self._corrections = 0
         self._no_returns = NoReturns()
+        self._reach: dict[int, float] = {}
+        """Largest depth of each frame, metres, by its index."""
+        self._together: list[tuple[Frame, PosedView]] = []
+        """Of the instant that is going on; of one camera alone there is one."""
+        self._waited = 0.0
         self._current: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __call__(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         """A frame went through `slam.step`, or its real-time counterpart."""
+        frame = self._without_body(slam, frame if self._still is None else self._still(slam, frame))
         if slam.mapper.identity is not None:
             self._current = slam.mapper.identity.current
         start = time.perf_counter()
         if len(slam.corrections) > self._corrections:
             self._corrections = len(slam.corrections)
-            self.maps.rebuild(self._views(slam.mapper.keyframes))
-        if report.frame.status == TrackingStatus.LOST.value:
+            self.maps.rebuild(self._stored_views(slam.mapper.keyframes))
+        if report.frame.status != TrackingStatus.LOST.value:
+            self._together.append((frame, self._view(slam, frame, report)))
+        self._waited += report.seconds + time.perf_counter() - start
+        if frame.instant is None or slam.frames[-1].frame_index == frame.index:
+            self._fuse(slam)
+
+    def _view(self, slam: Slam, frame: Frame, report: StepReport) -> PosedView:
+        newest = slam.mapper.keyframes[-len(slam.cameras) :] if self._objects else []
+        labels = next((keyframe.mask for keyframe in newest if keyframe.frame_index == frame.index), None)
+        return PosedView(frame.depth_or_infinity(), frame.camera, slam.pose_of(report.frame), frame.color, labels)
+
+    def _fuse(self, slam: Slam) -> None:
+        """Fuses the frames of an instant, once all of them went through the step."""
+        together, self._together = self._together, []
+        waited, self._waited = self._waited, 0.0
+        if not together:
             return
         if not self.maps.times.rows:
             self.maps.fit(slam.scale, self._fit_voxel)
-        T = slam.pose_of(report.frame)
-        newest = slam.mapper.keyframes[-len(slam.cameras) :] if self._objects else []
-        labels = next((keyframe.mask for keyframe in newest if keyframe.frame_index == frame.index), None)
-        self.maps.add(frame, T, labels, report.seconds + time.perf_counter() - start)
-        self._no_returns.note(frame, slam.mapper.keyframes)
-        self._saw(frame, T)
+        self.maps.add_together([view for _, view in together], waited)
+        for frame, view in together:
+            self._reach[frame.index] = float(view.depth.max(initial=0.0)) + LiveVolumeTuning.depth_unit_m
+            self._no_returns.note(frame, slam.mapper.keyframes)
+            self._saw(frame, view.T_world_camera)
+
+    def _without_body(self, slam: Slam, frame: Frame) -> Frame:
+        if self._seen_body is None:
+            return frame
+        if self._body is not None and isinstance(slam, RigSlam):
+            self._seen_body, self._body = CameraBody(self._body, slam.rig.T_first_camera), None
+        return self._seen_body.without(frame)
 
     def follow_parts(self, result: SlamResult) -> bool:
         """At the end: fuses the keyframes anew if the recording fell into parts, some of which were left out or joined
         since the last frame. Returns whether there were several parts."""
         kinds = {event.kind for event in result.loop_events}
         if "left out" in kinds or any(e.kind == "joined" and e.frame < 0 for e in result.loop_events):
-            self.maps.rebuild(self._views(result.keyframes))
+            self.maps.rebuild(self._stored_views(result.keyframes))
         return "new part" in kinds
 
     def settle(self, known_ids: list[int]) -> None:
@@ -74,7 +117,16 @@ class LiveVolumes:
         known[known_ids] = True
         self.maps.relabel(np.where(known[ids], ids, 0).astype(np.uint16))
 
-    def _views(self, keyframes: list[Keyframe]) -> Iterator[PosedView]:
-        for keyframe in list(keyframes):
-            depth, labels = self._no_returns.depth_of(keyframe), keyframe.mask if self._objects else None
-            yield PosedView(depth, keyframe.camera, keyframe.T_world_camera, keyframe.color, labels)
+    def _stored_views(self, keyframes: Sequence[Keyframe]) -> list[StoredView]:
+        """Keyframes where they are now."""
+        return [
+            StoredView(k.camera, k.T_world_camera, self._reach.get(k.frame_index, math.inf), partial(self._read, k))
+            for k in list(keyframes)
+        ]
+
+    def _read(self, keyframe: Keyframe) -> PosedView:
+        depth, labels = self._no_returns.depth_of(keyframe), keyframe.mask if self._objects else None
+        if self._seen_body is not None:
+            hidden = self._seen_body.hidden_pixels(depth, keyframe.camera, keyframe.camera_number)
+            depth = np.where(hidden, np.float32(0), depth)
+        return PosedView(depth, keyframe.camera, keyframe.T_world_camera, keyframe.color, labels)

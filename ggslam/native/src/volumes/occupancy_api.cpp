@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <algorithm>
 #include <cstring>
 #include <limits>
 
@@ -38,9 +39,10 @@ std::size_t free_voxels(const Scan& scan) {
 
 bool insert(Context& context, OccupancyMap& map, const float* points, std::size_t n, const InsertSettings& s,
             InsertResult& result, const std::vector<float>& empty = {}) {
-  const ScanSettings settings{{s.origin[0], s.origin[1], s.origin[2]}, s.max_range, s.quantize != 0, s.last_voxel != 0};
+  const ScanSettings settings{{s.origin[0], s.origin[1], s.origin[2]}, s.max_range, s.quantize != 0, s.last_voxel != 0,
+                              s.most_hits > 1};
   if (!map.scan.cast(context, map.tree.grid, settings, points, n, empty)) return false;
-  apply_scan(context, map.scan, {s.hit, s.miss, s.minimum, s.maximum}, map.tree);
+  apply_scan(context, map.scan, {s.hit, s.miss, s.minimum, s.maximum, s.most_hits}, map.tree);
   result = {map.scan.rays(), free_voxels(map.scan), map.scan.occupied().voxels()};
   return true;
 }
@@ -194,6 +196,10 @@ GGSLAM_EXPORT std::uint64_t ggslam_quantize(void* context, double resolution, co
   quantize(object_of<Context>(context), KeyGrid(resolution), points, n, codes, voxels);
   std::uint16_t* out = keys;
   for_each_voxel(voxels, [&](std::uint64_t code) { put_keys(out, code); });
-  if (counts != nullptr) count_points(codes, voxels, counts);
+  if (counts != nullptr) {
+    PointCounts found;
+    found.take(codes, voxels);
+    std::copy(found.counts.begin(), found.counts.end(), counts);
+  }
   return static_cast<std::uint64_t>(out - keys) / 3;
 } GGSLAM_CATCH_ALL

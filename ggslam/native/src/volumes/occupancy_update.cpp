@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "volumes/occupancy_update.hpp"
 
+#include <algorithm>
+
 GGSLAM_DECLARE_KERNEL(bool update_block(OccupancyBlock& block, const std::uint64_t* free, const std::uint64_t* occupied,
                                         const OccupancyUpdate& update))
 
@@ -22,6 +24,26 @@ bool settled(const Cell& cell, const OccupancyUpdate& update, bool misses, bool 
   return (!misses || cell.value <= update.minimum) && (!hits || cell.value >= update.maximum);
 }
 
+// Hits of further points in a block's voxels, after the first one's. Returns whether there were any.
+bool hit_again(OccupancyBlock& block, std::uint64_t code, const std::uint64_t* occupied, const PointCounts& counts,
+               const OccupancyUpdate& update) {
+  bool any = false;
+  for (int w = 0; w < kMaskWords; ++w)
+    for (std::uint64_t left = occupied[w]; left != 0; left &= left - 1) {
+      const int bit = 64 * w + __builtin_ctzll(left);
+      float& value = block.value[bit];
+      std::int32_t more = std::min(counts.of(code << 9 | bit), update.most_hits) - 1;
+      for (; more > 0 && value < update.maximum; --more, any = true) value = std::min(value + update.hit, update.maximum);
+    }
+  return any;
+}
+
+bool is_uniform(const OccupancyBlock& block) {
+  for (const std::uint64_t known : block.known)
+    if (known != ~std::uint64_t{0}) return false;
+  return std::all_of(block.value, block.value + kBlockVoxels, [&](float value) { return value == block.value[0]; });
+}
+
 }  // namespace
 
 void apply_scan(Context& context, const Scan& scan, const OccupancyUpdate& update, OccupancyTree& tree) {
@@ -35,9 +57,14 @@ void apply_scan(Context& context, const Scan& scan, const OccupancyUpdate& updat
   for (std::size_t b = 0; b < occupied.blocks(); ++b)
     if (free.find(occupied.code(b)) == nullptr) add(occupied.code(b), nullptr, occupied.words(b));
   const auto kernel = GGSLAM_DISPATCH(context.isa, update_block);
+  const PointCounts* counts = scan.counts();
   context.pool.parallel_for(tasks.size(), 64, [&](std::size_t begin, std::size_t end, int) {
-    for (std::size_t i = begin; i < end; ++i)
-      tasks[i].one_value = kernel(*tasks[i].block, tasks[i].free, tasks[i].occupied, update);
+    for (std::size_t i = begin; i < end; ++i) {
+      Task& task = tasks[i];
+      task.one_value = kernel(*task.block, task.free, task.occupied, update);
+      if (counts != nullptr && hit_again(*task.block, task.code, task.occupied, *counts, update))
+        task.one_value = is_uniform(*task.block);
+    }
   });
   for (const Task& task : tasks)
     if (task.one_value) tree.collapse(task.code);

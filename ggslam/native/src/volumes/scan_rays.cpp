@@ -82,20 +82,22 @@ void quantize(Context& context, const KeyGrid& grid, const float* points, std::s
     if (codes[i] >= 0) voxels.insert(static_cast<std::uint64_t>(codes[i]));
 }
 
-void count_points(const std::vector<std::int64_t>& codes, const VoxelMasks& voxels, std::int32_t* counts) {
-  std::vector<std::size_t> first(voxels.blocks() * kMaskWords);  // the number of the first voxel of each word
+void PointCounts::take(const std::vector<std::int64_t>& codes, const VoxelMasks& set) {
+  voxels = &set;
+  first.resize(set.blocks() * kMaskWords);
   std::size_t total = 0;
-  for (std::size_t b = 0; b < voxels.blocks(); ++b)
+  for (std::size_t b = 0; b < set.blocks(); ++b)
     for (int w = 0; w < kMaskWords; ++w) {
       first[b * kMaskWords + w] = total;
-      total += __builtin_popcountll(voxels.words(b)[w]);
+      total += __builtin_popcountll(set.words(b)[w]);
     }
-  std::fill_n(counts, total, 0);
+  counts.assign(total, 0);
   for (const std::int64_t code : codes) {
     if (code < 0) continue;
-    const std::size_t b = voxels.index(static_cast<std::uint64_t>(code) >> 9), w = (code >> 6) & 7;
+    const std::size_t word = set.index(static_cast<std::uint64_t>(code) >> 9) * kMaskWords + ((code >> 6) & 7);
     const std::uint64_t below = (std::uint64_t{1} << (code & 63)) - 1;
-    ++counts[first[b * kMaskWords + w] + __builtin_popcountll(voxels.words(b)[w] & below)];
+    const std::uint64_t bits = set.words(word / kMaskWords)[word % kMaskWords];
+    ++counts[first[word] + __builtin_popcountll(bits & below)];
   }
 }
 
@@ -108,6 +110,7 @@ bool Scan::cast(Context& context, const KeyGrid& grid, const ScanSettings& setti
     workers_.back()->free.limit(kMostFreeBlocks);
   }
   for (auto& worker : workers_) worker->free.clear(), worker->occupied.clear(), worker->rays = worker->batch.count = 0;
+  counts_.voxels = nullptr;
   cast_to(context, grid, settings, points, n, false);
   if (!empty.empty()) cast_to(context, grid, settings, empty.data(), empty.size() / 3, true);
   rays_ = workers_[0]->rays;
@@ -128,6 +131,7 @@ void Scan::cast_to(Context& context, const KeyGrid& grid, const ScanSettings& se
   if (settings.quantize) {
     quantize(context, grid, points, n, codes_, voxels_);
     list_centres(grid, voxels_, centres_);
+    if (settings.count && !empty) counts_.take(codes_, voxels_);
     points = centres_.data(), n = centres_.size() / 3;
   }
   const auto walk = GGSLAM_DISPATCH(context.isa, walk_rays);

@@ -28,6 +28,22 @@ struct ScanSettings {
   double max_range;  // metres; negative: none
   bool quantize;     // one ray per voxel, to its centre; otherwise one per point
   bool last_voxel;   // rays cut at the range free the voxel that they end in, if they go on behind it
+  bool count = false;  // where `quantize`: whether points are counted
+};
+
+// How many points lie in each voxel of a set.
+struct PointCounts {
+  const VoxelMasks* voxels = nullptr;  // null: nothing was counted
+  std::vector<std::size_t> first;      // the number of the first voxel of each word
+  std::vector<std::int32_t> counts;    // in the order of for_each_voxel
+
+  void take(const std::vector<std::int64_t>& codes, const VoxelMasks& voxels);
+  std::int32_t of(std::uint64_t code) const {  // of a voxel of the set
+    const std::size_t word = voxels->index(code >> 9) * kMaskWords + ((code >> 6) & 7);
+    const std::uint64_t below = (std::uint64_t{1} << (code & 63)) - 1;
+    const std::uint64_t bits = voxels->words(word / kMaskWords)[word % kMaskWords];
+    return counts[first[word] + __builtin_popcountll(bits & below)];
+  }
 };
 
 class Scan {
@@ -40,6 +56,8 @@ class Scan {
   const VoxelMasks& free() const { return workers_[0]->free; }
   const VoxelMasks& occupied() const { return workers_[0]->occupied; }
   std::size_t rays() const { return rays_; }
+  // Of the occupied voxels; null if points were not counted.
+  const PointCounts* counts() const { return counts_.voxels ? &counts_ : nullptr; }
 
  private:
   struct Worker {
@@ -55,14 +73,12 @@ class Scan {
   VoxelMasks voxels_;
   std::vector<float> centres_;
   std::vector<std::int64_t> codes_;
+  PointCounts counts_;
 };
 
 // The distinct voxels of n points, as Morton codes per point (-1: none) and as a set.
 void quantize(Context& context, const KeyGrid& grid, const float* points, std::size_t n,
               std::vector<std::int64_t>& codes, VoxelMasks& voxels);
-
-// How many of the points with these codes lie in each voxel of their set, in the order of for_each_voxel.
-void count_points(const std::vector<std::int64_t>& codes, const VoxelMasks& voxels, std::int32_t* counts);
 
 // Calls f(code) for each voxel of a set, block by block in the order they were found.
 template <class F>

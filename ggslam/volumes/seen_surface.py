@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was seen of surfaces, as it lies above a plane: the points that distances are measured from, and the measured
+points beside them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from ggslam.volumes.cell_grid import CellGrid, SlicePlane
+from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.measured_points import measured_octants
+
+_BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+
+
+class _Layered:
+    """Points [n, 3] and their heights above a plane, float32 [n]; those between two heights are placed on the plane."""
+
+    def __init__(self, points: np.ndarray, plane: SlicePlane) -> None:
+        self._points, self._plane = points, plane
+        normal = plane.normal.astype(points.dtype)
+        self._heights = (points @ normal - np.float32(plane.origin @ plane.normal)).astype(np.float32)
+
+    def between(self, low: float, high: float, which: np.ndarray | None = None) -> np.ndarray:
+        """x and y on the plane, float64 [m, 2], metres; `which` bool [n]: of these only."""
+        chosen = (self._heights >= low) & (self._heights <= high)
+        return self._plane.coordinates(self._points[chosen if which is None else chosen & which].astype(float))[:, :2]
+
+
+class SeenSurface:
+    """Surfaces above a plane: surface points of a distance field, and eighths of voxels that points were measured in.
+
+    Args:
+        field: which, with its TSDF, has them.
+        plane: its normal is up.
+    """
+
+    def __init__(self, field: DistanceField, plane: SlicePlane) -> None:
+        points, normals = field.surface()
+        # Seen from the field's origin, so that a map far from zero gives the same bits.
+        sites, octants = (points - field.origin).astype(np.float32), measured_octants(field.tsdf)
+        plane = replace(plane, origin=plane.origin - field.origin)
+        lone = (normals[:, 0] == 0) & (normals[:, 1] == 0) & (normals[:, 2] == 0)
+        self._sites, self._octants = _Layered(sites, plane), _Layered(octants, plane)
+        self._thin = _thin_octants(octants, sites[lone].astype(float), field.voxel)
+        self._reach = field.voxel / 4 * np.abs(np.stack([plane.x_axis, plane.y_axis, plane.normal])).sum(1)
+        """How far an eighth reaches from its middle along the plane's axes."""
+
+    def sites(self, low: float, high: float) -> np.ndarray:
+        """The surface points between two heights: x and y, float64 [n, 2], metres."""
+        return self._sites.between(low, high)
+
+    def near_points(self, grid: CellGrid, low: float, high: float) -> np.ndarray:
+        """Cells, bool [H, W], that may have a measured point in them between two heights: none of them is free."""
+        return grid.mark(self._octants.between(low - self._reach[2], high + self._reach[2]), self._reach[:2])
+
+    def with_points(self, grid: CellGrid, low: float, high: float) -> np.ndarray:
+        """Cells, bool [H, W], that have one: the middle of an eighth lies in them, or any part of one of a thin
+        thing."""
+        thin = self._octants.between(low - self._reach[2], high + self._reach[2], self._thin)
+        return grid.mark(self._octants.between(low, high)) | grid.mark(thin, self._reach[:2])
+
+
+def unseen_surface(surface: np.ndarray, near_points: np.ndarray) -> np.ndarray:
+    """Cells, bool [H, W], with a surface that nobody saw: it lies where what is behind one side of a thing meets space
+    seen free from another, and no cell beside it may have a measured point in it (of maps that count points)."""
+    if not near_points.any():
+        return np.zeros_like(surface)
+    return surface & (cv2.dilate(near_points.astype(np.uint8), _BESIDE) == 0)
+
+
+def _thin_octants(octants: np.ndarray, lone: np.ndarray, voxel: float) -> np.ndarray:
+    """Which octants [N, 3] lie in the voxels of points [M, 3]; both from the field's origin."""
+    thin, own = (
+        (v[:, 0] << 42) + (v[:, 1] << 21) + v[:, 2]
+        for v in (np.floor(p / voxel).astype(np.int64) for p in (lone, octants))
+    )
+    return np.isin(own, thin)
