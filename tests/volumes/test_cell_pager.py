@@ -70,7 +70,7 @@ def test_what_was_on_disk_is_as_if_it_had_stayed(
     budget = 8_500_000 if esdf else 1_500_000
     paged = fuse(seen, Paging(tmp_path / "cells", lambda held: budget), settings, esdf)
     pager = paged.pager
-    assert pager is not None and pager.written > 10 and pager.read > (0 if esdf else 5) and len(pager) > 5
+    assert pager is not None and pager.written > 10 and (esdf or pager.read > 5) and len(pager) > 5
     assert pager.most_bytes <= budget < (10_000 if esdf else 5120) * whole.tsdf.dense_blocks
     assert len(list((tmp_path / "cells").iterdir())) == len(pager)
     paged.finish(), whole.finish()
