@@ -108,6 +108,8 @@ class CellPager:
         if self._away:
             self._instant += 1
             self._free(self.held_bytes(None) + 1, None)
+        for key in [key for key, decays in self._away.items() if decays != self._decays]:
+            self._write(key, self.arrays(key))  # once, for all that reads them now
 
     def relabel(self, table: np.ndarray) -> None:
         """Gives objects on disk their new ids, uint16 [65536] by old one; all cells have been fused."""

@@ -38,14 +38,14 @@ def test_files_are_those_of_everything_in_memory(room: Path, whole: Path, tmp_pa
     assert not [path for path in out.iterdir() if path.name.startswith(".")]  # no cells are left
 
 
-def test_files_are_made_of_what_is_on_disk(room: Path, whole: Path, tmp_path: Path) -> None:
+def test_files_are_made_of_what_is_on_disk(room: Path, tmp_path: Path) -> None:
     """Without a distance field nothing comes back to be written."""
-    plain = ("--voxel", 0.03, "--no-objects", *NEAR)
+    plain = ("--voxel", 0.02, "--no-objects", *NEAR)
     succeed("volumes", room, "--out", tmp_path / "whole", *plain)
     said = succeed("volumes", room, "--out", tmp_path / "out", *plain, "--set", "volumes.budget_mb=1")
-    assert " 0 went to disk" not in said and " 0 MB\n" in said
+    assert "went to disk" in said and " 0 went to disk" not in said
     assert (tmp_path / "out" / "tsdf.npz").read_bytes() == (tmp_path / "whole" / "tsdf.npz").read_bytes()
-    assert triangles(tmp_path / "out" / "mesh.ply") == triangles(whole / "mesh.ply")
+    assert triangles(tmp_path / "out" / "mesh.ply") == triangles(tmp_path / "whole" / "mesh.ply")
 
 
 def test_a_limit_that_nothing_fits_into_is_refused(room: Path, tmp_path: Path) -> None:

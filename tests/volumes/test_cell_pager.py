@@ -31,7 +31,7 @@ def corridor() -> Scene:
 
 def views(there_and_back: bool = True) -> list[PosedView]:
     """Along the corridor, and back, looking ahead and to the sides by turns."""
-    way = np.arange(0.0, LENGTH, 0.4)
+    way = np.arange(0.0, LENGTH, 0.5)
     way = np.concatenate([way, way[::-1]]) if there_and_back else way
     ahead = np.ones(len(way)) if not there_and_back else np.repeat([1.0, -1.0], len(way) // 2)
     scene, found = corridor(), []
@@ -67,10 +67,10 @@ def test_what_was_on_disk_is_as_if_it_had_stayed(
 ) -> None:
     settings = replace(SETTINGS, decay_every=decay_every, esdf_every=5)
     whole = fuse(seen, None, settings, esdf)
-    budget = 9_000_000 if esdf else 1_500_000
+    budget = 8_500_000 if esdf else 1_500_000
     paged = fuse(seen, Paging(tmp_path / "cells", lambda held: budget), settings, esdf)
     pager = paged.pager
-    assert pager is not None and pager.written > 10 and pager.read > 5 and len(pager) > 5
+    assert pager is not None and pager.written > 10 and (esdf or pager.read > 5) and len(pager) > 5
     assert pager.most_bytes <= budget < (10_000 if esdf else 5120) * whole.tsdf.dense_blocks
     assert len(list((tmp_path / "cells").iterdir())) == len(pager)
     paged.finish(), whole.finish()
@@ -110,17 +110,17 @@ def test_a_correction_moves_cells_with_their_keyframes(seen: list[PosedView], tm
     """The way there was thought to bend; then the loop was closed. Cells of the way that are on disk are fused again
     where the keyframes are now."""
     drifted = [
-        replace(view, T_world_camera=se3_exp(np.array([0, 0.004 * k, 0, 0, 0, 0.001 * k])) @ view.T_world_camera)
-        for k, view in enumerate(seen[:34])
+        replace(view, T_world_camera=se3_exp(np.array([0, 0.01 * k, 0, 0, 0, 0.003 * k])) @ view.T_world_camera)
+        for k, view in enumerate(seen[:27])
     ]
-    stored = [StoredView(v.camera, v.T_world_camera, float(v.depth.max()), lambda v=v: v) for v in seen[:34]]
+    stored = [StoredView(v.camera, v.T_world_camera, float(v.depth.max()), lambda v=v: v) for v in seen[:27]]
     paged = fuse(drifted, Paging(tmp_path / "cells", lambda held: 1_500_000))
     off = np.abs(corridor().distance(paged.mesh(20).vertices.astype(float)))
     assert np.median(off) > 0.02  # what it is about
     paged.rebuild(stored)
     assert len(paged.tsdf) == 0 and not list(tmp_path.glob("cells/*"))  # nothing is fused before it is needed
-    whole = fuse(seen[:34])
-    for view in seen[34:50]:
+    whole = fuse(seen[:27])
+    for view in seen[27:40]:
         paged.add_together([view]), whole.add_together([view])
         assert paged.pager is not None and paged.pager.most_bytes < 4_000_000
     paged.finish(), whole.finish()
