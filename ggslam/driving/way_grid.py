@@ -74,6 +74,7 @@ class WayGrid:
     def __init__(self, dimensions: int, cell: float, page: int = 0) -> None:
         self._handle: int | None = None
         self.dimensions, self.cell, self.page = dimensions, float(cell), page
+        self._finished: set[Cell] = set()
         self._library = load_library()
         self._handle = self._library.ggslam_way_grid_create(dimensions, self.cell, page)
 
@@ -113,7 +114,12 @@ class WayGrid:
 
     def finish_page(self, page: Cell) -> None:
         """All cells of a page that may be entered were written."""
+        self._finished.add(page)
         self._library.ggslam_way_grid_finish_page(self._handle, (ctypes.c_int32 * 3)(*page))
+
+    def is_finished(self, page: Cell) -> bool:
+        """Whether a page was read."""
+        return page in self._finished
 
     def cells_of(self, points: np.ndarray) -> np.ndarray:
         """The cells that points [N, 3] (metres) lie in, int64 [N, 3]."""
@@ -199,9 +205,7 @@ def cell_distances(occupied: np.ndarray, cell: float, reach: int, context: Nativ
         raise InputError(f"occupied: expected 2 or 3 dimensions, found an array of shape {list(cells.shape)}")
     out = np.empty(cells.shape, np.float32)
     shape = (ctypes.c_int32 * 3)(*cells.shape[::-1], *([1] * (3 - cells.ndim)))
-    load_library().ggslam_cell_distances(
-        context.handle, shape, cells.ctypes.data, cell, reach, out.ctypes.data
-    )
+    load_library().ggslam_cell_distances(context.handle, shape, cells.ctypes.data, cell, reach, out.ctypes.data)
     return out
 
 

@@ -9,6 +9,7 @@ namespace ggslam::driving {
 namespace {
 
 constexpr double kRounding = 1e-9;  // of a line's length
+constexpr double kExact = 1e-6;     // cells that a clearance is off by, rounded
 
 // The pieces of a line between planes through cells' centres: within one, the interpolated clearance is a cubic.
 class Pieces {
@@ -98,7 +99,7 @@ bool is_clear(CellReader& reader, const Vec3<double>& from, const Vec3<double>& 
     reader.corners(pieces.low(), corners);
     bool all = true;
     for (int i = 0; i < count; ++i) all &= corners[i] >= cost.radius;
-    if (!all && !(least_of_piece(pieces, corners, dimensions) >= cost.radius)) return false;
+    if (!all && !(least_of_piece(pieces, corners, dimensions) >= cost.radius - kExact)) return false;
     if (sum == nullptr) continue;
     const double middle = between(corners, dimensions, pieces.low(), pieces.at((pieces.begin + pieces.end) / 2));
     total += (pieces.end - pieces.begin) * cost.factor(static_cast<float>(middle));

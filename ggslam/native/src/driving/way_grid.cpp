@@ -11,6 +11,7 @@ namespace ggslam::driving {
 namespace {
 
 constexpr float kNothing = std::numeric_limits<float>::quiet_NaN();
+constexpr double kParts = 1 << 20;  // of a cell that places are told in, so that centres stay centres
 constexpr std::size_t kMostCells = std::size_t{1} << 32;  // cells of a search have numbers of 32 bits
 
 }  // namespace
@@ -119,7 +120,7 @@ WayNode& WayGrid::node(CellPlace p, float unreached) {
 Vec3<double> WayGrid::to_cells(const double* metres) const {
   Vec3<double> out{{0, 0, 0}};
   for (int a = 0; a < dimensions; ++a) {
-    out[a] = metres[a] / cell - 0.5;
+    out[a] = std::rint((metres[a] / cell - 0.5) * kParts) / kParts;
     if (!(std::fabs(out[a]) < static_cast<double>(kFarthestCell))) refuse("points: expected numbers near the grid's origin");
   }
   return out;
