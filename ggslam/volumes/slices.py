@@ -7,7 +7,7 @@ in pictures; column 0 is where x is smallest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -16,10 +16,10 @@ import numpy as np
 
 from ggslam.errors import InputError
 from ggslam.system.atomic import write_bytes, write_text
-from ggslam.system.tuning import Tuning
+from ggslam.volumes.cell_grid import CellGrid, SlicePlane
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
-from ggslam.volumes.measured_points import measured_octants
+from ggslam.volumes.seen_surface import SeenSurface, unseen_surface
 from ggslam.volumes.tsdf import SIDE
 
 OCCUPIED: Final = 0
@@ -28,38 +28,6 @@ FREE: Final = 254
 """Grey of a free cell there."""
 UNKNOWN: Final = 205
 """Grey of an unknown cell there."""
-
-
-class SliceTuning(Tuning):
-    """Limits of a slice."""
-
-    max_cells = 50_000_000
-    """Most cells."""
-
-
-_BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-
-
-@dataclass(frozen=True)
-class SlicePlane:
-    """A rectangle in space.
-
-    Attributes:
-        origin: [3], metres, where the plane's coordinates are (0, 0).
-        x_axis, y_axis: [3], orthogonal unit vectors.
-        low, high: (x, y) of the rectangle's corners on the plane, metres.
-    """
-
-    origin: np.ndarray
-    x_axis: np.ndarray
-    y_axis: np.ndarray
-    low: tuple[float, float]
-    high: tuple[float, float]
-
-    @property
-    def normal(self) -> np.ndarray:
-        """Unit vector; seen from its side, y is to the left of x."""
-        return np.cross(self.x_axis, self.y_axis)
 
 
 @dataclass(frozen=True)
@@ -131,15 +99,10 @@ def slice_field(
     Raises:
         InputError: a resolution or band that is not positive, or more than 50 million cells.
     """
-    if not resolution > 0 or (band is not None and not band[0] <= band[1]):
-        raise InputError(f"expected a positive resolution and an ascending band, found {resolution} and {band}")
-    width, height = (max(1, int(np.ceil((plane.high[a] - plane.low[a]) / resolution - 1e-6))) for a in (0, 1))
-    if width * height > SliceTuning.max_cells:
-        raise InputError(f"resolution: {width} x {height} cells are more than {SliceTuning.max_cells}")
-    x = plane.low[0] + (np.arange(width) + 0.5) * resolution
-    y = plane.low[1] + (np.arange(height) + 0.5) * resolution
-    centres = (plane.origin + y[::-1, None, None] * plane.y_axis + x[None, :, None] * plane.x_axis).reshape(-1, 3)
-    low, high = band or (0.0, 0.0)
+    if band is not None and not band[0] <= band[1]:
+        raise InputError(f"expected an ascending band, found {band} (resolution {resolution})")
+    grid, (low, high) = CellGrid.over(plane, resolution), band or (0.0, 0.0)
+    centres = grid.places().reshape(-1, 3)
     offsets = np.linspace(low, high, int(np.ceil((high - low) / field.voxel - 1e-6)) + 1)
     least = np.full(len(centres), np.nan, np.float32)
     hit, cell = np.zeros(len(centres), bool), max(resolution, field.voxel)
@@ -147,50 +110,11 @@ def slice_field(
         found = field.query(centres + offset * plane.normal).distance
         least = np.fmin(least, found)
         hit |= (found <= cell / 2) & (found >= -cell)
-    distance, occupied = least.reshape(height, width), hit.reshape(height, width)
-    local = replace(plane, origin=plane.origin - field.origin)
-    octants, grid = measured_octants(field.tsdf), (local, resolution, (low, high), occupied.shape)
-    touched = _cells_with_points(octants, field.voxel / 4, *grid)
-    points = _cells_with_points(octants, 0.0, *grid)
-    points |= _cells_with_points(octants[_thin_octants(octants, field)], field.voxel / 4, *grid)
-    # Where what is behind one side of a thing meets space seen free from another, the field has a surface that nobody
-    # saw.
-    doubtful = occupied & (cv2.dilate(touched.astype(np.uint8), _BESIDE) == 0) & touched.any()
-    occupied, behind = (occupied & ~doubtful) | points, (distance < 0) | doubtful | touched
-    top_right = (plane.low[0] + width * resolution, plane.low[1] + height * resolution)
-    whole = SlicePlane(plane.origin, plane.x_axis, plane.y_axis, plane.low, top_right)
-    return FieldSlice(whole, resolution, distance, ~np.isnan(distance), occupied, behind)
-
-
-def _thin_octants(octants: np.ndarray, field: DistanceField) -> np.ndarray:
-    """Which octants [N, 3] (from the field's origin) lie in voxels that are surface for their points alone."""
-    points, normals = field.surface()
-    lone = points[~normals.any(1)].astype(float) - field.origin
-    voxels = [np.floor(p / field.voxel).astype(np.int64) for p in (lone, octants)]
-    thin, own = ((v[:, 0] << 42) + (v[:, 1] << 21) + v[:, 2] for v in voxels)
-    return np.isin(own, thin)
-
-
-def _cells_with_points(
-    octants: np.ndarray, half: float, plane: SlicePlane, resolution: float, band: tuple[float, float],
-    shape: tuple[int, int],
-) -> np.ndarray:  # fmt: skip
-    """Cells that cubes around points [N, 3], with edges of twice `half`, overlap at the heights of a band, bool
-    [H, W]."""
-    axes = np.stack([plane.x_axis, plane.y_axis, plane.normal])
-    reach = half * np.abs(axes).sum(1)
-    points = (octants - plane.origin) @ axes.T
-    points = points[(points[:, 2] >= band[0] - reach[2]) & (points[:, 2] <= band[1] + reach[2])]
-    first, last = (
-        np.floor((points[:, :2] + side * reach[:2] - plane.low) / resolution).astype(int) for side in (-1, 1)
-    )
-    marked = np.zeros(shape, bool)
-    steps = (last - first).max(axis=0, initial=0)
-    for step in np.ndindex(*(steps + 1)):
-        column, from_bottom = np.minimum(first + step, last).T
-        inside = (column >= 0) & (column < shape[1]) & (from_bottom >= 0) & (from_bottom < shape[0])
-        marked[shape[0] - 1 - from_bottom[inside], column[inside]] = True
-    return marked
+    distance, occupied, surface = least.reshape(grid.shape), hit.reshape(grid.shape), SeenSurface.of(field, plane)
+    near, points = surface.near_points(grid, low, high), surface.with_points(grid, low, high)
+    unseen = unseen_surface(occupied, near)
+    occupied, behind = (occupied & ~unseen) | points, (distance < 0) | unseen | near
+    return FieldSlice(grid.plane, resolution, distance, ~np.isnan(distance), occupied, behind)
 
 
 def slice_picture(cut: FieldSlice, full_scale: float, smallest_side: int = 480) -> np.ndarray:

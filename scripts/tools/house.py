@@ -109,7 +109,7 @@ def lines_by_purpose() -> dict[str, int]:
     return dict(found)
 
 
-ONLY_FOR_USERS = {"ggslam.volumes.raycast", "ggslam.driving.robot"}
+ONLY_FOR_USERS = {"ggslam.volumes.raycast", "ggslam.driving.bands"}
 """Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it."""
 
 
