@@ -237,9 +237,13 @@ class Planner:
 
     def _read_around(self, place: np.ndarray, reach: float) -> None:
         """Reads the pages that the cells around a place are on."""
+        self.read_box(place - reach, place + reach)
+
+    def read_box(self, low: np.ndarray, high: np.ndarray) -> None:
+        """Reads the pages of the map that a box [3], [3] (metres, in the grid's frame) touches."""
         if not self.grid.page:
             return
-        low, high = self.grid.cells_of(np.array([place - reach, place + reach])) // self.grid.page_cells
+        low, high = self.grid.cells_of(np.array([low, high])) // self.grid.page_cells
         for step in np.ndindex(*(high - low + 1)):
             x, y, z = (int(v) for v in low + step)
             if not self.grid.is_finished((x, y, z)):

@@ -31,8 +31,7 @@ to write, `--set NAME=VALUE` overrides a [setting](settings.md), `--config` name
 
 Exit codes: 0 done, 2 something in the input is wrong (one line says what and where), 1 ggslam or the machine is at
 fault, or a run lost most of its frames, 3 a run that `--strict` finds bad or a plan without a path, 130 interrupted.
-Where output is no
-terminal, long commands print a line of progress every 10 seconds.
+Where output is no terminal, long commands print a line of progress every 10 seconds.
 """
 TABLE = "| argument or option | meaning | default |\n|---|---|---|"
 _SHARED = 3

@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from ggslam.driving.plan_maps import floor_cells
+from ggslam.driving.bands import band_map, floor_plane
 from ggslam.driving.robot import Robot
-from ggslam.scene.poses import inverse, translation
+from ggslam.scene.poses import translation
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import floor_from_map
-from ggslam.volumes.slices import SlicePlane, slice_field
-from ggslam.volumes.tsdf import SIDE
 from ggslam.volumes.upright import estimate_up
 
 Extent = tuple[tuple[float, float], tuple[float, float]]
@@ -36,12 +36,13 @@ def band_cells(
     Returns:
         Where the first cell begins on the floor (x, y), metres, and clearances float32 [Y, X].
     """
-    low, high = extent or _extent(field, T_floor_map)
-    T_map_floor = inverse(T_floor_map)
-    plane = SlicePlane(T_map_floor[:3, 3], T_map_floor[:3, 0], T_map_floor[:3, 1], low, high)
-    cut = slice_field(field, plane, cell, robot.band)
-    clearance = floor_cells(cut.occupied[::-1], cut.free[::-1], cell, reach, unknown, field.tsdf.context)
-    return cut.plane.low, clearance
+    plane = floor_plane(field, T_floor_map)
+    plane = plane if extent is None else replace(plane, low=extent[0], high=extent[1])
+    band = band_map(field, plane, robot, cell)
+    clearance = np.minimum(band.distance, np.float32(reach))
+    if not unknown:
+        clearance = np.where(band.free | band.occupied, clearance, np.float32(np.nan))
+    return band.plane.low, clearance[::-1]
 
 
 def floor_of_field(field: DistanceField, poses: np.ndarray | None = None) -> np.ndarray:
@@ -57,13 +58,3 @@ def floor_of_field(field: DistanceField, poses: np.ndarray | None = None) -> np.
     near[:, :3, 3] -= field.origin if poses is not None else 0
     upright = estimate_up(near, points - field.origin, normals)
     return np.asarray(floor_from_map(upright, near) @ translation(-field.origin))
-
-
-def _extent(field: DistanceField, T_floor_map: np.ndarray) -> Extent:
-    edge = SIDE * field.voxel
-    corners = np.concatenate([field.coordinates() + shift for shift in np.ndindex(2, 2, 2)]) * edge + field.origin
-    if not len(corners):
-        return (0.0, 0.0), (0.0, 0.0)
-    on_floor = corners @ T_floor_map[:3, :3].T + T_floor_map[:3, 3]
-    low, high = on_floor[:, :2].min(axis=0), on_floor[:, :2].max(axis=0)
-    return (float(low[0]), float(low[1])), (float(high[0]), float(high[1]))

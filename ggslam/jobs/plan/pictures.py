@@ -6,6 +6,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from ggslam.driving.plan_maps import InMemory
 from ggslam.driving.planner import PlannedPath, Planner
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.system.tuning import Tuning
@@ -21,6 +22,8 @@ class PathPictureTuning(Tuning):
     """Most cells of a picture along a side; more are drawn coarser."""
     heights_m = 1.0
     """Space above and below that is shown along a path, in metres."""
+    scale = 1.25
+    """Clearance at the far end of the colours, in clearances that a path keeps where it can."""
     gap = 12
     """Pixels between two pictures."""
 
@@ -56,13 +59,15 @@ def path_picture(planner: Planner, path: PlannedPath, start: np.ndarray, goal: n
 def _picture(planner: Planner, places: np.ndarray, step: float) -> tuple[np.ndarray, float]:
     """Clearances at places [H, W, 3] of the map as colours, and pixels in a cell."""
     grid = planner.map.to_grid(places.reshape(-1, 3))
+    if isinstance(planner.map.pages, InMemory):  # of others what the search read is shown
+        planner.read_box(grid.min(axis=0), grid.max(axis=0))
     clearance = planner.grid.clearance(grid).reshape(places.shape[:2])
     known = ~np.isnan(clearance)
     size = (places.shape[1] * step, places.shape[0] * step)
     plane = SlicePlane(np.zeros(3), np.eye(3)[0], np.eye(3)[1], (0.0, 0.0), size)
     occupied = known & (clearance <= step / 2)
     cut = FieldSlice(plane, step, clearance, known, occupied, np.zeros_like(known))
-    full = planner.costs.radius + max(planner.costs.margin, planner.costs.radius)
+    full = PathPictureTuning.scale * (planner.costs.radius + planner.costs.margin)
     picture = slice_picture(cut, full)
     return picture, picture.shape[1] / places.shape[1]
 
