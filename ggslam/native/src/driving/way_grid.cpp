@@ -23,6 +23,18 @@ WayGrid::WayGrid(int dimensions_, double cell_, int page_)
   for (int a = 0; a < 3; ++a) mask_[a] = (1 << bits[a]) - 1;
   for (int n = 0; n < kAround; ++n)
     offset_[n] = (n % 3 - 1) + (n / 3 % 3 - 1) * (1 << bits[0]) + (n / 9 - 1) * (1 << (bits[0] + bits[1]));
+  neighbours_.resize(static_cast<std::size_t>(cells) * kAround);
+  for (int i = 0; i < cells; ++i)
+    for (int n = 0; n < kAround; ++n) {
+      const int to[3] = {(i & mask_[0]) + n % 3 - 1, (i >> bits[0] & mask_[1]) + n / 3 % 3 - 1,
+                         (i >> (bits[0] + bits[1])) + n / 9 - 1};
+      int beyond = 0, power = 1, index = 0;
+      for (int a = 0, shift = 0; a < 3; power *= 3, shift += bits[a++]) {
+        beyond += power * ((to[a] >> bits[a]) + 1);
+        index |= (to[a] & mask_[a]) << shift;
+      }
+      neighbours_[static_cast<std::size_t>(i * kAround + n)] = static_cast<uint16_t>(beyond << kIndexBits | index);
+    }
   inner_.assign(static_cast<std::size_t>(cells), 1);
   for (int i = 0; i < cells; ++i) {
     const int at[3] = {i & mask_[0], i >> bits[0] & mask_[1], i >> (bits[0] + bits[1])};
@@ -43,10 +55,12 @@ int32_t WayGrid::make(BlockCoordinates at) {
   const int32_t row = static_cast<int32_t>(table_.insert(at));
   blocks_.emplace_back();
   WayBlock& made = blocks_.back();
+  made.around[kHere] = row;
   made.clearance.reset(new float[static_cast<std::size_t>(cells)]);
   std::fill_n(made.clearance.get(), cells, kNothing);
   for (int n = 0; n < kAround; ++n) {
     const int x = n % 3 - 1, y = n / 3 % 3 - 1, z = n / 9 - 1;
+    if (n == kHere) continue;
     const int32_t other = table_.find({at.x + x, at.y + y, at.z + z});
     made.around[n] = other;
     if (other >= 0) block(other).around[kAround - 1 - n] = row;
@@ -99,19 +113,11 @@ float WayGrid::clearance(const Vec3i& c) const {
   return p.row < 0 ? kNothing : block(p.row).clearance[static_cast<std::size_t>(p.index)];
 }
 
-CellPlace WayGrid::neighbour(CellPlace p, int number) const {
-  const int x = (p.index & mask_[0]) + number % 3 - 1, y = ((p.index >> bits[0]) & mask_[1]) + number / 3 % 3 - 1,
-            z = (p.index >> (bits[0] + bits[1])) + number / 9 - 1;
-  const int beyond = kHere + (x >> bits[0]) + 3 * (y >> bits[1]) + (dimensions == 2 ? 0 : 9 * (z >> bits[2]));
-  const int32_t row = beyond == kHere ? p.row : block(p.row).around[beyond];
-  return {row, (x & mask_[0]) | (y & mask_[1]) << bits[0] | (z & mask_[2]) << (bits[0] + bits[1])};
-}
-
 WayNode& WayGrid::node(CellPlace p, float unreached) {
   WayBlock& b = block(p.row);
   if (b.search != searches || !b.nodes) {
     if (!b.nodes) b.nodes.reset(new WayNode[static_cast<std::size_t>(cells)]);
-    std::fill_n(b.nodes.get(), cells, WayNode{unreached, kNoStep});
+    std::fill_n(b.nodes.get(), cells, WayNode{unreached, kNoStep, 0});
     b.search = searches;
   }
   return b.nodes[static_cast<std::size_t>(p.index)];

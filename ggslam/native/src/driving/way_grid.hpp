@@ -18,12 +18,14 @@ using volumes::BlockTable;
 constexpr int kHere = 13;       // a cell among the 27 around it: 13 + x + 3 y + 9 z
 constexpr int kAround = 27;
 constexpr uint8_t kNoStep = 255;
+constexpr int kIndexBits = 10;  // of a cell's number in its block
 constexpr int64_t kFarthestCell = int64_t{1} << 29;
 
 // What a search knows of a cell.
 struct WayNode {
   float value;   // cost from the start; of the widest way, the least clearance on it
   uint8_t step;  // the neighbour's number of this cell where it was reached from; kNoStep: at the start
+  uint8_t done;  // its neighbours were looked at
 };
 
 struct WayBlock {
@@ -83,7 +85,10 @@ class WayGrid {
   float clearance(const Vec3i& c) const;
 
   // The neighbour of a cell.
-  CellPlace neighbour(CellPlace p, int number) const;
+  CellPlace neighbour(CellPlace p, int number) const {
+    const uint16_t there = neighbours_[static_cast<std::size_t>(p.index) * kAround + static_cast<std::size_t>(number)];
+    return {block(p.row).around[there >> kIndexBits], there & ((1 << kIndexBits) - 1)};
+  }
   // Whether all neighbours of a cell are in its block, `offset` of them apart.
   bool is_inner(CellPlace p) const { return inner_[static_cast<std::size_t>(p.index)] != 0; }
   int32_t offset(int number) const { return offset_[number]; }
@@ -99,6 +104,7 @@ class WayGrid {
   int mask_[3];
   int32_t offset_[kAround];
   std::vector<uint8_t> inner_;
+  std::vector<uint16_t> neighbours_;  // of each cell of a block: number of the block around, index in it
   BlockTable table_;
   std::vector<WayBlock> blocks_;
   std::unordered_set<BlockCoordinates, PageHash, SamePage> finished_;

@@ -11,6 +11,8 @@ namespace ggslam::driving {
 namespace {
 
 constexpr float kFar = std::numeric_limits<float>::infinity();
+constexpr float kDiagonal = 0.41421356f, kSpaceDiagonal = 0.73205081f;  // how much longer than a straight step
+constexpr float kWorthwhile = 0.005f;  // part of a step's length that a way has to be cheaper by to be taken instead
 
 // The 26 cells around one, of which a grid of two dimensions has the 8 in the middle.
 struct Steps {
@@ -61,6 +63,7 @@ void WaySearch::begin(const WayQuery& query) {
   const float scale = static_cast<float>(1 / grid_.cell);
   cost_ = {query.radius * scale, query.margin * scale, query.weight};
   start_ = grid_.to_cells(query.start), goal_ = grid_.to_cells(query.goal);
+  near_goal_ = cast<float>(goal_);
   queue_.clear(), widest_ = {}, goals_.clear(), points_.clear();
   ++grid_.searches;
   seeded_ = false, state_ = kSearching, best_ = query.widest ? -1 : kFar, expanded_ = 0;
@@ -68,12 +71,11 @@ void WaySearch::begin(const WayQuery& query) {
 }
 
 float WaySearch::estimate(const Vec3i& cell) const {
-  double d[3];
-  for (int a = 0; a < 3; ++a) d[a] = a < grid_.dimensions ? std::fabs(cell[a] - goal_[a]) : 0;
-  if (d[0] < d[1]) std::swap(d[0], d[1]);
-  if (d[1] < d[2]) std::swap(d[1], d[2]);
-  if (d[0] < d[1]) std::swap(d[0], d[1]);
-  return static_cast<float>(d[0] + (M_SQRT2 - 1) * d[1] + (std::sqrt(3.0) - M_SQRT2) * d[2]);
+  const float x = std::fabs(static_cast<float>(cell[0]) - near_goal_[0]);
+  const float y = std::fabs(static_cast<float>(cell[1]) - near_goal_[1]);
+  const float z = std::fabs(static_cast<float>(cell[2]) - near_goal_[2]);
+  const float most = std::max(std::max(x, y), z), least = std::min(std::min(x, y), z), sum = x + y + z;
+  return most + kDiagonal * (sum - most - least) + (kSpaceDiagonal - kDiagonal) * least;
 }
 
 bool WaySearch::needs_page(const Vec3i& cell) {
@@ -113,15 +115,14 @@ SearchState WaySearch::seed() {
   seeded_ = true;
   goals_ = ends(goal_);
   if (goals_.empty()) return kNoWay;
-  for (const End& end : ends(start_)) reach(end.place, end.cost, kHere);
+  for (const End& end : ends(start_)) reach(end.place, grid_.cell_at(end.place), end.cost, kHere);
   return kSearching;
 }
 
-void WaySearch::reach(CellPlace p, float value, uint8_t step) {
-  const Vec3i cell = grid_.cell_at(p);
+void WaySearch::reach(CellPlace p, const Vec3i& cell, float value, uint8_t step) {
   const float left = estimate(cell);
   WayNode& node = grid_.node(p, query_.widest ? -1 : kFar);
-  node = {value, step};
+  node.value = value, node.step = step;
   if (left < nearest_) nearest_ = left, nearest_cell_ = p;
   if (query_.widest) widest_.push({value, number(p)});
   else queue_.push(value + query_.greed * left, {number(p), value});
@@ -166,19 +167,27 @@ SearchState WaySearch::expand(uint32_t cell, float value) {
   uint32_t passable = 0;
   for (int n = first; n < last; ++n) passable |= static_cast<uint32_t>(clearance[n] >= cost_.radius) << n;
   const float own = cost_.factor(clearance[kHere]);
+  const Vec3i c = grid_.cell_at(here);
+  // With a greedy estimate cells are not looked at again: the way still costs no more than greed allows.
+  const bool closed = query_.greed > 1;
+  const Steps& all = steps();
+  grid_.node(here, kFar).done = 1;
   for (int n = first; n < last; ++n) {
-    if (n == kHere || (steps().through[n] & ~passable) != 0) continue;
+    if (n == kHere || (all.through[n] & ~passable) != 0) continue;
     const WayNode& there = grid_.node(places[n], query_.widest ? -1 : kFar);
     const uint8_t back = static_cast<uint8_t>(kAround - 1 - n);
+    const Vec3i at{{c[0] + n % 3 - 1, c[1] + n / 3 % 3 - 1, c[2] + n / 9 - 1}};
     if (query_.widest) {
       float least = value;
       for (int m = first; m < last; ++m)
-        if (steps().through[n] >> m & 1) least = std::min(least, clearance[m]);
-      if (least > there.value) reach(places[n], least, back);
+        if (all.through[n] >> m & 1) least = std::min(least, clearance[m]);
+      if (least > there.value) reach(places[n], at, least, back);
       continue;
     }
-    const float next = value + steps().length[n] * 0.5f * (own + cost_.factor(clearance[n]));
-    if (next < there.value - 0.005f * steps().length[n]) reach(places[n], next, back);
+    const float length = all.length[n], known = there.value - kWorthwhile * length;
+    if (value + length >= known || (closed && there.done)) continue;
+    const float next = value + length * 0.5f * (own + cost_.factor(clearance[n]));
+    if (next < known) reach(places[n], at, next, back);
   }
   return kSearching;
 }
@@ -201,6 +210,7 @@ SearchState WaySearch::go_on(int64_t most) {
     }
     const float known = grid_.node(place(entry.cell), query_.widest ? -1 : kFar).value;
     if (query_.widest ? entry.value < known : entry.value > known) continue;  // reached in a better way since
+    if (query_.greed > 1 && grid_.node(place(entry.cell), kFar).done && !query_.widest) continue;
     state_ = expand(entry.cell, entry.value);
     if (state_ != kNeedsPages) continue;
     if (query_.widest) widest_.push({entry.value, entry.cell});

@@ -50,7 +50,7 @@ class WaySearch {
   SearchState expand(uint32_t cell, float value);
   // Clearances of the cells around one; whether none of them is on a page that is not there.
   bool look_around(CellPlace p, float* clearance, CellPlace* places);
-  void reach(CellPlace p, float value, uint8_t step);
+  void reach(CellPlace p, const Vec3i& cell, float value, uint8_t step);
   float estimate(const Vec3i& cell) const;
   void finish();
   uint32_t number(CellPlace p) const {
@@ -65,6 +65,7 @@ class WaySearch {
   WayQuery query_{};
   WayCost cost_{};
   Vec3<double> start_{}, goal_{};
+  Vec3<float> near_goal_{};  // rounded
   SearchState state_ = kNoWay;
   bool seeded_ = false;
   CostQueue queue_;
