@@ -68,7 +68,7 @@ def plan(
     clearance: Clearance = None,
     unknown: Unknown = False,
     margin: Margin = 0.3,
-    weight: Weight = 0.05,
+    weight: Weight = 0.03,
     frame: Frame = OutputFrame.map,
     out: Out = None,
 ) -> None:

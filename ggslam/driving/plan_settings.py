@@ -12,7 +12,7 @@ class PlanSettings:
 
     margin: float = setting(0.3, 0, 100, "m")
     """Clearance beyond the least one that a path keeps where it can."""
-    weight: float = setting(0.05, 0, 1000)
+    weight: float = setting(0.03, 0, 1000)
     """What a metre costs more at the least clearance than outside of the margin. Paths are at most this share longer
     than the shortest one."""
     passes: int = setting(40, 0, 10_000)

@@ -11,12 +11,12 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ggslam.driving.plan_maps import PlanMap
 from ggslam.driving.plan_settings import PlanSettings
-from ggslam.driving.way_grid import Cell, WayCosts, WayGrid
+from ggslam.driving.way_grid import Cell, WayCosts, WayGrid, cell_distances
 from ggslam.errors import InputError
+from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points
 from ggslam.system.tuning import Tuning
 
@@ -24,6 +24,9 @@ from ggslam.system.tuning import Tuning
 class PlannerTuning(Tuning):
     """How paths are refined and refusals explained."""
 
+    greed = {2: 1.0, 3: 1.01}
+    """Factor of the estimate of what is left of a way, by the number of dimensions. In space 1.01 halves the cells that
+    are looked at; a path that is longer for it is planned again without."""
     spacing_cells = 2.0
     """Distance between points of a path, in cells."""
     near_m = 2.0
@@ -101,6 +104,8 @@ class Planner:
         self.pages = 0
         """Pages of the map that were read."""
         self._reading, self._goal = 0.0, np.zeros(3)
+        self._reach_cells = int(np.ceil((self.costs.radius + self.costs.margin) / plan_map.cell)) + 1
+        self._context = NativeContext()
         self._obstacles: list[np.ndarray] = []
         if not self.grid.page:
             self._read_page((0, 0, 0))
@@ -120,12 +125,9 @@ class Planner:
         self._goal, narrowest, points, cells = ends[1], None, None, 0
         reason = self._refusal("start", ends[0]) or self._refusal("goal", ends[1])
         if reason is None:
-            way = self.grid.search(ends[0], ends[1], self.costs, self._read_page)
-            points, cells = way.points, way.expanded
+            points, cells, reached = self._search(ends)
             if points is None:
-                reason, narrowest = self._explain(ends, way.reached)
-            else:
-                points = self._refine(points, way.cost)
+                reason, narrowest = self._explain(ends, reached)
         milliseconds = 1e3 * (time.perf_counter() - began - self._reading)
         return self._path(points, reason, narrowest, milliseconds, cells, self.pages - read)
 
@@ -134,10 +136,10 @@ class Planner:
         self.grid.write(low, clearance)
 
     def add_obstacles(self, points: np.ndarray) -> None:
-        """Puts obstacles into the map: clearances around fall to the distance from them.
+        """Puts obstacles into the map: clearances around fall to the distance from the cells that they are in.
 
         Args:
-            points: [N, 3], metres in the map's frame, on their surfaces, no farther apart than cells. Robots that drive
+            points: [N, 3], metres in the map's frame, in or on them, no farther apart than cells. Robots that drive
                 meet them whatever their height.
         """
         places = self.map.to_grid(points)
@@ -145,7 +147,7 @@ class Planner:
             raise InputError(f"points: expected finite points [N, 3], found an array of shape {np.shape(points)}")
         places[:, self.map.dimensions :] = 0
         self._obstacles.append(places)
-        reach = self.costs.radius + self.costs.margin + self.map.cell
+        reach = self._reach_cells * self.map.cell
         low, high = self.grid.cells_of(np.array([places.min(0) - reach, places.max(0) + reach]))
         size = high - low + 1
         shape = tuple(size[: self.map.dimensions][::-1].tolist())
@@ -155,13 +157,16 @@ class Planner:
     # --- parts -------------------------------------------------------------------------------------------------------
 
     def _with_obstacle(self, low: Cell, clearance: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Clearances [Z, Y, X] or [Y, X] no larger than the distances from places [N, 3]."""
-        n = self.map.dimensions
-        axes = [(np.arange(size) + first + 0.5) * self.map.cell
-                for first, size in zip(low, clearance.shape[::-1], strict=False)]  # fmt: skip
-        centres = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], -1).reshape(-1, n)
-        reach = self.costs.radius + self.costs.margin + self.map.cell
-        distance = cKDTree(places[:, :n]).query(centres, distance_upper_bound=reach)[0].reshape(clearance.shape)
+        """Clearances [Z, Y, X] or [Y, X] no larger than the distances from the cells of places [N, 3]."""
+        n, reach = self.map.dimensions, self._reach_cells
+        at = (self.grid.cells_of(places) - low + reach)[:, :n][:, ::-1]
+        size = np.array(clearance.shape) + 2 * reach
+        at = at[((at >= 0) & (at < size)).all(axis=1)]
+        if not len(at):
+            return clearance
+        occupied = np.zeros(size, bool)
+        occupied[tuple(at.T)] = True
+        distance = cell_distances(occupied, self.map.cell, reach, self._context)[(slice(reach, -reach),) * n]
         return np.where(distance < clearance, distance, clearance)
 
     def _read_page(self, page: Cell) -> None:
@@ -195,10 +200,23 @@ class Planner:
             clearance = self._with_obstacle(low, clearance, places)
         return clearance
 
-    def _refine(self, points: np.ndarray, cost: float) -> np.ndarray:
-        """A way over cells as a smooth path. Where the weight alone makes ways longer, their cost bounds the length."""
-        s, spacing = self.settings, PlannerTuning.spacing_cells * self.map.cell
-        return self.grid.smooth(points, self.costs, spacing, s.push, s.passes, cost)
+    def _search(self, ends: np.ndarray) -> tuple[np.ndarray | None, int, np.ndarray]:
+        """A path between places [2, 3] of the grid, how many cells were looked at for it, and how far the search came.
+
+        A search with greed finds a way that may cost so much more than the best one. If the smoothed path does not make
+        up for that, another search without follows: no path is longer than the weight allows.
+        """
+        s, spacing, cells = self.settings, PlannerTuning.spacing_cells * self.map.cell, 0
+        for greed in (PlannerTuning.greed[self.map.dimensions], 1.0):
+            way = self.grid.search(ends[0], ends[1], replace(self.costs, greed=greed), self._read_page)
+            cells += way.expanded
+            if way.points is None:
+                return None, cells, way.reached
+            most = way.cost / greed
+            points = self.grid.smooth(way.points, self.costs, spacing, s.push, s.passes, most)
+            if greed == 1 or np.linalg.norm(np.diff(points, axis=0), axis=1).sum() <= most:
+                break
+        return points, cells, way.reached
 
     def _path(
         self, points: np.ndarray | None, reason: str | None, narrowest: np.ndarray | None, milliseconds: float,
@@ -271,7 +289,7 @@ class Planner:
 
     def _explain(self, ends: np.ndarray, reached: np.ndarray) -> tuple[str, np.ndarray | None]:
         """Why there is no way between places that fit, and where the widest one is narrowest."""
-        widest = self.grid.search(ends[0], ends[1], WayCosts(0.0, 0.0, 0.0), self._read_page, widest=True)
+        widest = self.grid.search(ends[0], ends[1], WayCosts(PlannerTuning.touching, 0.0, 0.0), self._read_page, True)
         if widest.points is None:
             hint = "" if self.settings.unknown else ", or space that nobody has seen,"
             said = f"no way: obstacles{hint} separate start and goal"
