@@ -24,9 +24,6 @@ from ggslam.system.tuning import Tuning
 class PlannerTuning(Tuning):
     """How paths are refined and refusals explained."""
 
-    greed = {2: 1.0, 3: 1.01}
-    """Factor of the estimate of what is left of a way, by the number of dimensions. In space 1.01 halves the cells that
-    are looked at; a path that is longer for it is planned again without."""
     spacing_cells = 2.0
     """Distance between points of a path, in cells."""
     near_m = 2.0
@@ -35,6 +32,9 @@ class PlannerTuning(Tuning):
     """Pages towards the goal that are prepared while the search goes on."""
     touching = 1e-3
     """Clearance below which a place is in an obstacle, in metres."""
+
+
+_NO_WAY = "no way"
 
 
 @dataclass(frozen=True)
@@ -110,11 +110,13 @@ class Planner:
         if not self.grid.page:
             self._read_page((0, 0, 0))
 
-    def plan(self, start: np.ndarray, goal: np.ndarray) -> PlannedPath:
+    def plan(self, start: np.ndarray, goal: np.ndarray, explain: bool = True) -> PlannedPath:
         """Plans a path.
 
         Args:
             start, goal: [3], metres in the map's frame. Robots that drive start and end on the floor below or above.
+            explain: whether the widest way is looked for where there is no path, which takes several times as long as
+                finding out that there is none.
 
         Raises:
             InputError: a place that is none.
@@ -127,7 +129,7 @@ class Planner:
         if reason is None:
             points, cells, reached = self._search(ends)
             if points is None:
-                reason, narrowest = self._explain(ends, reached)
+                reason, narrowest = self._explain(ends, reached) if explain else (_NO_WAY, None)
         milliseconds = 1e3 * (time.perf_counter() - began - self._reading)
         return self._path(points, reason, narrowest, milliseconds, cells, self.pages - read)
 
@@ -152,7 +154,7 @@ class Planner:
         size = high - low + 1
         shape = tuple(size[: self.map.dimensions][::-1].tolist())
         first = (int(low[0]), int(low[1]), int(low[2]))
-        self.grid.write(first, self._with_obstacle(first, self.grid.read(first, shape), places))
+        self.grid.write(first, self._with_obstacle(first, self.grid.read(first, shape), places), lower=True)
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
@@ -173,7 +175,7 @@ class Planner:
         began = time.perf_counter()
         self.map.pages.prepare(self._towards_goal(page))
         for low, clearance in self.map.pages.read(page):
-            self.grid.write(low, self._now(low, clearance))
+            self.grid.write(low, self._now(low, clearance), lower=True)
         self.grid.finish_page(page)
         self.pages += 1
         self._reading += time.perf_counter() - began
@@ -202,21 +204,14 @@ class Planner:
 
     def _search(self, ends: np.ndarray) -> tuple[np.ndarray | None, int, np.ndarray]:
         """A path between places [2, 3] of the grid, how many cells were looked at for it, and how far the search came.
-
-        A search with greed finds a way that may cost so much more than the best one. If the smoothed path does not make
-        up for that, another search without follows: no path is longer than the weight allows.
-        """
-        s, spacing, cells = self.settings, PlannerTuning.spacing_cells * self.map.cell, 0
-        for greed in (PlannerTuning.greed[self.map.dimensions], 1.0):
-            way = self.grid.search(ends[0], ends[1], replace(self.costs, greed=greed), self._read_page)
-            cells += way.expanded
-            if way.points is None:
-                return None, cells, way.reached
-            most = way.cost / greed
-            points = self.grid.smooth(way.points, self.costs, spacing, s.push, s.passes, most)
-            if greed == 1 or np.linalg.norm(np.diff(points, axis=0), axis=1).sum() <= most:
-                break
-        return points, cells, way.reached
+        Smoothing makes no path longer than the way over cells that it is made of, so the weight bounds its length."""
+        s, spacing = self.settings, PlannerTuning.spacing_cells * self.map.cell
+        way = self.grid.search(ends[0], ends[1], self.costs, self._read_page)
+        points = way.points
+        if points is not None:
+            most = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+            points = self.grid.smooth(points, self.costs, spacing, s.push, s.passes, most)
+        return points, way.expanded, way.reached
 
     def _path(
         self, points: np.ndarray | None, reason: str | None, narrowest: np.ndarray | None, milliseconds: float,
@@ -292,12 +287,12 @@ class Planner:
         widest = self.grid.search(ends[0], ends[1], WayCosts(PlannerTuning.touching, 0.0, 0.0), self._read_page, True)
         if widest.points is None:
             hint = "" if self.settings.unknown else ", or space that nobody has seen,"
-            said = f"no way: obstacles{hint} separate start and goal"
+            said = f"{_NO_WAY}: obstacles{hint} separate start and goal"
             return f"{said}; from the start {self._words(reached)} can be reached", None
         least = self.grid.least_clearance(widest.points)
         where = widest.points[1:][int(np.argmin(least))]
         wide = f"{float(least.min()):.2f} m clearance at {self._words(where)}"
-        return f"no way: the widest one has {wide}, {self.costs.radius:.2f} m asked", where
+        return f"{_NO_WAY}: the widest one has {wide}, {self.costs.radius:.2f} m asked", where
 
 
 def headings(points: np.ndarray) -> np.ndarray:

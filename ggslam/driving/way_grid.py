@@ -36,13 +36,11 @@ class WayCosts:
         radius: least clearance, metres.
         margin: clearance beyond the radius from which on a metre costs a metre, metres.
         weight: what a metre costs more at the radius; between radius and margin it falls with the square.
-        greed: factor of the estimate of what is left. The way found costs at most so many times as much as the best.
     """
 
     radius: float
     margin: float
     weight: float
-    greed: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -92,17 +90,19 @@ class WayGrid:
         """Edge of a page in cells."""
         return self.page * BLOCK[self.dimensions]
 
-    def write(self, low: Cell, clearance: np.ndarray) -> None:
+    def write(self, low: Cell, clearance: np.ndarray, lower: bool = False) -> None:
         """Sets cells.
 
         Args:
             low: first cell.
             clearance: [Z, Y, X] (or [Y, X]), metres to the nearest obstacle; NaN: may not be entered.
+            lower: no clearance that a search has met becomes larger. What was learned of the way to the last goal then
+                serves the next search for it.
         """
         values = np.ascontiguousarray(clearance, np.float32)
         values = values[None] if values.ndim == 2 else values
         first, shape = _box(low, values)
-        self._library.ggslam_way_grid_write(self._handle, first, shape, values.ctypes.data)
+        self._library.ggslam_way_grid_write(self._handle, first, shape, values.ctypes.data, int(lower))
 
     def read(self, low: Cell, shape: tuple[int, ...]) -> np.ndarray:
         """Clearances float32 of the cells from `low` on, of a shape [Z, Y, X] (or [Y, X]); NaN where none may be
@@ -156,7 +156,7 @@ class WayGrid:
                 clearance than the radius is entered.
         """
         places = ((ctypes.c_double * 3)(*map(float, p)) for p in (start, goal))
-        numbers = (costs.radius, costs.margin, costs.weight, costs.greed)
+        numbers = (costs.radius, costs.margin, costs.weight)
         query, stats = WayQuery(*places, *numbers, int(widest)), WayStats()
         state = self._library.ggslam_way_begin(self._handle, ctypes.byref(query))
         while state in (SearchState.SEARCHING, SearchState.NEEDS_PAGES):

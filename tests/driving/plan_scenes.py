@@ -173,7 +173,9 @@ class Trial:
     milliseconds: float
 
 
-def room_planner(room: Room, voxel: float, fly: bool, clearance: float, settings: PlanSettings | None = None) -> Planner:
+def room_planner(
+    room: Room, voxel: float, fly: bool, clearance: float, settings: PlanSettings | None = None
+) -> Planner:
     """A planner in a room's volume: in space, or on the floor for a robot 0.4 m high."""
     field = room_field(room, voxel, None if fly else 0.5)
     T = np.eye(4)

@@ -109,7 +109,7 @@ def test_the_widest_way_is_named() -> None:
     path = flat_planner(room_with_door(3), clearance=0.3).plan(np.array([1.05, 1, 0]), np.array([5, 3, 0]))
     assert not path.found and path.narrowest is not None and len(path.points) == 0
     assert path.narrowest == pytest.approx([3.05, 2.05, 0.0], abs=0.06)
-    assert "no way: the widest one has 0.15 m clearance at (3.05, 2.05, 0.00), 0.30 m asked" == path.reason
+    assert path.reason == "no way: the widest one has 0.15 m clearance at (3.05, 2.05, 0.00), 0.30 m asked"
     assert flat_planner(room_with_door(3), clearance=0.149).plan(np.array([1.05, 1, 0]), np.array([5, 3, 0])).found
 
 
@@ -121,7 +121,7 @@ def test_no_door_at_all() -> None:
 @pytest.mark.parametrize(
     ("start", "reason"),
     [
-        ((3.05, 0.5, 0), "the start lies in an obstacle; the nearest place that fits is (2.75, 0.45, 0.00), 0.30 m away"),
+        ((3.05, 0.5, 0), "the start lies in an obstacle; the nearest place that fits is (2.75, 0.45, 0.00), 0.30 m"),
         ((2.9, 1, 0), "the start is 0.10 m from an obstacle, 0.20 m asked"),
         ((70, 1, 0), "the start lies in unknown space, or outside the map"),
     ],
@@ -152,6 +152,23 @@ def test_a_new_obstacle_is_gone_around() -> None:
     assert gaps >= 0.2 - 1e-6
     planner.update((0, 0, 0), cell_distances(room_with_door(16), 0.1, 30, NativeContext(1)))
     assert planner.plan(start, goal).length == pytest.approx(before.length, abs=1e-6)
+
+
+def test_what_was_learned_of_a_goal_changes_no_cost() -> None:
+    """Searches for the same goal, obstacle after obstacle, find what a planner that knows nothing yet finds."""
+    planner, start, goal = flat_planner(room_with_door(16)), np.array([1, 2, 0]), np.array([5, 2, 0])
+    blocks = [np.array([[x, y, 0.0]]) for x, y in ((2.05, 2.05), (3.05, 1.85), (3.05, 2.35), (4.15, 2.05))]
+    looked_at = np.zeros(2, int)
+    planner.plan(start, goal)
+    for number, block in enumerate(blocks):
+        planner.add_obstacles(block)
+        fresh = flat_planner(room_with_door(16))
+        for there in blocks[: number + 1]:
+            fresh.add_obstacles(there)
+        again, first = (p.grid.search(start, goal, p.costs, lambda page: None) for p in (planner, fresh))
+        assert again.cost == pytest.approx(first.cost, rel=0.006)  # what a search takes for worthwhile
+        looked_at += again.expanded, first.expanded
+    assert looked_at[0] < looked_at[1]
 
 
 def test_searches_repeat_bit_for_bit() -> None:

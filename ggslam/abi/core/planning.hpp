@@ -13,7 +13,6 @@ struct WayQuery {
   float radius;    // least clearance
   float margin;    // clearance beyond the radius from which on a metre costs a metre
   float weight;    // what a metre costs more at the radius, falling with the square of what is left of the margin
-  float greed;     // factor of the estimate of what is left; more than 1 is faster, and dearer by no more than that
   int32_t widest;  // the way with the largest least clearance, whatever its length; radius: what may still be entered
 };
 
@@ -45,8 +44,10 @@ GGSLAM_EXPORT void* ggslam_way_grid_create(int dimensions, double cell, int page
 GGSLAM_EXPORT int ggslam_way_grid_destroy(void* grid);
 GGSLAM_EXPORT int64_t ggslam_way_grid_bytes(void* grid);
 
-// Clearances [shape z, y, x] in metres of the cells from `low` on; NaN: may not be entered.
-GGSLAM_EXPORT int ggslam_way_grid_write(void* grid, const int32_t* low, const int32_t* shape, const float* clearance);
+// Clearances [shape z, y, x] in metres of the cells from `low` on; NaN: may not be entered. `lower`: none becomes larger
+// that a search has met.
+GGSLAM_EXPORT int ggslam_way_grid_write(void* grid, const int32_t* low, const int32_t* shape, const float* clearance,
+                                        int lower);
 GGSLAM_EXPORT int ggslam_way_grid_read(void* grid, const int32_t* low, const int32_t* shape, float* clearance);
 
 // What is not written in a page by now has nothing that may be entered.

@@ -81,10 +81,11 @@ GGSLAM_EXPORT int64_t ggslam_way_grid_bytes(void* handle) try {
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_way_grid_write(void* handle, const int32_t* low_, const int32_t* shape_,
-                                        const float* clearance) try {
+                                        const float* clearance, int lower) try {
   Planner& p = planner(handle);
   const Vec3i low = vector3("low", low_), shape = vector3("shape", shape_);
   check_array("clearance", clearance, static_cast<int64_t>(check_box(p, low, shape)));
+  if (lower == 0) p.grid.forget();
   p.grid.write(low, shape, clearance);
   return 0;
 } GGSLAM_CATCH_ALL
@@ -132,7 +133,7 @@ GGSLAM_EXPORT int ggslam_way_begin(void* handle, const WayQuery* query_) try {
   const WayQuery& query = object_of<WayQuery>(query_);
   check_within("start", query.start, 3, kFarthestPoint), check_within("goal", query.goal, 3, kFarthestPoint);
   check_range("radius", query.radius, 0.0f, 1e6f), check_range("margin", query.margin, 0.0f, 1e6f);
-  check_range("weight", query.weight, 0.0f, 1e6f), check_range("greed", query.greed, 0.0f, 1e3f);
+  check_range("weight", query.weight, 0.0f, 1e6f);
   p.search.begin(query);
   p.begun = true;
   return kSearching;

@@ -98,7 +98,7 @@ void WayGrid::read(const Vec3i& low, const Vec3i& shape, float* clearance) const
 
 std::size_t WayGrid::bytes() const {
   std::size_t sum = table_.bytes() + blocks_.capacity() * sizeof(WayBlock);
-  for (const WayBlock& b : blocks_) sum += static_cast<std::size_t>(cells) * (4 + (b.nodes ? sizeof(WayNode) : 0));
+  for (const WayBlock& b : blocks_) sum += static_cast<std::size_t>(cells) * (4 + (b.nodes ? sizeof(WayNode) : 0) + (b.ahead ? 4 : 0));
   return sum;
 }
 
@@ -113,14 +113,31 @@ float WayGrid::clearance(const Vec3i& c) const {
   return p.row < 0 ? kNothing : block(p.row).clearance[static_cast<std::size_t>(p.index)];
 }
 
-WayNode& WayGrid::node(CellPlace p, float unreached) {
-  WayBlock& b = block(p.row);
-  if (b.search != searches || !b.nodes) {
-    if (!b.nodes) b.nodes.reset(new WayNode[static_cast<std::size_t>(cells)]);
-    std::fill_n(b.nodes.get(), cells, WayNode{unreached, kNoStep, 0});
-    b.search = searches;
-  }
-  return b.nodes[static_cast<std::size_t>(p.index)];
+void WayGrid::begin_search(bool same_goal) {
+  ++search_;
+  if (!same_goal || forgotten_) ++goal_, first_ = search_, costs_.clear();
+  forgotten_ = false;
+  costs_.push_back(-1);
+}
+
+void WayGrid::begin_block(WayBlock& b, float unreached) {
+  const std::size_t n = static_cast<std::size_t>(cells);
+  if (!b.nodes) b.nodes.reset(new WayNode[n]);
+  else if (b.search >= first_) learn(b);
+  std::fill_n(b.nodes.get(), n, WayNode{unreached, kNoStep, 0});
+  b.search = search_;
+}
+
+// From the search that last came to a block, for the same goal.
+void WayGrid::learn(WayBlock& b) {
+  const float cost = costs_[b.search - first_];
+  if (cost < 0) return;
+  const std::size_t n = static_cast<std::size_t>(cells);
+  if (!b.ahead) b.ahead.reset(new float[n]);
+  if (b.goal != goal_) std::fill_n(b.ahead.get(), n, 0.0f);
+  b.goal = goal_;
+  for (std::size_t i = 0; i < n; ++i)
+    if (b.nodes[i].done) b.ahead[i] = std::max(b.ahead[i], cost - b.nodes[i].value);
 }
 
 Vec3<double> WayGrid::to_cells(const double* metres) const {

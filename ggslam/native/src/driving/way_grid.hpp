@@ -33,6 +33,8 @@ struct WayBlock {
   std::unique_ptr<float[]> clearance;  // NaN: may not be entered
   std::unique_ptr<WayNode[]> nodes;
   uint32_t search = 0;  // which search the nodes are of
+  std::unique_ptr<float[]> ahead;  // what the way to the goal costs at least, as earlier searches know
+  uint32_t goal = 0;               // which goal that is
 };
 
 // Where a cell is.
@@ -59,7 +61,12 @@ class WayGrid {
   const int page;     // blocks; 0: all is written
   const int bits[3];  // of a cell's place in its block
   const int cells;    // of a block
-  uint32_t searches = 0;
+
+  // Searches are numbered. What one for a goal found out serves the next one for the same goal, as long as nothing got
+  // cheaper: the goal is as far from a cell as the whole way is long, less the way to the cell (adaptive A*).
+  void begin_search(bool same_goal);
+  void end_search(float cost) { costs_.back() = cost; }  // infinite: the goal cannot be reached
+  void forget() { forgotten_ = true; }
 
   void write(const Vec3i& low, const Vec3i& shape, const float* clearance);
   void read(const Vec3i& low, const Vec3i& shape, float* clearance) const;
@@ -93,7 +100,16 @@ class WayGrid {
   bool is_inner(CellPlace p) const { return inner_[static_cast<std::size_t>(p.index)] != 0; }
   int32_t offset(int number) const { return offset_[number]; }
   // Nodes of the current search.
-  WayNode& node(CellPlace p, float unreached);
+  WayNode& node(CellPlace p, float unreached) {
+    WayBlock& b = block(p.row);
+    if (b.search != search_) begin_block(b, unreached);
+    return b.nodes[static_cast<std::size_t>(p.index)];
+  }
+  // What the way from a cell to the goal costs at least, as far as that is known.
+  float ahead(CellPlace p) const {
+    const WayBlock& b = block(p.row);
+    return b.goal == goal_ ? b.ahead[static_cast<std::size_t>(p.index)] : 0.0f;
+  }
 
   // The place in cells of a point in metres.
   Vec3<double> to_cells(const double* metres) const;
@@ -101,6 +117,8 @@ class WayGrid {
 
  private:
   int32_t make(BlockCoordinates at);
+  void begin_block(WayBlock& block, float unreached);
+  void learn(WayBlock& block);
   int mask_[3];
   int32_t offset_[kAround];
   std::vector<uint8_t> inner_;
@@ -108,6 +126,9 @@ class WayGrid {
   BlockTable table_;
   std::vector<WayBlock> blocks_;
   std::unordered_set<BlockCoordinates, PageHash, SamePage> finished_;
+  uint32_t search_ = 0, goal_ = 0, first_ = 0;  // numbers of the search, of its goal, of the first search for that
+  bool forgotten_ = false;
+  std::vector<float> costs_;  // of the ways that the searches from `first_` on found; negative: nothing is known
 };
 
 // Finds cells that lie near one another.

@@ -59,18 +59,21 @@ bool CostQueue::pop(Entry* entry) {
 }
 
 void WaySearch::begin(const WayQuery& query) {
+  const auto same_place = [](const double* a, const double* b) { return std::equal(a, a + 3, b); };
+  const bool same_goal = same_place(query.goal, query_.goal) && query.radius == query_.radius &&
+                         query.margin == query_.margin && query.weight == query_.weight && !query.widest && !query_.widest;
   query_ = query;
   const float scale = static_cast<float>(1 / grid_.cell);
   cost_ = {query.radius * scale, query.margin * scale, query.weight};
   start_ = grid_.to_cells(query.start), goal_ = grid_.to_cells(query.goal);
   near_goal_ = cast<float>(goal_);
   queue_.clear(), widest_ = {}, goals_.clear(), points_.clear();
-  ++grid_.searches;
+  grid_.begin_search(same_goal);
   seeded_ = false, state_ = kSearching, best_ = query.widest ? -1 : kFar, expanded_ = 0;
   last_ = nearest_cell_ = {-1, 0}, nearest_ = kFar;
 }
 
-float WaySearch::estimate(const Vec3i& cell) const {
+float WaySearch::distance_left(const Vec3i& cell) const {
   const float x = std::fabs(static_cast<float>(cell[0]) - near_goal_[0]);
   const float y = std::fabs(static_cast<float>(cell[1]) - near_goal_[1]);
   const float z = std::fabs(static_cast<float>(cell[2]) - near_goal_[2]);
@@ -120,12 +123,12 @@ SearchState WaySearch::seed() {
 }
 
 void WaySearch::reach(CellPlace p, const Vec3i& cell, float value, uint8_t step) {
-  const float left = estimate(cell);
   WayNode& node = grid_.node(p, query_.widest ? -1 : kFar);
+  const float left = distance_left(cell);
   node.value = value, node.step = step;
   if (left < nearest_) nearest_ = left, nearest_cell_ = p;
   if (query_.widest) widest_.push({value, number(p)});
-  else queue_.push(value + query_.greed * left, {number(p), value});
+  else if (const float whole = value + std::max(left, grid_.ahead(p)); whole < kFar) queue_.push(whole, {number(p), value});
 }
 
 bool WaySearch::look_around(CellPlace p, float* clearance, CellPlace* places) {
@@ -168,8 +171,6 @@ SearchState WaySearch::expand(uint32_t cell, float value) {
   for (int n = first; n < last; ++n) passable |= static_cast<uint32_t>(clearance[n] >= cost_.radius) << n;
   const float own = cost_.factor(clearance[kHere]);
   const Vec3i c = grid_.cell_at(here);
-  // With a greedy estimate cells are not looked at again: the way still costs no more than greed allows.
-  const bool closed = query_.greed > 1;
   const Steps& all = steps();
   grid_.node(here, kFar).done = 1;
   for (int n = first; n < last; ++n) {
@@ -185,7 +186,7 @@ SearchState WaySearch::expand(uint32_t cell, float value) {
       continue;
     }
     const float length = all.length[n], known = there.value - kWorthwhile * length;
-    if (value + length >= known || (closed && there.done)) continue;
+    if (value + length >= known) continue;
     const float next = value + length * 0.5f * (own + cost_.factor(clearance[n]));
     if (next < known) reach(places[n], at, next, back);
   }
@@ -210,17 +211,17 @@ SearchState WaySearch::go_on(int64_t most) {
     }
     const float known = grid_.node(place(entry.cell), query_.widest ? -1 : kFar).value;
     if (query_.widest ? entry.value < known : entry.value > known) continue;  // reached in a better way since
-    if (query_.greed > 1 && grid_.node(place(entry.cell), kFar).done && !query_.widest) continue;
     state_ = expand(entry.cell, entry.value);
     if (state_ != kNeedsPages) continue;
     if (query_.widest) widest_.push({entry.value, entry.cell});
-    else queue_.push(entry.value + query_.greed * estimate(grid_.cell_at(place(entry.cell))), entry);
+    else queue_.push(entry.value + estimate(place(entry.cell), grid_.cell_at(place(entry.cell))), entry);
   }
   return state_;
 }
 
 void WaySearch::finish() {
   state_ = last_.row < 0 ? kNoWay : kFound;
+  if (!query_.widest) grid_.end_search(best_);
   if (state_ == kNoWay) return;
   points_.push_back(goal_);
   for (CellPlace p = last_;;) {

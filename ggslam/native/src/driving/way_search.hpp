@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Searches on a grid: A* for the cheapest way of a ball, and the way with the largest least clearance.
 #pragma once
+#include <algorithm>
 #include <queue>
 #include <vector>
 
@@ -51,7 +52,8 @@ class WaySearch {
   // Clearances of the cells around one; whether none of them is on a page that is not there.
   bool look_around(CellPlace p, float* clearance, CellPlace* places);
   void reach(CellPlace p, const Vec3i& cell, float value, uint8_t step);
-  float estimate(const Vec3i& cell) const;
+  float distance_left(const Vec3i& cell) const;
+  float estimate(CellPlace p, const Vec3i& cell) const { return std::max(distance_left(cell), grid_.ahead(p)); }
   void finish();
   uint32_t number(CellPlace p) const {
     return static_cast<uint32_t>(p.row) * static_cast<uint32_t>(grid_.cells) + static_cast<uint32_t>(p.index);
