@@ -15,6 +15,7 @@ from ggslam.driving.plan_settings import PlanSettings
 from ggslam.driving.planner import Planner
 from ggslam.driving.robot import Robot
 from ggslam.jobs.plan.bands import band_cells
+from ggslam.scene.poses import transform_points
 from ggslam.volumes.esdf import DistanceField, FieldSettings
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, SIDE, VOXELS, TsdfMap
@@ -89,11 +90,18 @@ def random_room(seed: int, size: tuple[float, float, float], walls: int, things:
     return Room(size, tuple(solids))
 
 
-def room_field(room: Room, voxel: float, top: float | None = None, max_distance: float = 1.0) -> DistanceField:
-    """A room as a volume, known up to the truncation behind surfaces; up to a height, or whole."""
+Y_DOWN = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""T_floor_map of a map whose first camera was held level at the floor's origin."""
+
+
+def room_tsdf(room: Room, voxel: float, top: float | None = None, T_floor_map: np.ndarray | None = None) -> TsdfMap:
+    """A room as a volume, known up to the truncation behind surfaces; up to a height, or whole. T_floor_map [4, 4], of
+    the map that it is in, only exchanges axes."""
+    T = np.eye(4) if T_floor_map is None else T_floor_map
     tsdf = TsdfMap(TsdfSettings(voxel=voxel))
-    edge, reach = SIDE * voxel, np.array([*room.size[:2], room.size[2] if top is None else top]) + 0.2
-    ranges = [np.arange(np.floor(-0.2 / edge), np.ceil(far / edge)) for far in reach]
+    edge, far = SIDE * voxel, np.array([*room.size[:2], room.size[2] if top is None else top]) + 0.2
+    ends = np.array([np.full(3, -0.2), far]) @ T[:3, :3]
+    ranges = [np.arange(np.floor(a / edge), np.ceil(b / edge)) for a, b in zip(ends.min(0), ends.max(0), strict=True)]
     blocks = np.stack(np.meshgrid(*ranges, indexing="ij"), -1).reshape(-1, 3).astype(np.int32)
     k, j, i = np.unravel_index(np.arange(VOXELS), (SIDE,) * 3)
     offsets = np.stack([i, j, k], -1) + 0.5
@@ -101,13 +109,18 @@ def room_field(room: Room, voxel: float, top: float | None = None, max_distance:
     for start in range(0, len(blocks), 500):
         at = blocks[start : start + 500]
         centres = (at[:, None] * SIDE + offsets[None]) * voxel
-        distance = room.distance(centres.reshape(-1, 3)).reshape(len(at), VOXELS)
+        distance = room.distance(transform_points(centres.reshape(-1, 3), T)).reshape(len(at), VOXELS)
         value = np.rint(np.clip(distance / limit, -1, 1) * FREE_VALUE)
         free = (value == FREE_VALUE).all(axis=1)
         weight = np.where(distance[~free] >= -limit, FULL_WEIGHT, 0)
         tsdf.write(at[~free], value=value[~free], weight=weight)
         tsdf.write_free(at[free], np.full(free.sum(), FULL_WEIGHT))
-    field = DistanceField(tsdf, FieldSettings(max_distance=max_distance))
+    return tsdf
+
+
+def room_field(room: Room, voxel: float, top: float | None = None) -> DistanceField:
+    """The distance field of `room_tsdf`."""
+    field = DistanceField(room_tsdf(room, voxel, top), FieldSettings(max_distance=1.0))
     field.update()
     return field
 

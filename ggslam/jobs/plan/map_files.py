@@ -20,7 +20,7 @@ from ggslam.driving.plan_maps import (
 )
 from ggslam.driving.plan_settings import PlanSettings
 from ggslam.driving.robot import Robot
-from ggslam.errors import AnotherKindError, FormatError
+from ggslam.errors import FormatError
 from ggslam.jobs.plan.bands import band_cells, floor_of_field
 from ggslam.jobs.plan.ros_maps import read_ros_map, read_yaml
 from ggslam.jobs.plan.store_maps import VOLUMES, is_store, open_store_map
@@ -46,12 +46,6 @@ class PlanFileTuning(Tuning):
     """Cells in the least clearance, at least, as far as voxels are fine enough."""
     coarsest_m = 0.05
     """Largest cell, in metres, unless voxels are larger."""
-
-
-class NotAMapError(AnotherKindError, FormatError):
-    """Something to plan on was asked for."""
-
-    wanted = "map to plan on"
 
 
 @dataclass(frozen=True)
@@ -109,8 +103,8 @@ def open_plan_map(request: MapRequest) -> PlanMap:
         "map (.yaml)"
     )
     if path.is_dir():
-        raise NotAMapError(path, f"{said}; `ggslam volumes` makes volumes of a run, a recording or a store")
-    raise NotAMapError(path, f"file is missing: {said}" if not path.exists() else said)
+        raise FormatError(f"{path}: {said}; `ggslam volumes` makes volumes of a run, a recording or a store")
+    raise FormatError(f"{path}: file is missing: {said}" if not path.exists() else f"{path}: {said}")
 
 
 def _of_tsdf(path: Path, request: MapRequest) -> PlanMap:
