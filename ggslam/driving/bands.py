@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from ggslam.abi.core import BEHIND_BIT, SEEN_BIT
 from ggslam.driving.robot import Robot
+from ggslam.errors import InputError
 from ggslam.scene.poses import inverse
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.cell_grid import CellGrid, SlicePlane
@@ -29,6 +30,8 @@ class BandTuning(Tuning):
     reach_voxels = 0.75
     """Distance from a surface point in voxels up to which a cell is occupied: with less, walls have holes where cells
     are smaller than voxels, for the points are up to 1.4 voxels apart."""
+    most_layer_bytes = 256 << 20
+    """Most memory for what was seen at the heights of a volume; of large maps each band looks again."""
     same_place = 1 / 16
     """Surface points above one another count as one if they are this share of a cell apart."""
 
@@ -39,9 +42,9 @@ class BandMap:
 
     Attributes:
         grid: the cells, on the floor.
-        robot: whose band it is.
-        occupied: bool [H, W], whether a cell has a surface in it: a surface point between the robot's lowest and
-            highest obstacle, or a measured point, lies in it or within half a cell (three quarters of a voxel, if
+        heights: lowest and highest obstacle that counts, metres above the floor.
+        occupied: bool [H, W], whether a cell has a surface in it: a surface point, or a measured point, between these
+            heights lies in it or within half a cell (three quarters of a voxel, if
             that is more) of its centre.
         known: bool [H, W], whether it was seen at one of the heights at least.
         behind: bool [H, W], whether it is behind a surface at one of them, at one that no point was measured near, or
@@ -52,7 +55,7 @@ class BandMap:
     """
 
     grid: CellGrid
-    robot: Robot
+    heights: tuple[float, float]
     occupied: np.ndarray
     known: np.ndarray
     behind: np.ndarray
@@ -62,7 +65,7 @@ class BandMap:
     @property
     def free(self) -> np.ndarray:
         """Cells that were seen, with no surface in them and not behind one, bool [H, W]. A cell that was seen at some
-        of the robot's heights only may be free."""
+        of the heights only may be free."""
         return self.known & ~self.occupied & ~self.behind
 
     @property
@@ -92,7 +95,7 @@ class HeightLayers:
     def __init__(self, field: DistanceField, plane: SlicePlane, resolution: float) -> None:
         self.grid = CellGrid.over(plane, resolution)
         self._field = field
-        self._surface = SeenSurface.of(field, self.grid.plane)
+        self._surface = SeenSurface(field, self.grid.plane)
         self._layers: dict[int, np.ndarray] = {}
         edge = SIDE * field.voxel
         middles = (field.coordinates() + 0.5) * edge + field.origin
@@ -101,34 +104,49 @@ class HeightLayers:
 
     def band(self, robot: Robot) -> BandMap:
         """What a robot meets."""
-        low, high = robot.band
+        return self.between(*robot.band)
+
+    def between(self, low: float, high: float) -> BandMap:
+        """What there is between two heights above the floor, metres; a robot that meets all of it.
+
+        Raises:
+            InputError: the lower one is not the first.
+        """
+        if not low <= high:
+            raise InputError(f"expected two heights, the lower first, found {low} and {high}")
+        low, high = max(low, min(self._reach[0], high)), min(high, max(self._reach[1], low))
         seen = self._see(low, high)
         known, behind = (seen & SEEN_BIT) > 0, (seen & BEHIND_BIT) > 0
         near = self._surface.near_points(self.grid, low, high)
-        sites = self._surface.sites
-        sites = sites[(sites[:, 2] >= low) & (sites[:, 2] <= high), :2]
+        sites = self._surface.sites(low, high)
         sited = self.grid.mark(sites)
-        unseen = unseen_surface(sited, near)
+        sites = self._outside(sites, unseen_surface(sited, near))
         measured = self._surface.with_points(self.grid, low, high)
-        points = np.concatenate([self._outside(sites, unseen), self.grid.centres()[measured & ~(sited & ~unseen)]])
-        points = self._thin_out(points)
+        points = self._thin_out(np.concatenate([sites, self.grid.centres()[measured & ~self.grid.mark(sites)]]))
         distance = self._distance(points)
-        occupied = (sited & ~unseen) | measured
-        occupied |= distance <= max(self.grid.resolution / 2, BandTuning.reach_voxels * self._field.voxel)
-        return BandMap(self.grid, robot, occupied, known, behind | unseen | near, distance, points)
+        reached = distance <= max(self.grid.resolution / 2, BandTuning.reach_voxels * self._field.voxel)
+        unseen = unseen_surface(sited | reached, near)
+        occupied = ((sited | reached) & ~unseen) | measured
+        return BandMap(self.grid, (low, high), occupied, known, behind | unseen | near, distance, points)
 
     def _see(self, low: float, high: float) -> np.ndarray:
         """What the voxels of a band are, together, uint8 [H, W]: layers a voxel apart, or the one at its middle."""
-        low, high, spacing = max(low, self._reach[0]), min(high, self._reach[1]), self._field.voxel
+        spacing = self._field.voxel
         first, last = int(np.ceil(low / spacing - 1e-6)), int(np.floor(high / spacing + 1e-6))
         if first > last:
             first = last = int(np.rint((low + high) / 2 / spacing))
-        missing = [number for number in range(first, last + 1) if number not in self._layers]
-        if missing:
-            start, count = missing[0], missing[-1] + 1 - missing[0]
-            found = seen_above(self._field.tsdf, self.grid, start * spacing, spacing, count)
-            self._layers |= {start + k: layer for k, layer in enumerate(found)}
-        return np.bitwise_or.reduce([self._layers[number] for number in range(first, last + 1)])
+        most = max(1, BandTuning.most_layer_bytes // max(1, self.grid.shape[0] * self.grid.shape[1]))
+        found = np.zeros(self.grid.shape, np.uint8)
+        for start in range(first, last + 1, most):
+            count = min(most, last + 1 - start)
+            if any(number not in self._layers for number in range(start, start + count)):
+                new = seen_above(self._field.tsdf, self.grid, start * spacing, spacing, count)
+                if len(self._layers) + count > most:
+                    self._layers = {}
+                self._layers |= {start + k: layer for k, layer in enumerate(new)}
+            for number in range(start, start + count):
+                found |= self._layers[number]
+        return found
 
     def _outside(self, places: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """Those of places [N, 2] that lie in none of some cells, bool [H, W]."""
@@ -146,7 +164,9 @@ class HeightLayers:
     def _distance(self, points: np.ndarray) -> np.ndarray:
         if not len(points):
             return np.full(self.grid.shape, np.inf, np.float32)
-        found = cKDTree(points).query(self.grid.centres().reshape(-1, 2), workers=2)[0]
+        found = cKDTree(points, compact_nodes=False, balanced_tree=False).query(
+            self.grid.centres().reshape(-1, 2), workers=2
+        )[0]
         return found.astype(np.float32).reshape(self.grid.shape)
 
 

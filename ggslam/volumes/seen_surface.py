@@ -4,7 +4,7 @@ points beside them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,48 +16,52 @@ from ggslam.volumes.measured_points import measured_octants
 _BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 
-@dataclass(frozen=True)
-class SeenSurface:
-    """Surfaces above a plane; positions are x, y and height on it, metres.
+class _Layered:
+    """Points [n, 3] and their heights above a plane, float32 [n]; those between two heights are placed on the plane."""
 
-    Attributes:
-        sites: float64 [S, 3], surface points of a distance field.
-        octants: float64 [N, 3], middles of the eighths of voxels that points were measured in.
-        thin: bool [N], whether such an eighth is of a voxel that is surface for its points alone.
-        reach: [3], how far an eighth reaches from its middle.
+    def __init__(self, points: np.ndarray, plane: SlicePlane) -> None:
+        self._points, self._plane = points, plane
+        normal = plane.normal.astype(points.dtype)
+        self._heights = (points @ normal - np.float32(plane.origin @ plane.normal)).astype(np.float32)
+
+    def between(self, low: float, high: float, which: np.ndarray | None = None) -> np.ndarray:
+        """x and y on the plane, float64 [m, 2], metres; `which` bool [n]: of these only."""
+        chosen = (self._heights >= low) & (self._heights <= high)
+        return self._plane.coordinates(self._points[chosen if which is None else chosen & which].astype(float))[:, :2]
+
+
+class SeenSurface:
+    """Surfaces above a plane: surface points of a distance field, and eighths of voxels that points were measured in.
+
+    Args:
+        field: which, with its TSDF, has them.
+        plane: its normal is up.
     """
 
-    sites: np.ndarray
-    octants: np.ndarray
-    thin: np.ndarray
-    reach: np.ndarray
-
-    @staticmethod
-    def of(field: DistanceField, plane: SlicePlane) -> SeenSurface:
-        """What a field and its TSDF have."""
+    def __init__(self, field: DistanceField, plane: SlicePlane) -> None:
         points, normals = field.surface()
-        octants = measured_octants(field.tsdf)
-        thin = _thin_octants(octants, points[~normals.any(1)].astype(float) - field.origin, field.voxel)
-        axes = np.stack([plane.x_axis, plane.y_axis, plane.normal])
-        sites = plane.coordinates(points.astype(float))
-        return SeenSurface(
-            sites, plane.coordinates(octants + field.origin), thin, field.voxel / 4 * np.abs(axes).sum(1)
-        )
+        # Seen from the field's origin, so that a map far from zero gives the same bits.
+        sites, octants = (points - field.origin).astype(np.float32), measured_octants(field.tsdf)
+        plane = replace(plane, origin=plane.origin - field.origin)
+        lone = (normals[:, 0] == 0) & (normals[:, 1] == 0) & (normals[:, 2] == 0)
+        self._sites, self._octants = _Layered(sites, plane), _Layered(octants, plane)
+        self._thin = _thin_octants(octants, sites[lone].astype(float), field.voxel)
+        self._reach = field.voxel / 4 * np.abs(np.stack([plane.x_axis, plane.y_axis, plane.normal])).sum(1)
+        """How far an eighth reaches from its middle along the plane's axes."""
+
+    def sites(self, low: float, high: float) -> np.ndarray:
+        """The surface points between two heights: x and y, float64 [n, 2], metres."""
+        return self._sites.between(low, high)
 
     def near_points(self, grid: CellGrid, low: float, high: float) -> np.ndarray:
         """Cells, bool [H, W], that may have a measured point in them between two heights: none of them is free."""
-        return grid.mark(self._between(low, high, self.reach[2]), self.reach[:2])
+        return grid.mark(self._octants.between(low - self._reach[2], high + self._reach[2]), self._reach[:2])
 
     def with_points(self, grid: CellGrid, low: float, high: float) -> np.ndarray:
         """Cells, bool [H, W], that have one: the middle of an eighth lies in them, or any part of one of a thin
         thing."""
-        marked = grid.mark(self._between(low, high))
-        return marked | grid.mark(self._between(low, high, self.reach[2], self.thin), self.reach[:2])
-
-    def _between(self, low: float, high: float, reach: float = 0.0, which: np.ndarray | None = None) -> np.ndarray:
-        octants = self.octants if which is None else self.octants[which]
-        heights = octants[:, 2]
-        return octants[(heights >= low - reach) & (heights <= high + reach)]
+        thin = self._octants.between(low - self._reach[2], high + self._reach[2], self._thin)
+        return grid.mark(self._octants.between(low, high)) | grid.mark(thin, self._reach[:2])
 
 
 def unseen_surface(surface: np.ndarray, near_points: np.ndarray) -> np.ndarray:

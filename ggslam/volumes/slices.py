@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plane slices through the distance field: arrays, pictures, and maps for ROS's map_server.
+"""Plane slices through the distance field: arrays and pictures.
 
 A slice is a grid of square cells on an oriented plane. Arrays are [H, W] with row 0 at the top, where y is largest, as
 in pictures; column 0 is where x is smallest.
@@ -8,26 +8,15 @@ in pictures; column 0 is where x is smallest.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
 
 import cv2
 import numpy as np
 
-from ggslam.errors import InputError
-from ggslam.system.atomic import write_bytes, write_text
 from ggslam.volumes.cell_grid import CellGrid, SlicePlane
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
 from ggslam.volumes.seen_surface import SeenSurface, unseen_surface
 from ggslam.volumes.tsdf import SIDE
-
-OCCUPIED: Final = 0
-"""Grey of an occupied cell in a ROS map."""
-FREE: Final = 254
-"""Grey of a free cell there."""
-UNKNOWN: Final = 205
-"""Grey of an unknown cell there."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +26,11 @@ class FieldSlice:
     Attributes:
         plane: where; its rectangle is that of the cells.
         resolution: edge of a cell, metres.
-        distance: float32 [H, W], metres, at the cells' centres; of a band, the least over the heights. NaN: not known.
+        distance: float32 [H, W], metres, at the cells' centres. NaN: not known.
         known: bool [H, W].
         occupied: bool [H, W], whether a cell has a surface in it.
-        behind: bool [H, W], whether a cell is behind a surface (at one of the heights), at one that no point was
-            measured near, or may have a measured point in it: not free, whatever is known.
+        behind: bool [H, W], whether a cell is behind a surface, at one that no point was measured near, or may have a
+            measured point in it: not free, whatever is known.
     """
 
     plane: SlicePlane
@@ -78,40 +67,26 @@ def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> Slic
     return SlicePlane(field.origin + height * z, x, y, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
 
 
-def slice_field(
-    field: DistanceField, plane: SlicePlane, resolution: float, band: tuple[float, float] | None = None
-) -> FieldSlice:
+def slice_field(field: DistanceField, plane: SlicePlane, resolution: float) -> FieldSlice:
     """Slices the field.
 
     A cell is occupied if its centre is from half a cell before a surface (or half a voxel, if that is more) to a cell
     behind it, or if a point was measured in it: the middle of an eighth of a voxel that has points lies in it, or any
-    part of one that is a thin thing. No cell that overlaps an eighth with points is free. With a band, heights from
-    `low` to `high` are looked at, a voxel apart: a cell is occupied if it is at any of them, and free if it is known at
-    one at least, and occupied or behind a surface at none. A robot as high as the band may therefore drive over a cell
-    that was seen at some of its heights only.
+    part of one that is a thin thing. No cell that overlaps an eighth with points is free. What there is between two
+    heights, `driving.bands` tells.
 
     Args:
         field: to slice.
         plane: where.
         resolution: edge of a cell, metres.
-        band: lowest and highest offset along the plane's normal, metres; None: the plane alone.
 
     Raises:
-        InputError: a resolution or band that is not positive, or more than 50 million cells.
+        InputError: a resolution that is not positive, or more than 50 million cells.
     """
-    if band is not None and not band[0] <= band[1]:
-        raise InputError(f"expected an ascending band, found {band} (resolution {resolution})")
-    grid, (low, high) = CellGrid.over(plane, resolution), band or (0.0, 0.0)
-    centres = grid.places().reshape(-1, 3)
-    offsets = np.linspace(low, high, int(np.ceil((high - low) / field.voxel - 1e-6)) + 1)
-    least = np.full(len(centres), np.nan, np.float32)
-    hit, cell = np.zeros(len(centres), bool), max(resolution, field.voxel)
-    for offset in offsets:
-        found = field.query(centres + offset * plane.normal).distance
-        least = np.fmin(least, found)
-        hit |= (found <= cell / 2) & (found >= -cell)
-    distance, occupied, surface = least.reshape(grid.shape), hit.reshape(grid.shape), SeenSurface.of(field, plane)
-    near, points = surface.near_points(grid, low, high), surface.with_points(grid, low, high)
+    grid, surface, cell = CellGrid.over(plane, resolution), SeenSurface(field, plane), max(resolution, field.voxel)
+    distance = field.query(grid.places().reshape(-1, 3)).distance.reshape(grid.shape)
+    occupied = (distance <= cell / 2) & (distance >= -cell)
+    near, points = surface.near_points(grid, 0.0, 0.0), surface.with_points(grid, 0.0, 0.0)
     unseen = unseen_surface(occupied, near)
     occupied, behind = (occupied & ~unseen) | points, (distance < 0) | unseen | near
     return FieldSlice(grid.plane, resolution, distance, ~np.isnan(distance), occupied, behind)
@@ -130,13 +105,18 @@ def slice_picture(cut: FieldSlice, full_scale: float, smallest_side: int = 480) 
     inner = cv2.erode(cut.occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     picture[cut.occupied & ~inner] = 0
     picture[~cut.known] = 128
-    times = max(1, -(-smallest_side // min(cut.known.shape)))
-    times = max(1, min(times, 4000 // max(cut.known.shape)))
+    times = magnification(cut.known.shape, smallest_side)
     picture = picture.repeat(times, 0).repeat(times, 1)
-    return np.concatenate([picture, _scale(picture.shape[1], full_scale, cut.resolution)])
+    return np.concatenate([picture, _scale(picture.shape[1], full_scale)])
 
 
-def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
+def magnification(shape: tuple[int, ...], smallest_side: int) -> int:
+    """By how much cells [H, W] are magnified so that the shorter side has `smallest_side` pixels, if the longer one
+    has not more than 4000 then."""
+    return max(1, min(-(-smallest_side // min(shape)), 4000 // max(shape)))
+
+
+def _scale(width: int, full_scale: float) -> np.ndarray:
     """The colours of distances with marks in metres."""
     bar = np.full((46, width, 3), 255, np.uint8)
     ramp = cv2.applyColorMap(np.linspace(255, 0, width).astype(np.uint8)[None], cv2.COLORMAP_TURBO)[..., ::-1]
@@ -148,33 +128,3 @@ def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
         x = int(np.clip(i * (width - 1) / (marks - 1) - size / 2, 2, max(2, width - size - 2)))
         cv2.putText(bar, text, (x, 38), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
     return bar
-
-
-def ros_map(cut: FieldSlice) -> np.ndarray:
-    """A slice as a ROS map: uint8 [H, W], 0 occupied, 254 free, 205 unknown."""
-    return np.where(cut.occupied, OCCUPIED, np.where(cut.free, FREE, UNKNOWN)).astype(np.uint8)
-
-
-def write_ros_map(cut: FieldSlice, path: str | Path) -> tuple[Path, Path]:
-    """Writes a map that ROS's map_server reads: `path` with the endings .pgm (binary) and .yaml.
-
-    The map's frame is that of the plane: x and y along its axes, in metres from its origin; the yaml's origin is the
-    lower left corner of the lower left pixel.
-
-    Returns:
-        The two files.
-
-    Raises:
-        RunFolderError: a file cannot be written.
-    """
-    path = Path(path)
-    image, description = path.with_name(path.name + ".pgm"), path.with_name(path.name + ".yaml")
-    pixels = ros_map(cut)
-    write_bytes(image, f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n".encode() + pixels.tobytes())
-    x, y = cut.plane.low
-    write_text(
-        description,
-        f"image: {image.name}\nmode: trinary\nresolution: {cut.resolution:.6g}\norigin: [{x:.6f}, {y:.6f}, 0.0]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
-    )
-    return image, description

@@ -474,6 +474,30 @@ def read_rig(path: Path) -> Any:
     return read_rig_file(path)
 
 
+def urdf_files(folder: Path) -> list[Path]:
+    """A robot of three links."""
+    solids = ('<box size="0.6 0.4 0.2"/>', '<cylinder radius="0.02" length="0.5"/>', '<sphere radius="0.1"/>')
+    links = [
+        f'<link name="l{k}"><collision><origin xyz="0 0 {k}" rpy="0 1 0"/><geometry>{solid}</geometry></collision>'
+        for k, solid in enumerate(solids)
+    ]
+    links = [f"{link}</link>" for link in links]
+    joints = [
+        f'<joint name="j{k}" type="fixed"><parent link="l{k - 1}"/><child link="l{k}"/><origin xyz="1 0 0"/></joint>'
+        for k in (1, 2)
+    ]
+    (folder / "robot.urdf").write_text("\n".join(['<?xml version="1.0"?>', "<robot>", *links, *joints, "</robot>"]))
+    return [folder / "robot.urdf"]
+
+
+def read_urdf_file(path: Path) -> Any:
+    """Its shapes, and what they hide."""
+    from ggslam.driving.body import Body
+    from ggslam.driving.urdf import read_urdf
+
+    return Body(read_urdf(path, "l0")).hides(np.eye(3))
+
+
 def id_tables(folder: Path) -> list[Path]:
     """Ids of masks as DEVA lists them, beside the masks."""
     import cv2

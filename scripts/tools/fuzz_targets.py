@@ -486,6 +486,7 @@ TARGETS = [
     Target("whole-run", states.whole_runs, states.read_more_of_run),
     Target("tsdf", states.tsdf_files, states.read_tsdf),
     Target("rig-file", states.rig_files, states.read_rig),
+    Target("urdf", states.urdf_files, states.read_urdf_file),
     Target("id-table", states.id_tables, states.read_id_table),
     Target("edit-list", states.videos, states.read_edit_list, 2),
     *(Target(name.replace(" ", "-"), _recordings(name), _recording_read, 2) for name in RECORDINGS),

@@ -5,8 +5,11 @@ of ggslam: written from what map_server publishes of its files."""
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import yaml
 
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.settings import TsdfSettings
@@ -77,29 +80,45 @@ def room_field(T_floor_map: np.ndarray, voxel: float = 0.04) -> DistanceField:
     return field
 
 
-def read_map(path: Path) -> tuple[np.ndarray, dict[str, object]]:
+def read_map(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """A map as map_server loads it: occupancy int [H, W] with row 0 at the BOTTOM (-1 unknown, 0 free ... 100
     occupied), as of a nav_msgs/OccupancyGrid, and what the yaml says."""
-    import yaml
-
     told = yaml.safe_load(path.read_text())
-    pixels = _pgm(path.parent / told["image"])
-    shade = pixels.astype(float) / 255
+    pixels = cv2.imread(str(path.parent / told["image"]), cv2.IMREAD_UNCHANGED)
+    alpha = pixels[..., 3] if pixels.ndim == 3 and pixels.shape[2] == 4 else np.full(pixels.shape[:2], 255, np.uint8)
+    grey = pixels.astype(float) if pixels.ndim == 2 else pixels[..., :3].astype(float).mean(2)
+    return occupancy(grey, alpha, told)[::-1], told
+
+
+def occupancy(grey: np.ndarray, alpha: np.ndarray, told: dict[str, Any]) -> np.ndarray:
+    """What map_server makes of pixels."""
+    shade = grey / 255
     p = shade if told["negate"] else 1 - shade
-    mode, occ, free = told["mode"], told["occupied_thresh"], told["free_thresh"]
+    mode, occupied, free = told["mode"], told["occupied_thresh"], told["free_thresh"]
     if mode == "raw":
-        grid = np.where(pixels <= 100, pixels.astype(int), -1)
-    else:
-        between = np.full(p.shape, -1)
-        if mode == "scale":
-            between = np.rint((p - free) / (occ - free) * 100).astype(int)
-        grid = np.where(p > occ, 100, np.where(p < free, 0, between))
-    return grid[::-1], told
+        return np.where(np.rint(shade * 255) <= 100, np.rint(shade * 255), -1).astype(int)
+    between = np.full(p.shape, -1)
+    if mode == "scale":
+        between = np.rint((p - free) / (occupied - free) * 100).astype(int)
+    found = np.where(p > occupied, 100, np.where(p < free, 0, between))
+    return np.where(alpha < 255, -1, found) if mode == "scale" else found
 
 
-def _pgm(path: Path) -> np.ndarray:
-    data = path.read_bytes()
-    kind, size, most, rest = data.split(b"\n", 3)
-    width, height = map(int, size.split())
-    assert kind == b"P5" and most == b"255" and len(rest) == width * height
-    return np.frombuffer(rest, np.uint8).reshape(height, width)
+def value_at(grid: np.ndarray, told: dict[str, Any], x: float, y: float) -> int:
+    """The cell that a place of the map's frame is in: row 0 begins at the origin's y."""
+    x0, y0, yaw = told["origin"]
+    assert yaw == 0
+    return int(grid[int((y - y0) / told["resolution"]), int((x - x0) / told["resolution"])])
+
+
+def centres_of(grid: np.ndarray, told: dict[str, Any]) -> np.ndarray:
+    """Where the cells' centres are in the map's frame, [H, W, 2]."""
+    x = told["origin"][0] + (np.arange(grid.shape[1]) + 0.5) * told["resolution"]
+    y = told["origin"][1] + (np.arange(grid.shape[0]) + 0.5) * told["resolution"]
+    return np.stack(np.meshgrid(x, y), -1)
+
+
+def costs_of(values: np.ndarray) -> np.ndarray:
+    """What nav2's static layer makes of an occupancy grid with `trinary_costmap: false` and a lethal threshold of
+    100."""
+    return np.where(values < 0, 255, np.where(values >= 100, 254, (values / 100 * 254).astype(int)))

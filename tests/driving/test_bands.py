@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from rooms import BOXES, SIZE, room_field, turned, wall_distance
 
-from ggslam.driving.bands import BandMap, HeightLayers, band_map, floor_plane
+from ggslam.driving.bands import BandMap, BandTuning, HeightLayers, band_map, floor_plane
 from ggslam.driving.robot import Robot
 from ggslam.errors import InputError
+from ggslam.system.tuning import overridden
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.tsdf import TsdfMap
 
@@ -80,6 +81,15 @@ def test_bands_of_one_volume_are_those_of_each_alone(field: DistanceField, layer
             assert np.array_equal(getattr(one, name), getattr(alone, name))
 
 
+def test_bands_of_large_maps_are_the_same(field: DistanceField, layers: HeightLayers) -> None:
+    """Of which not all heights are held."""
+    cells = layers.grid.shape[0] * layers.grid.shape[1]
+    with overridden(BandTuning, most_layer_bytes=5 * cells):
+        few = HeightLayers(field, floor_plane(field, T_FLOOR_MAP), CELL)
+        for robot in (TALL, LOW, TALL):
+            assert np.array_equal(few.band(robot).free, layers.band(robot).free)
+
+
 @pytest.mark.parametrize("cell", [0.02, 0.04, 0.1, 0.25])
 def test_walls_have_no_holes_at_any_resolution(field: DistanceField, cell: float) -> None:
     """Nobody gets out of the room."""
@@ -88,6 +98,19 @@ def test_walls_have_no_holes_at_any_resolution(field: DistanceField, cell: float
     (row,), (column,), _ = band.grid.cells_of(np.array([[2.4, 1.4]]))
     out = wall_distance(places(band), *LOW.band).reshape(labels.shape) < -0.02
     assert labels[row, column] and not (labels[out] == labels[row, column]).any()
+
+
+def test_any_obstacle_between_two_heights_counts(field: DistanceField, layers: HeightLayers) -> None:
+    at = [tuple(int(i[0]) for i in layers.grid.cells_of(np.array([place]))[:2]) for place in ((2.4, 1.4), (1.3, 0.54))]
+    open_floor, low_box = at
+    assert layers.between(0.1, 0.3).occupied[low_box] and not layers.between(0.5, 0.9).occupied[low_box]
+    assert layers.between(-0.2, 0.3).occupied[open_floor]  # the floor is between them
+    high = layers.between(3.0, 4.0)
+    assert not high.known.any() and not high.occupied.any() and high.heights[0] == 3.0
+    partly = layers.between(1.5, 99.0)
+    assert partly.known[open_floor] and partly.heights[1] < 4
+    with pytest.raises(InputError, match="heights"):
+        layers.between(1.0, 0.5)
 
 
 def test_empty_volumes_know_nothing() -> None:

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ggslam.driving.body import CameraBody
+from ggslam.driving.body_options import read_body
 from ggslam.errors import ConfigError
 from ggslam.jobs.volumes.live import LiveVolumes
 from ggslam.jobs.volumes.no_returns import NoReturns
@@ -18,6 +20,7 @@ from ggslam.mapping.keyframe import make_keyframe
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import se3_exp
 from ggslam.sequences import open_sequence
+from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.loop_closing import LoopEvent
 from ggslam.slam.result import StepReport, TrackedFrame
 from ggslam.volumes.maps import VolumeMaps
@@ -83,6 +86,35 @@ def test_after_a_correction_the_volumes_are_where_the_keyframes_are(frames: list
     assert maps.occupancy is not None and straight.occupancy is not None
     assert maps.occupancy.summary().occupied == pytest.approx(straight.occupancy.summary().occupied, rel=0.02)
     assert len(maps.times.rebuilds) == 1
+
+
+def test_the_robots_body_is_left_out_live_and_after_a_correction(frames: list[Frame]) -> None:
+    """A box before the lower half of the camera."""
+    body = read_body(["-2,0.2,0.3,2,1,0.5"])
+    assert body is not None
+    cut, maps, slam = CameraBody(body), VolumeMaps(SETTINGS), Played()
+    live = LiveVolumes(maps, lambda frame, T: None, body=body)
+    for corrections in ([], [np.eye(4)]):
+        slam.corrections = corrections
+        for frame in frames[:2]:
+            slam.play(live, frame, frame.T_world_camera)
+    straight = VolumeMaps(SETTINGS)
+    for frame in frames[:2]:
+        straight.add(cut.without(frame), frame.T_world_camera, frame.load_mask())
+    assert len(maps.times.rebuilds) == 1 and values(maps).keys() == values(straight).keys()
+
+
+def test_what_moves_is_left_out_live(frames: list[Frame]) -> None:
+    pixels, left = MovingPixels(), np.zeros(frames[0].depth.shape, bool)
+    left[:, : left.shape[1] // 2] = True
+    pixels.add(1, left)
+    maps, slam = VolumeMaps(SETTINGS), Played()
+    live = LiveVolumes(maps, lambda frame, T: None, objects=False, still=lambda slam, frame: pixels.without(frame))
+    slam.play(live, frames[1], frames[1].T_world_camera)
+    halved = VolumeMaps(SETTINGS)
+    halved.add(pixels.without(frames[1]), frames[1].T_world_camera)
+    assert values(maps).keys() == values(halved).keys() and len(values(maps)) > 10
+    assert not (frames[1].depth[left] == 0).all()
 
 
 def test_lost_frames_are_left_out(frames: list[Frame]) -> None:

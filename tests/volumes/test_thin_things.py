@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from analytic_scenes import Box, Scene, Union, looking_at, render_depth, small_camera
 
+from ggslam.driving.bands import HeightLayers
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.measured_points import measured_octants
 from ggslam.volumes.occupancy import OCCUPIED, OccupancyMap
 from ggslam.volumes.occupancy_settings import OccupancySettings
 from ggslam.volumes.settings import TsdfSettings
-from ggslam.volumes.slices import plane_at_height, slice_field
+from ggslam.volumes.slices import plane_at_height
 from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.tsdf_torch import TorchTsdf
 
@@ -58,7 +59,7 @@ def test_a_pole_is_an_obstacle_in_all_maps(voxel: float, z: float, shift: float)
     assert found.known.all() and np.abs(found.distance - 0.3).max() < 0.55 * voxel + 0.02
     assert (field.query(front - [0, 0, 1e-4]).distance <= 0.9 * voxel).all()
     assert (occupancy.states(front + [0, 0, 1e-4]) == OCCUPIED).mean() > 0.9
-    cut = slice_field(field, plane_at_height(field, UP, 0.0), voxel, (-0.3, 0.3))
+    cut = HeightLayers(field, plane_at_height(field, UP, 0.0), voxel).between(-0.3, 0.3)
     assert not cut.free[cells_of(cut, front)].any()
     beside = cv2.dilate(cut.occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     assert beside[cells_of(cut, front)].all()
@@ -96,7 +97,7 @@ def test_the_ros_map_has_all_surfaces_and_nothing_else(voxel: float) -> None:
     views = poses(6)
     _, field, _ = seen(scene, voxel, views)
     band = (-0.35, 0.35)
-    cut = slice_field(field, plane_at_height(field, UP, 0.0), voxel, band)
+    cut = HeightLayers(field, plane_at_height(field, UP, 0.0), voxel).between(*band)
     surface = []
     for T in views:
         points = CAMERA.back_project(render_depth(scene, CAMERA, T)).reshape(-1, 3).astype(np.float64)

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What maps of a floor need of a volume: where points were measured, and what is known above each cell.
+#include <algorithm>
 #include <cmath>
 
 #include "abi/core/volumes.hpp"
@@ -38,6 +39,32 @@ struct Reader {
 int32_t floor_of(double x) {
   const int32_t whole = static_cast<int32_t>(x);
   return whole - (x < whole);
+}
+
+// How many steps from a place stay in the block that voxel v, which the place is in, belongs to; rather one too few.
+int steps_within(const double place[3], const int32_t v[3], const double step[3], int most) {
+  double steps = most;
+  for (int a = 0; a < 3; ++a) {
+    if (step[a] == 0) continue;
+    const double low = (v[a] >> 3) * kSide, end = step[a] > 0 ? low + kSide : low;
+    steps = std::min(steps, (end - place[a]) / step[a] - 1e-6);
+  }
+  return std::max(0, static_cast<int>(steps));
+}
+
+// What the voxels of a column are, layer by layer; `seen` has a byte for each, `stride` apart.
+void read_column(Reader& reader, const double foot[3], const double step[3], int layers, uint8_t* seen,
+                 std::size_t stride) {
+  for (int layer = 0; layer < layers; ++layer) {
+    double place[3];
+    int32_t v[3];
+    for (int a = 0; a < 3; ++a) place[a] = foot[a] + layer * step[a], v[a] = floor_of(place[a]);
+    const uint8_t found = reader.read(v);
+    seen[layer * stride] = found;
+    if (reader.voxels != nullptr) continue;
+    for (int left = steps_within(place, v, step, layers - 1 - layer); left > 0; --left)
+      seen[++layer * stride] = found;
+  }
 }
 
 void check(const ColumnGrid& g) {
@@ -83,14 +110,12 @@ GGSLAM_EXPORT int ggslam_tsdf_columns(void* handle, void* context, const ColumnG
       static_cast<std::size_t>(g.rows), 4, [&](std::size_t begin, std::size_t end, int) {
         Reader reader{map};
         for (std::size_t row = begin; row < end; ++row)
-          for (int column = 0; column < g.columns; ++column)
-            for (int layer = 0; layer < g.layers; ++layer) {
-              int32_t v[3];
-              for (int a = 0; a < 3; ++a)
-                v[a] = floor_of(g.start[a] + layer * g.layer_step[a] + static_cast<double>(row) * g.row_step[a] +
-                                column * g.column_step[a]);
-              seen[layer * cells + row * g.columns + column] = reader.read(v);
-            }
+          for (int column = 0; column < g.columns; ++column) {
+            double foot[3];
+            for (int a = 0; a < 3; ++a)
+              foot[a] = g.start[a] + static_cast<double>(row) * g.row_step[a] + column * g.column_step[a];
+            read_column(reader, foot, g.layer_step, g.layers, seen + row * g.columns + column, cells);
+          }
       });
   return 0;
 } GGSLAM_CATCH_ALL
