@@ -84,13 +84,13 @@ def plan(
     _print(found)
     if out is not None:
         console.print(f"wrote {RECORD} and {PICTURE} to {out}", highlight=False, markup=False)
-    if not found.found:
+    if not found.is_found:
         raise typer.Exit(NO_PATH_EXIT_CODE)
 
 
 def _print(found: PlannedPath) -> None:
     took = f"{found.milliseconds:.1f} ms, {quantity(found.cells, 'cell')} searched"
-    if found.found:
+    if found.is_found:
         line = (
             f"path of {found.length:.2f} m, {quantity(len(found.points), 'point')}; clearance "
             f"{found.least_clearance:.2f} to {float(found.clearance.max()):.2f} m, {found.asked:.2f} asked ({took})"

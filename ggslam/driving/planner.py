@@ -66,7 +66,7 @@ class PlannedPath:
     pages: int = 0
 
     @property
-    def found(self) -> bool:
+    def is_found(self) -> bool:
         """Whether there is a path."""
         return self.reason is None
 
@@ -75,7 +75,7 @@ class PlannedPath:
         """Metres."""
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
-    def moved(self, T_to_map: np.ndarray) -> PlannedPath:
+    def in_frame(self, T_to_map: np.ndarray) -> PlannedPath:
         """The path in another frame."""
         narrowest = None if self.narrowest is None else transform_points(self.narrowest[None], T_to_map)[0]
         return replace(self, points=transform_points(self.points, T_to_map), narrowest=narrowest)

@@ -122,7 +122,7 @@ def _replan(planner: Planner, rng: np.random.Generator) -> tuple[float, float, b
     or a short one. The obstacle goes again."""
     start, goal = rng.uniform(0.3, np.array(FLOOR) - 0.3, (2, 3))
     before = planner.plan(start, goal, explain=False)
-    if not before.found or before.length < 2:
+    if not before.is_found or before.length < 2:
         return None
     middle, here = (before.points[int(len(before.points) * share)] for share in (0.55, 0.3))
     step = np.arange(-0.2, 0.2, planner.map.cell)
@@ -138,7 +138,7 @@ def _replan(planner: Planner, rng: np.random.Generator) -> tuple[float, float, b
     after = planner.plan(here, goal, explain=False)
     done = time.process_time()
     planner.update(first, held)
-    return 1e3 * (taken - began), 1e3 * (done - taken), after.found
+    return 1e3 * (taken - began), 1e3 * (done - taken), after.is_found
 
 
 def octomaps() -> None:
@@ -187,7 +187,7 @@ def _paths(name: str, plan_map: PlanMap, clearance: float, size: tuple[float, fl
         began = time.process_time()
         path = planner.plan(ends[0], ends[1])
         cold.append(time.process_time() - began)
-        if path.found:  # again, with all that it needs in memory
+        if path.is_found:  # again, with all that it needs in memory
             began = time.process_time()
             planner.plan(ends[0], ends[1])
             ms.append(1e3 * (time.process_time() - began))

@@ -233,7 +233,7 @@ def _trial(planner: Planner, room: Room, start: np.ndarray, end: np.ndarray, sho
     began = time.process_time()
     path = planner.plan(start, end)
     milliseconds = 1e3 * (time.process_time() - began)
-    if not path.found:
+    if not path.is_found:
         return Trial(np.isfinite(shortest), False, np.nan, np.nan, np.nan, milliseconds)
     least = float(exact_clearance(room, along(path.points), planner.map.dimensions).min())
     ratio = path.length / shortest if shortest > 0 and np.isfinite(shortest) else np.nan

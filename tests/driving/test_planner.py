@@ -66,7 +66,7 @@ def test_paths_in_space() -> None:
 def test_a_straight_way_is_straight() -> None:
     planner = flat_planner(np.zeros((50, 50), bool))
     path = planner.plan(np.array([0.77, 0.93, 7.0]), np.array([4.21, 3.02, 0.0]))
-    assert path.found and path.length == pytest.approx(np.hypot(3.44, 2.09), abs=1e-4)
+    assert path.is_found and path.length == pytest.approx(np.hypot(3.44, 2.09), abs=1e-4)
     assert path.points[0] == pytest.approx([0.77, 0.93, 0.0], abs=1e-6)
     assert path.points[-1] == pytest.approx([4.21, 3.02, 0.0], abs=1e-6)
     assert path.yaw == pytest.approx(np.full(len(path.points), np.arctan2(2.09, 3.44)), abs=1e-3)
@@ -80,7 +80,7 @@ def test_wider_paths_cost_what_they_may() -> None:
     for weight in (0.0, 0.03, 1.0):
         planner = room_planner(room, VOXEL, False, ASKED, PlanSettings(weight=weight, passes=0 if weight == 0 else 40))
         path = planner.plan(start, goal)
-        assert path.found
+        assert path.is_found
         lengths.append(path.length)
         clearances.append(float(exact_clearance(room, along(path.points), 2).mean()))
     assert clearances[0] < clearances[1] <= clearances[2] + 0.02
@@ -107,15 +107,15 @@ def test_a_smoothed_path_turns_less() -> None:
 
 def test_the_widest_way_is_named() -> None:
     path = flat_planner(room_with_door(3), clearance=0.3).plan(np.array([1.05, 1, 0]), np.array([5, 3, 0]))
-    assert not path.found and path.narrowest is not None and len(path.points) == 0
+    assert not path.is_found and path.narrowest is not None and len(path.points) == 0
     assert path.narrowest == pytest.approx([3.05, 2.05, 0.0], abs=0.06)
     assert path.reason == "no way: the widest one has 0.15 m clearance at (3.05, 2.05, 0.00), 0.30 m asked"
-    assert flat_planner(room_with_door(3), clearance=0.149).plan(np.array([1.05, 1, 0]), np.array([5, 3, 0])).found
+    assert flat_planner(room_with_door(3), clearance=0.149).plan(np.array([1.05, 1, 0]), np.array([5, 3, 0])).is_found
 
 
 def test_no_door_at_all() -> None:
     path = flat_planner(room_with_door(0)).plan(np.array([1, 1, 0]), np.array([5, 3, 0]))
-    assert not path.found and "separate start and goal" in str(path.reason)
+    assert not path.is_found and "separate start and goal" in str(path.reason)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_no_door_at_all() -> None:
 )
 def test_starts_that_do_not_fit(start: tuple[float, float, float], reason: str) -> None:
     path = flat_planner(room_with_door(8)).plan(np.array(start), np.array([5, 3, 0]))
-    assert not path.found and reason in str(path.reason)
+    assert not path.is_found and reason in str(path.reason)
 
 
 def test_places_that_are_none_are_refused() -> None:
@@ -147,7 +147,7 @@ def test_a_new_obstacle_is_gone_around() -> None:
     block = np.stack(np.meshgrid(np.arange(2.6, 3.3, 0.05), np.arange(1.8, 2.1, 0.05), [0.2]), -1).reshape(-1, 3)
     planner.add_obstacles(block)
     after = planner.plan(start, goal)
-    assert before.length < 4.05 and after.found and after.length > 4.05
+    assert before.length < 4.05 and after.is_found and after.length > 4.05
     gaps = np.linalg.norm(along(after.points)[:, None, :2] - block[None, :, :2], axis=2).min()
     assert gaps >= 0.2 - 1e-6
     planner.update((0, 0, 0), cell_distances(room_with_door(16), 0.1, 30, NativeContext(1)))

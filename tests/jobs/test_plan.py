@@ -84,7 +84,7 @@ def nearest(points: np.ndarray, fly: bool, T_floor_map: np.ndarray = Y_DOWN) -> 
 @pytest.mark.parametrize("fly", [False, True], ids=["drive", "fly"])
 def test_volumes(volumes: Path, tmp_path: Path, fly: bool) -> None:
     path = plan_path(volumes, in_map(START), in_map(GOAL), fly=fly, clearance=0.25, out=tmp_path)
-    assert path.found, path.reason
+    assert path.is_found, path.reason
     assert 7.4 < path.length < 8.8 and path.least_clearance >= 0.25 - 1e-6
     assert nearest(path.points, fly) >= 0.25 - VOXEL / 2
     record = json.loads((tmp_path / "path.json").read_text())
@@ -98,7 +98,7 @@ def test_volumes(volumes: Path, tmp_path: Path, fly: bool) -> None:
 def test_the_floor_frame(volumes: Path) -> None:
     place = [*START[:2], 0.0], [*GOAL[:2], 0.0]
     path = plan_path(volumes, place[0], place[1], frame="floor")
-    assert path.found and np.abs(path.points[:, 2]).max() < 1e-6
+    assert path.is_found and np.abs(path.points[:, 2]).max() < 1e-6
     assert path.points[0] == pytest.approx(place[0], abs=0.02)  # the floor is found from surfaces
     assert path.yaw is not None and abs(path.yaw[0]) < np.pi / 2
 
@@ -107,7 +107,7 @@ def test_the_floor_frame(volumes: Path) -> None:
 def test_a_store_is_read_along_the_path(store: Path, volumes: Path, fly: bool) -> None:
     whole = plan_path(volumes, in_map(START), in_map(GOAL), fly=fly, clearance=0.25)
     path = plan_path(store, in_map(START), in_map(GOAL), fly=fly, clearance=0.25)
-    assert path.found, path.reason
+    assert path.is_found, path.reason
     assert path.length == pytest.approx(whole.length, rel=0.03)
     assert nearest(path.points, fly) >= 0.25 - VOXEL / 2
 
@@ -124,7 +124,7 @@ def test_cells_far_from_the_path_are_not_read(store: Path, fly: bool, monkeypatc
 
     monkeypatch.setattr(kind, "close", note)
     path = plan_path(store, in_map(START), in_map(np.array([1.6, 2.1, 0.6])), fly=fly, clearance=0.25)
-    assert path.found and path.pages > 0
+    assert path.is_found and path.pages > 0
     with GridStore.open(store / "volumes") as made:
         assert 0 < len(read) < 0.8 * len(made.cells())
 
@@ -145,7 +145,7 @@ def test_octomaps(tmp_path: Path, ending: str) -> None:
     for fly in (False, True):
         start = START if fly else np.array([*START[:2], 0.0])
         path = plan_path(file, start.tolist(), GOAL.tolist(), fly=fly, clearance=0.3)
-        assert path.found, path.reason
+        assert path.is_found, path.reason
         assert nearest(path.points, fly, np.eye(4)) >= 0.3 - VOXEL
 
 
@@ -169,7 +169,7 @@ def test_ros_maps(tmp_path: Path, yaw: float) -> None:
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     ends = np.array([[0.5, 0.5], [2.9, 2.5]]) @ turn.T + (-1.0, 2.0)  # from the lower left corner, right and up
     path = plan_path(file, [*ends[0], 0], [*ends[1], 0], clearance=0.2)
-    assert path.found, path.reason
+    assert path.is_found, path.reason
     own = (along(path.points)[:, :2] - (-1.0, 2.0)) @ turn
     column, from_bottom = np.floor(own / 0.1).astype(int).T
     found = read_ros_map(file)
@@ -179,7 +179,7 @@ def test_ros_maps(tmp_path: Path, yaw: float) -> None:
     assert gaps.min() >= 0.2 - 0.1**2 / (4 * 0.2)  # between cells' centres distances are interpolated
     mirrored = np.array([[0.5, 2.5], [2.9, 0.5]]) @ turn.T + (-1.0, 2.0)
     assert "unknown space" in str(plan_path(file, [*mirrored[0], 0], [*mirrored[1], 0]).reason)
-    assert plan_path(file, [*mirrored[0], 0], [*mirrored[1], 0], unknown=True).found
+    assert plan_path(file, [*mirrored[0], 0], [*mirrored[1], 0], unknown=True).is_found
 
 
 def test_the_command(volumes: Path, tmp_path: Path) -> None:
@@ -230,6 +230,6 @@ def test_a_robot_under_a_table(tmp_path: Path) -> None:
     save_tsdf(tmp_path / "tsdf.npz", room_tsdf(table, 0.05, None, Y_DOWN))
     ends = in_map(np.array([0.6, 1.0, 0.0])), in_map(np.array([3.4, 1.0, 0.0]))
     under = plan_path(tmp_path / "tsdf.npz", *ends, robot=Robot(0.5, 0.2))
-    assert under.found and under.length == pytest.approx(2.8, abs=0.02)
+    assert under.is_found and under.length == pytest.approx(2.8, abs=0.02)
     high = plan_path(tmp_path, *ends, robot=Robot(1.2, 0.2))
-    assert not high.found and "no way" in str(high.reason)
+    assert not high.is_found and "no way" in str(high.reason)

@@ -38,7 +38,7 @@ def path_picture(planner: Planner, path: PlannedPath, start: np.ndarray, goal: n
     that flies the plane is that of its middle height, and below is the section along it, unrolled.
     """
     T_floor_map = planner.map.T_floor_map
-    shown = np.array([start, goal]) if not path.found else path.points
+    shown = np.array([start, goal]) if not path.is_found else path.points
     on_floor, ends = (transform_points(p, T_floor_map) for p in (shown, np.array([start, goal])))
     everything = np.concatenate([on_floor, ends])
     height = float(np.median(on_floor[:, 2])) if planner.map.dimensions == 3 else 0.0
@@ -49,11 +49,11 @@ def path_picture(planner: Planner, path: PlannedPath, start: np.ndarray, goal: n
     places = np.stack(np.broadcast_arrays(across[None], up[::-1, None], height), -1)
     top = _picture(planner, transform_points(places.reshape(-1, 3), inverse(T_floor_map)).reshape(places.shape), step)
     picture, scale = top
-    line = on_floor[:, :2] if path.found else on_floor[:0, :2]
+    line = on_floor[:, :2] if path.is_found else on_floor[:0, :2]
     _draw(picture, (line - low) / step * scale, (ends[:, :2] - low) / step * scale, len(up) * scale)
-    if planner.map.dimensions == 2 or not path.found:
+    if planner.map.dimensions == 2 or not path.is_found:
         return picture
-    return _stack(picture, _section(planner, on_floor, step))
+    return _join(picture, _section(planner, on_floor, step))
 
 
 def _picture(planner: Planner, places: np.ndarray, step: float) -> tuple[np.ndarray, float]:
@@ -104,7 +104,15 @@ def _draw(picture: np.ndarray, line: np.ndarray, ends: np.ndarray, height: float
         cv2.circle(picture, centre, 16 * 4 * width, colour, -1, cv2.LINE_AA, 4)
 
 
-def _stack(upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
-    width = max(upper.shape[1], lower.shape[1])
-    rows = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in (upper, lower)]
-    return np.concatenate([rows[0], np.full((PathPictureTuning.gap, width, 3), 255, np.uint8), rows[1]])
+def _join(top: np.ndarray, section: np.ndarray) -> np.ndarray:
+    """Both pictures on white: beside one another if the first is upright, else one below the other."""
+    beside = top.shape[0] > top.shape[1]
+    side = 0 if beside else 1
+    size = max(top.shape[side], section.shape[side])
+    gap = np.full((size, PathPictureTuning.gap, 3), 255, np.uint8)
+    parts = []
+    for picture in (top, section):
+        missing = [(0, 0), (0, 0), (0, 0)]
+        missing[side] = (0, size - picture.shape[side])
+        parts.append(np.pad(picture, missing, constant_values=255))
+    return np.concatenate([parts[0], gap if beside else gap.transpose(1, 0, 2), parts[1]], axis=1 - side)

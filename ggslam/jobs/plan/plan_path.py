@@ -77,7 +77,7 @@ def plan_path(
         in_map = ends if frame == "map" else transform_points(ends, inverse(plan_map.T_floor_map))
         found = planner.plan(in_map[0], in_map[1])
         if frame == "floor":
-            found = found.moved(plan_map.T_floor_map)
+            found = found.in_frame(plan_map.T_floor_map)
         if out is not None:
             _write(Path(out), planner, found, in_map, ends, frame, robot if not fly else None)
     return found
@@ -88,7 +88,7 @@ def _write(
     robot: Robot | None,
 ) -> None:  # fmt: skip
     make_folder(out)
-    shown = found if frame == "map" else found.moved(inverse(planner.map.T_floor_map))
+    shown = found if frame == "map" else found.in_frame(inverse(planner.map.T_floor_map))
     write_picture(out / PICTURE, path_picture(planner, shown, in_map[0], in_map[1]))
     write_json(out / RECORD, _record(planner, found, ends, frame, robot))
 
@@ -96,9 +96,9 @@ def _write(
 def _record(planner: Planner, found: PlannedPath, ends: np.ndarray, frame: str, robot: Robot | None) -> dict[str, Any]:
     drives = None if robot is None else {"height": robot.height, "radius": robot.radius, "step": robot.step}
     return {
-        "map": planner.map.name, "frame": frame, "found": found.found, "reason": found.reason,
+        "map": planner.map.name, "frame": frame, "found": found.is_found, "reason": found.reason,
         "narrowest": found.narrowest, "robot": drives, "start": ends[0], "goal": ends[1],
-        "clearance_asked_m": found.asked, "least_clearance_m": found.least_clearance if found.found else None,
+        "clearance_asked_m": found.asked, "least_clearance_m": found.least_clearance if found.is_found else None,
         "length_m": found.length, "cell_m": planner.map.cell, "points": found.points,
         "clearances_m": found.clearance, "yaws_rad": found.yaw, "T_floor_map": planner.map.T_floor_map,
         "milliseconds": found.milliseconds, "cells_searched": found.cells, "pages_read": found.pages,

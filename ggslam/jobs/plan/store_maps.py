@@ -157,7 +157,7 @@ class StoreSpace:
             return
         for key in distances:
             arrays = self.cells.arrays(key, ESDF)
-            at, distance = _checked(arrays, key, self.cells.store.path)
+            at, distance = _distances(arrays, key, self.cells.store.path)
             inside = ((at >= first) & (at < behind)).all(1)
             yield from block_boxes(at[inside], distance[inside], self.step)
 
@@ -287,7 +287,7 @@ def _voxel_of(arrays: Arrays, path: Path) -> float:
     return voxel
 
 
-def _checked(arrays: Arrays, key: CellKey, path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _distances(arrays: Arrays, key: CellKey, path: Path) -> tuple[np.ndarray, np.ndarray]:
     at, distance = arrays.get("coordinates"), arrays.get("distance")
     if at is None or distance is None or at.ndim != 2 or at.shape[1] != 3 or distance.shape != (len(at), SIDE**3):
         raise FormatError(f"{path}: cell {key}: its distances are damaged")
