@@ -155,9 +155,8 @@ def block_boxes(coordinates: np.ndarray, distance: np.ndarray, step: int) -> Ite
         step: voxels, a divisor of 8.
     """
     values = distance.reshape(-1, SIDE, SIDE, SIDE)[:, step // 2 :: step, step // 2 :: step, step // 2 :: step]
-    known = ~np.isnan(values).all(axis=(1, 2, 3))
-    cells = (coordinates[known] * (SIDE // step)).tolist()
-    yield from (((x, y, z), block) for (x, y, z), block in zip(cells, values[known], strict=True))
+    cells = (coordinates * (SIDE // step)).tolist()
+    yield from (((x, y, z), block) for (x, y, z), block in zip(cells, values, strict=True))
 
 
 def field_frame(origin: np.ndarray, voxel: float, step: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ggslam.driving.plan_maps import PlanMap
+from ggslam.driving.plan_maps import FieldCells, PlanMap
 from ggslam.driving.plan_settings import PlanSettings
 from ggslam.driving.way_grid import Cell, WayCosts, WayGrid, cell_distances
 from ggslam.errors import InputError
@@ -136,6 +136,20 @@ class Planner:
     def update(self, low: Cell, clearance: np.ndarray) -> None:
         """Sets cells of the grid anew; see `WayGrid.write`. The next path heeds them."""
         self.grid.write(low, clearance)
+
+    def update_blocks(self, coordinates: np.ndarray) -> None:
+        """Takes over blocks of the distance field that the map is made of and that was updated.
+
+        Args:
+            coordinates: int32 [n, 3], of the blocks that changed; those that are gone may be among them.
+
+        Raises:
+            InputError: the map is made of something else.
+        """
+        if not isinstance(self.map.pages, FieldCells):
+            raise InputError(f"{self.map.name}: expected a map of a distance field in space")
+        for low, clearance in self.map.pages.of_blocks(np.asarray(coordinates)):
+            self.grid.write(low, self._now(low, clearance))
 
     def add_obstacles(self, points: np.ndarray) -> None:
         """Puts obstacles into the map: clearances around fall to the distance from the cells that they are in.

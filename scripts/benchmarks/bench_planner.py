@@ -172,7 +172,7 @@ def _fill(size: tuple[float, float, float], voxel: float, things: int) -> Occupa
             way = rng.normal(size=(6000, 3)) * (1, 1, 0.3)
             way /= np.linalg.norm(way, axis=1, keepdims=True)
             far = np.zeros(len(way))
-            for _ in range(40):  # as far as nothing can be
+            for _ in range(80):  # as far as nothing can be
                 far += np.maximum(room.distance(eye + far[:, None] * way), 0)
             occupancy.insert(eye + far[:, None] * way, eye, 30.0)
     return occupancy

@@ -5,9 +5,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plan_scenes import Column, Room, along, exact_clearance, random_room, room_planner, trials
+from plan_scenes import (
+    Column,
+    Room,
+    along,
+    exact_clearance,
+    random_room,
+    room_field,
+    room_planner,
+    room_tsdf,
+    trials,
+)
 
-from ggslam.driving.plan_maps import PlanMap, WholeArray
+from ggslam.driving.plan_maps import FieldCells, PlanMap, WholeArray
 from ggslam.driving.plan_settings import PlanSettings
 from ggslam.driving.planner import PlannedPath, Planner, headings
 from ggslam.driving.way_grid import cell_distances
@@ -152,6 +162,29 @@ def test_a_new_obstacle_is_gone_around() -> None:
     assert gaps >= 0.2 - 1e-6
     planner.update((0, 0, 0), cell_distances(room_with_door(16), 0.1, 30, NativeContext(1)))
     assert planner.plan(start, goal).length == pytest.approx(before.length, abs=1e-6)
+
+
+def test_blocks_of_a_field_that_changed() -> None:
+    """A column comes into a room, and goes again: the planner takes the field's blocks over."""
+    empty = Room((4.0, 2.0, 1.0), ())
+    full = Room(empty.size, (Column((2.0, 0.9), (0.15, 0.15), 0.0, 0.0, 1.0, True),))
+    field, T = room_field(empty, 0.05), np.eye(4)
+    planner = Planner(PlanMap("room", 3, 0.05, T, FieldCells(field, 1), T), 0.2)
+    start, goal = np.array([0.5, 0.9, 0.5]), np.array([3.5, 0.95, 0.5])
+    lengths = []
+    for room in (empty, full, empty):
+        changed = room_tsdf(room, 0.05)
+        coordinates = changed.blocks().coordinates
+        voxels = changed.read(coordinates)
+        field.tsdf.write(coordinates, value=voxels.value, weight=voxels.weight)
+        field.update()
+        planner.update_blocks(field.coordinates())
+        path = planner.plan(start, goal)
+        assert path.is_found
+        assert exact_clearance(room, along(path.points), 3).min() >= 0.2 - 0.025
+        lengths.append(path.length)
+    assert lengths[0] == pytest.approx(3.0, abs=0.01) and lengths[1] > 3.03
+    assert lengths[2] == pytest.approx(lengths[0], abs=1e-3)
 
 
 def test_what_was_learned_of_a_goal_changes_no_cost() -> None:

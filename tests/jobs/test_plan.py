@@ -135,10 +135,10 @@ def test_octomaps(tmp_path: Path, ending: str) -> None:
     rng = np.random.default_rng(0)
     for x in (0.6, 2.0, 3.9, 4.6, 6.0, 8.0):
         eye = np.array([x, 1.5 if x != 4.6 else 0.7, 1.1])
-        way = rng.normal(size=(20_000, 3))
+        way = rng.normal(size=(8_000, 3))
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         far = np.zeros(len(way))
-        for _ in range(60):
+        for _ in range(80):
             far += np.maximum(ROOM.distance(eye + far[:, None] * way), 0)
         occupancy.insert(eye + far[:, None] * way, eye)
     write_octomap(occupancy, file)
