@@ -45,12 +45,12 @@ RobotSize = Annotated[
 Fly = Annotated[bool, typer.Option("--fly", help="Plan in space; otherwise on the floor.")]
 Clearance = Annotated[
     float | None,
-    typer.Option(min=0, max=1000, help="Least distance from the robot's middle to obstacles, metres; default: its "
+    typer.Option(min=0, max=50, help="Least distance from the robot's middle to obstacles, metres; default: its "
                  "radius, with --fly that of the ball around it."),
 ]  # fmt: skip
 Unknown = Annotated[bool, typer.Option("--unknown", help="The path may enter what nobody has seen.")]
 Margin = Annotated[
-    float, typer.Option(min=0, max=100, help="Clearance that a path keeps beyond the least where it can, metres.")
+    float, typer.Option(min=0, max=20, help="Clearance that a path keeps beyond the least where it can, metres.")
 ]
 Weight = Annotated[
     float, typer.Option(min=0, max=1000, help="Share that a path may be longer than the shortest one for it.")

@@ -28,6 +28,8 @@ class PlannerTuning(Tuning):
     """Distance between points of a path, in cells."""
     near_m = 2.0
     """How far around a start or goal that does not fit a place that does is looked for, in metres."""
+    near_cells = {2: 200, 3: 50}
+    """The same in cells, at most, by the number of dimensions."""
     pages_ahead = 2
     """Pages towards the goal that are prepared while the search goes on."""
     touching = 1e-3
@@ -278,7 +280,8 @@ class Planner:
 
     def _nearest_fit(self, place: np.ndarray) -> str:
         """Where near a place the robot fits, in words."""
-        n, reach = self.map.dimensions, int(PlannerTuning.near_m / self.map.cell)
+        n = self.map.dimensions
+        reach = min(int(PlannerTuning.near_m / self.map.cell), PlannerTuning.near_cells[n])
         first = self.grid.cells_of(place[None])[0]
         first[:n] -= reach
         self._read_around(place, PlannerTuning.near_m)

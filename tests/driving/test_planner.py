@@ -82,6 +82,14 @@ def test_a_straight_way_is_straight() -> None:
     assert path.yaw == pytest.approx(np.full(len(path.points), np.arctan2(2.09, 3.44)), abs=1e-3)
 
 
+@pytest.mark.parametrize("shift", [0.0, 1e-9, 0.03])
+def test_hardly_any_way(shift: float) -> None:
+    planner = flat_planner(np.zeros((50, 50), bool))
+    path = planner.plan(np.array([2.0, 2.03, 0.0]), np.array([2.0 + shift, 2.03, 0.0]))
+    assert path.is_found and path.length == pytest.approx(shift, abs=1e-6)
+    assert path.yaw is not None and np.isfinite(path.yaw).all() and np.isfinite(path.points).all()
+
+
 def test_wider_paths_cost_what_they_may() -> None:
     """Past one corner: with a margin the path keeps away from it, and is hardly longer."""
     room = Room((6.0, 6.0, 1.0), (Column((2.0, 2.0), (1.5, 1.5), 0.0, 0.0, 1.0, False),))
