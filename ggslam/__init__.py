@@ -47,6 +47,7 @@ if _TYPE_CHECKING:
     from ggslam.jobs.export.export_run import export_run as export_run
     from ggslam.jobs.localize.localize_recording import localize_recording as localize_recording
     from ggslam.jobs.merge.merge import merge_runs as merge_runs
+    from ggslam.jobs.plan.plan_path import plan_path as plan_path
     from ggslam.jobs.refine.refine_run import refine_run as refine_run
     from ggslam.jobs.render.film import render_film as render_film
     from ggslam.jobs.render.plan import render_plan as render_plan
@@ -123,6 +124,7 @@ _HOMES = {
     "ggslam.jobs.export.export_run": ("export_run",),
     "ggslam.jobs.changes.changes": ("find_changes",),
     "ggslam.jobs.compare.comparison": ("compare_maps",),
+    "ggslam.jobs.plan.plan_path": ("plan_path",),
     "ggslam.jobs.localize.localize_recording": ("localize_recording",),
     "ggslam.jobs.merge.merge": ("merge_runs",),
     "ggslam.jobs.refine.refine_run": ("refine_run",),

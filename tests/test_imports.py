@@ -26,7 +26,7 @@ FLOORS = (
 JOBS = (
     {"watch"},
     {"view"},
-    {"export"},
+    {"export", "plan"},
     {"volumes"},
     {"run"},
     {"report"},

@@ -22,7 +22,7 @@ NAMES = """
     RenderBuffers RenderError RunFolder RunFolderError RunOutcome SegmentationCounts Sequence SequenceError Slam
     SlamResult StepReport Trajectory TsdfMap collate_frames color_loss compare_maps decode_cloud depth_loss edit_run
     encode_cloud evaluate_run export_run find_changes fuse_volumes identity_loss load_config localize_recording
-    merge_runs neighbour_loss objects_at open_sequence read_gaussian_ply read_point_cloud read_splats
+    merge_runs neighbour_loss objects_at open_sequence plan_path read_gaussian_ply read_point_cloud read_splats
     read_trajectory refine_run render render_film render_plan render_run run_recording sample_points save_run
     score_cloud score_image score_trajectory surface_points update_run write_gaussian_ply write_point_cloud
     write_synthetic_sequence write_tum
@@ -32,7 +32,7 @@ PUBLIC = NAMES.split()
 
 def test_the_list() -> None:
     assert sorted(ggslam.__all__) == sorted([*PUBLIC, "__version__"])
-    assert dir(ggslam) == sorted(ggslam.__all__) and len(PUBLIC) < 71
+    assert dir(ggslam) == sorted(ggslam.__all__) and len(PUBLIC) < 72
 
 
 @pytest.mark.parametrize("name", PUBLIC)

@@ -27,6 +27,7 @@ from ggslam.cli import (
     inspect_command,
     localize_command,
     merge_command,
+    plan_command,
     refine_command,
     render_command,
     report_command,
@@ -125,6 +126,7 @@ _COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "encode": (encode_command.encode, encode_command.EPILOG), "decode": (decode_command.decode, decode_command.EPILOG),
     "localize": (localize_command.localize, localize_command.EPILOG),
     "merge": (merge_command.merge, merge_command.EPILOG),
+    "plan": (plan_command.plan, plan_command.EPILOG),
     "refine": (refine_command.refine, refine_command.EPILOG),
     "submaps": (submaps_command.submaps, submaps_command.EPILOG),
     "update": (update_command.update, update_command.EPILOG),
@@ -139,9 +141,9 @@ for _name, (_function, _epilog) in _COMMANDS.items():
 
 
 def main() -> None:
-    """Entry point. Exit codes: 0 done, 3 done but bad (`run --strict`), 2 the user's input is at fault, 1 ggslam or the
-    machine is, or most frames of a run were lost, 130 Ctrl-C, 128 + the number of another signal that ended it (143
-    SIGTERM, 129 SIGHUP)."""
+    """Entry point. Exit codes: 0 done, 3 done but bad (`run --strict`; `plan`: no path), 2 the user's input is at
+    fault, 1 ggslam or the machine is, or most frames of a run were lost, 130 Ctrl-C, 128 + the number of another signal
+    that ended it (143 SIGTERM, 129 SIGHUP)."""
     errors = PlainConsole(stderr=True)
     try:
         with warnings.catch_warnings():

@@ -30,8 +30,8 @@ Every command has `--help`, which says the same as this page. An option means th
 to write, `--set NAME=VALUE` overrides a [setting](settings.md), `--config` names a [preset](presets.md) or a YAML file.
 
 Exit codes: 0 done, 2 something in the input is wrong (one line says what and where), 1 ggslam or the machine is at
-fault, or a run lost most of its frames, 3 a run that `--strict` finds bad, 130 interrupted. Where output is no
-terminal, long commands print a line of progress every 10 seconds.
+fault, or a run lost most of its frames, 3 a run that `--strict` finds bad or a plan without a path, 130 interrupted.
+Where output is no terminal, long commands print a line of progress every 10 seconds.
 """
 TABLE = "| argument or option | meaning | default |\n|---|---|---|"
 _SHARED = 3
@@ -39,7 +39,7 @@ _SHARED = 3
 _GROUPS = {
     "Make a map": ("run", "inspect", "synth", "doctor"),
     "Look and score": ("view", "render", "report", "eval", "compare"),
-    "Use a map": ("edit", "export", "volumes", "encode", "decode", "localize", "submaps", "refine"),
+    "Use a map": ("edit", "export", "volumes", "plan", "encode", "decode", "localize", "submaps", "refine"),
 }
 
 

@@ -9,7 +9,7 @@ set -eu
 cd "$(dirname "$0")/../.."
 kind=${1:-}; shift || true
 case $kind in address|undefined|thread) ;; *) sed -n 's/^# //p' "$0" | sed -n 2,8p; exit 2 ;; esac
-tests=(tests/native tests/abi tests/volumes tests/coding tests/rendering tests/tracking tests/mapping tests/submaps)
+tests=(tests/native tests/abi tests/volumes tests/driving tests/coding tests/rendering tests/tracking tests/mapping tests/submaps)
 if [ "${1:-}" = --all ]; then shift; tests=(tests); elif [ $# -gt 0 ]; then tests=(); fi
 
 # --- build ------------------------------------------------------------------------------------------------------------

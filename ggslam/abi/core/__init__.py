@@ -8,7 +8,7 @@ from typing import Any
 
 from ggslam.abi.headers import Declarations
 
-HEADERS = ("codec", "common", "mapping", "objects", "rendering", "sight", "tracking", "volumes")
+HEADERS = ("codec", "common", "mapping", "objects", "planning", "rendering", "sight", "tracking", "volumes")
 DECLARED = Declarations(Path(__file__).parent, HEADERS)
 globals().update(DECLARED.names)
 

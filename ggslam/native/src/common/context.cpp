@@ -5,6 +5,7 @@
 #include "abi/core/common.hpp"
 #include "abi/core/mapping.hpp"
 #include "abi/core/objects.hpp"
+#include "abi/core/planning.hpp"
 #include "abi/core/rendering.hpp"
 #include "abi/core/sight.hpp"
 #include "abi/core/tracking.hpp"
