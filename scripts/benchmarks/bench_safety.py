@@ -1,0 +1,109 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""How fast a robot may drive on a live map: what `ggslam.volumes.safety` predicts against what a simulation finds.
+
+    python scripts/benchmarks/bench_safety.py
+    python scripts/benchmarks/bench_safety.py --quick
+    python scripts/benchmarks/bench_safety.py --voxels 0.05 --latencies 50 --load 20
+
+A robot drives along rooms and corridors of a generated world. Boxes, discs, poles and panels appear in its way, at the
+protective distance or farther. Depth is rendered exactly, fused by `TsdfMap` with `DistanceField`, and the robot brakes
+when the map has something within the protective distance. Simulated: motion, camera, and the latencies of sensor and
+planner, which fill up what the map leaves of the latencies asked for. Measured: which frame gets an obstacle into the
+map, where the map has it, and how long a frame takes in it (processor time of one thread, drawn for each frame from
+those measured on this machine at the beginning).
+
+Prints a table and writes safety.json and safety.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+sys.path.insert(0, str(Path(__file__).parents[2]))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+import numpy as np
+from safety_cells import Cell, Experiment, measure_map, run_cell
+from safety_figure import draw_cells
+
+from ggslam.cli.console import console, table
+
+QUICK_TRIALS, QUICK_VOXELS, QUICK_LATENCIES = 60, [0.1, 0.05], [16.0, 100.0, 500.0]
+FINE = 0.015
+"""Voxels, in metres, below which the speed without waiting is not tried: it would take half as long again."""
+
+
+def main() -> None:
+    """Runs the experiment."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--voxels", nargs="+", type=float, default=[0.1, 0.05, 0.02, 0.01], help="metres")
+    parser.add_argument("--latencies", nargs="+", type=float, default=[16.0, 50.0, 100.0, 500.0], help="ms")
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--distance", type=float, default=2.0, help="protective distance, metres")
+    parser.add_argument("--load", type=float, default=0.0, help="kilograms that roll along unbraked")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--quick", action="store_true", help="fewer trials, coarse voxels")
+    parser.add_argument("--out", type=Path, default=Path("safety"), help="folder")
+    arguments = parser.parse_args()
+    experiment = Experiment(trials=arguments.trials, distance=arguments.distance, seed=arguments.seed)
+    experiment = replace(experiment, robot=replace(experiment.robot, load=arguments.load))
+    voxels, latencies = arguments.voxels, arguments.latencies
+    if arguments.quick:
+        experiment, voxels, latencies = replace(experiment, trials=QUICK_TRIALS), QUICK_VOXELS, QUICK_LATENCIES
+    start = time.perf_counter()
+    cells, measured = run_all(experiment, voxels, latencies, arguments.workers)
+    print_cells(cells)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    written = {"cells": [asdict(cell) for cell in cells], "experiment": asdict(experiment),
+               "map_ms": {f"{voxel:g}": _summary(seconds) for voxel, seconds in measured.items()}}  # fmt: skip
+    (arguments.out / "safety.json").write_text(json.dumps(written, indent=1))
+    draw_cells(cells, experiment.distance, arguments.out / "safety.png")
+    console.print(f"wrote safety.json and safety.png to {arguments.out} after {time.perf_counter() - start:.0f} s")
+
+
+def run_all(
+    experiment: Experiment, voxels: list[float], latencies: list[float], workers: int
+) -> tuple[list[Cell], dict[float, np.ndarray]]:
+    """All cells, those that take longest first, and the measured times of the maps."""
+    measured = {voxel: measure_map(experiment, voxel) for voxel in voxels}
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        running = [
+            pool.submit(run_cell, experiment, voxel, ms / 1e3, measured[voxel], voxel >= FINE)
+            for voxel in sorted(voxels)
+            for ms in latencies
+        ]
+        cells = [future.result() for future in running]
+    return sorted(cells, key=lambda cell: (-cell.voxel, cell.asked)), measured
+
+
+def print_cells(cells: list[Cell]) -> None:
+    """The table."""
+    rows = [
+        [f"{100 * c.voxel:g} cm", f"{1e3 * c.asked:g}", f"{1e3 * c.map_latency:.1f}", f"{1e3 * c.latency:.0f}",
+         f"{1e3 * c.total:.0f}", f"{c.found:.2f}", f"{c.predicted:.2f}", f"{100 * (c.predicted / c.found - 1):+.1f} %",
+         f"{c.collisions}", f"{c.plain:.2f}", "-" if c.plain_collisions < 0 else f"{c.plain_collisions}"]
+        for c in cells
+    ]  # fmt: skip
+    heads = ["voxel", "asked, ms", "map", "latency", "with waiting", "found, m/s", "predicted", "off", "collisions",
+             "without waiting", "collisions"]  # fmt: skip
+    console.print(table(f"largest speed without a collision in {cells[0].trials}", heads, rows))
+
+
+def _summary(seconds: np.ndarray) -> dict[str, float]:
+    ms = 1e3 * seconds
+    return {"mean": float(ms.mean()), "p95": float(np.percentile(ms, 95)), "max": float(ms.max()), "frames": len(ms)}
+
+
+if __name__ == "__main__":
+    main()

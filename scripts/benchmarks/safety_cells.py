@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cells of the experiment's table: what is predicted, and what is found, at one voxel size and one latency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+from safety_map import LiveMap, LiveMapTuning
+from safety_robot import Robot
+from safety_trials import Chain, Encounters, Trial, TrialTuning, draw_trials
+from safety_world import Lane, LaneCaster, find_lanes
+from worlds.plan import make_world
+
+from ggslam.scene.camera import Camera
+from ggslam.volumes.safety import Braking, Latencies
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is the same for all cells.
+
+    Attributes:
+        trials: encounters with one speed.
+        lanes: places where they happen.
+        distance: protective distance, metres: nothing appears nearer, and the robot brakes for what is nearer.
+        frame_period, control_period: of camera and controller, seconds.
+        robot: its body.
+        camera: a window of its image.
+        seed: of everything random.
+    """
+
+    trials: int = 200
+    lanes: int = 8
+    distance: float = 2.0
+    frame_period: float = 1 / 30
+    control_period: float = 0.01
+    robot: Robot = field(default_factory=Robot)
+    camera: Camera = field(default_factory=lambda: Camera(160, 120, 200.0, 200.0, 79.5, 59.5))
+    seed: int = 0
+
+    @property
+    def max_depth(self) -> float:
+        """How far the map reaches: all that appears is within."""
+        return self.distance + TrialTuning.beyond + self.robot.radius + 0.1
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One result; speeds in m/s, times in seconds.
+
+    Attributes:
+        voxel: metres.
+        asked, latency: of sensor, map, plan and network together: as asked for, and as it was (a map that takes longer
+            than that takes what it takes).
+        map_latency: the longest measured time of a frame in the map.
+        total: latency and waiting, at worst.
+        predicted: largest speed by `Braking`.
+        plain: the same without waiting.
+        found: largest speed without a collision.
+        collisions, plain_collisions: in all trials at the two predicted speeds; -1: not tried.
+        trials: their number.
+    """
+
+    voxel: float
+    asked: float
+    latency: float
+    map_latency: float
+    total: float
+    predicted: float
+    plain: float
+    found: float
+    collisions: int
+    plain_collisions: int
+    trials: int
+
+
+@lru_cache(maxsize=2)
+def place_trials(experiment: Experiment) -> tuple[list[Lane], list[Trial]]:
+    """Where and what the encounters are."""
+    shortest = LiveMapTuning.approach + experiment.distance + TrialTuning.beyond + 0.3
+    lanes = find_lanes(
+        make_world(30.0, experiment.seed), experiment.lanes, experiment.robot.radius, experiment.robot.heights,
+        (shortest, shortest + 4), experiment.seed,
+    )  # fmt: skip
+    return lanes, draw_trials(lanes, experiment.robot, experiment.distance, experiment.trials, experiment.seed)
+
+
+@lru_cache(maxsize=1)
+def encounters(experiment: Experiment, voxel: float) -> Encounters:
+    """Runs trials at a voxel size; those of the last size are kept."""
+    lanes, _ = place_trials(experiment)
+    return Encounters(lanes, experiment.robot, experiment.camera, voxel, experiment.max_depth)
+
+
+def measure_map(experiment: Experiment, voxel: float, frames: int = 20, speed: float = 2.0) -> np.ndarray:
+    """Processor time in seconds [n] of frames in the map, one thread: fusion, field, and looking up the way, along
+    each lane with an obstacle that appears halfway."""
+    lanes, trials = place_trials(experiment)
+    seconds = []
+    for number, lane in enumerate(lanes):
+        live = LiveMap(lane, experiment.robot, experiment.camera, voxel, experiment.max_depth)
+        mine = next(t.obstacle for t in trials if t.obstacle is not None and t.lane in (number, trials[0].lane))
+        empty, filled = (LaneCaster(lane, experiment.camera, experiment.robot.camera_height, o) for o in (None, mine))
+        for k in range(frames):
+            x, caster = LiveMapTuning.approach + speed * experiment.frame_period * k, (empty, filled)[2 * k >= frames]
+            live.add(caster.depth(x), caster.pose(x))
+        seconds += live.seconds[2:]  # the first touch new memory
+    return np.array(seconds)
+
+
+def latencies_of(experiment: Experiment, asked: float, map_seconds: np.ndarray) -> Latencies:
+    """Sensor and planner share what the map leaves of a latency, one to two."""
+    slowest = float(map_seconds.max())
+    rest = max(0.0, asked - slowest)
+    return Latencies(
+        sensor=rest / 3, map=slowest, plan=2 * rest / 3, frame_period=experiment.frame_period, frames=2,
+        control_period=experiment.control_period,
+    )  # fmt: skip
+
+
+def run_cell(experiment: Experiment, voxel: float, asked: float, map_seconds: np.ndarray, plain: bool = True) -> Cell:
+    """Predicts the largest speed, tries it, and searches it.
+
+    Args:
+        experiment: what is common.
+        voxel: metres.
+        asked: latency in seconds.
+        map_seconds: as `measure_map` found them.
+        plain: whether the speed that leaves waiting out is tried, too.
+    """
+    latencies = latencies_of(experiment, asked, map_seconds)
+    robot = experiment.robot
+    braking = Braking(latencies, robot.friction, robot.braked_share)
+    without = replace(braking, latencies=replace(latencies, frame_period=0.0, frames=1, control_period=0.0))
+    predicted, ignorant = (b.largest_speed(experiment.distance) for b in (braking, without))
+    chain, runner = Chain(latencies, map_seconds, experiment.distance), encounters(experiment, voxel)
+    _, trials = place_trials(experiment)
+    collisions = count_collisions(runner, trials, predicted, chain)
+    low = predicted if collisions == 0 else predicted / 2
+    found = largest_safe_speed(runner, trials, chain, (low, 1.5 * predicted), 0.004 * predicted)
+    more = count_collisions(runner, trials, ignorant, chain) if plain else -1
+    return Cell(
+        voxel, asked, without.latencies.total, latencies.map, latencies.total, predicted, ignorant, found, collisions,
+        more, len(trials),
+    )  # fmt: skip
+
+
+def count_collisions(runner: Encounters, trials: list[Trial], speed: float, chain: Chain) -> int:
+    """How many trials end in a collision at a speed."""
+    return sum(int(runner.run(trial, speed, chain).collided) for trial in trials)
+
+
+def largest_safe_speed(
+    runner: Encounters, trials: list[Trial], chain: Chain, bounds: tuple[float, float], precision: float
+) -> float:
+    """The largest speed at which no trial ends in a collision, to a precision.
+
+    Each trial is run at the largest speed that those before it survived, and where it does not survive, that speed is
+    lowered until it does: a few trials are searched, the others run once.
+
+    Args:
+        runner: of the trials.
+        trials: in random order.
+        chain: from sensor to brake.
+        bounds: speeds at which no trial and at which some trial ends in a collision.
+        precision: in m/s.
+    """
+    low, speed = bounds
+    for trial in trials:
+        if not runner.run(trial, speed, chain).collided:
+            continue
+        safe, unsafe = low, speed
+        while unsafe - safe > precision:
+            middle = (safe + unsafe) / 2
+            safe, unsafe = (safe, middle) if runner.run(trial, middle, chain).collided else (middle, unsafe)
+        speed = safe
+    return speed

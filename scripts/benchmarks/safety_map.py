@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The live map of a robot that drives along a lane: TSDF, distance field, and where on the way it shows something."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from safety_robot import Robot
+from safety_world import Lane, LaneCaster
+
+from ggslam.native.loader import NativeContext
+from ggslam.scene.camera import Camera
+from ggslam.system.tuning import Tuning
+from ggslam.volumes.esdf import DistanceField, FieldSettings
+from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.tsdf import TsdfMap
+
+
+class LiveMapTuning(Tuning):
+    """How the map is made."""
+
+    band_low = 0.15
+    """Metres above the floor below which nothing counts: the floor may be a voxel of 10 cm off."""
+    approach = 1.5
+    """Metres that the robot drives, and maps, before an encounter begins."""
+    between = 0.15
+    """Metres between the views of that approach."""
+    field_reach = 0.3
+    """Metres, or three voxels, up to which distances are computed."""
+
+
+@dataclass(frozen=True)
+class Saved:
+    """Voxels of a TSDF, to be put back."""
+
+    dense: np.ndarray
+    voxels: dict[str, np.ndarray]
+    free: np.ndarray
+    free_weight: np.ndarray
+
+
+class LiveMap:
+    """The map of one lane, begun with the approach.
+
+    Attributes:
+        seconds: processor time of each frame fused: TSDF, field and looking up the way.
+    """
+
+    def __init__(self, lane: Lane, robot: Robot, camera: Camera, voxel: float, max_depth: float) -> None:
+        self.lane, self.robot, self.camera, self.voxel = lane, robot, camera, voxel
+        context = NativeContext(1)
+        self.tsdf = TsdfMap(TsdfSettings(voxel=voxel, max_depth=max_depth), context)
+        self.field = DistanceField(self.tsdf, FieldSettings(max_distance=max(LiveMapTuning.field_reach, 3 * voxel)))
+        self.seconds: list[float] = []
+        caster = LaneCaster(lane, camera, robot.camera_height)
+        for x in np.arange(0.0, LiveMapTuning.approach + 1e-9, LiveMapTuning.between):
+            self.add(caster.depth(x), caster.pose(x))
+        self._saved, self.seconds = self._save(), []
+
+    def add(self, depth: np.ndarray, T_lane_camera: np.ndarray) -> float:
+        """Fuses a frame and tells what `contact` does afterwards."""
+        start = time.thread_time()
+        self.tsdf.integrate(depth, self.camera, T_lane_camera)
+        self.field.update()
+        found = self.contact()
+        self.seconds.append(time.thread_time() - start)
+        return found
+
+    def contact(self) -> float:
+        """The x of the robot's centre at which, by the map, it comes within a voxel of something; infinite if it does
+        not."""
+        points, _ = self.field.surface()
+        reach = self.robot.radius + self.voxel
+        x, y, z = points.T
+        low, high = LiveMapTuning.band_low, self.robot.heights[1]
+        near = (z > low) & (z < high) & (np.abs(y) < reach) & (x > 0)
+        return float((x[near] - np.sqrt(reach**2 - y[near] ** 2)).min(initial=np.inf))
+
+    def restore(self) -> None:
+        """Makes the map again what it was after the approach."""
+        self.tsdf.clear()
+        self.tsdf.write(self._saved.dense, **self._saved.voxels)
+        self.tsdf.write_free(self._saved.free, self._saved.free_weight)
+        self.field.update()
+
+    def _save(self) -> Saved:
+        blocks = self.tsdf.blocks()
+        dense = blocks.coordinates[blocks.dense]
+        held = self.tsdf.read(dense)
+        voxels = {name: getattr(held, name) for name in ("value", "weight", "hits", "octants")}
+        return Saved(dense, voxels, blocks.coordinates[~blocks.dense], blocks.free_weight[~blocks.dense])
