@@ -22,6 +22,8 @@ from ggslam.system.settings import setting, settings_class
 
 GRAVITY: Final = 9.81
 """Gravity of the earth, in metres per second squared."""
+FRAMES_UNTIL_OCCUPIED: Final = 2
+"""Frames that have to measure points in a voxel until a `TsdfMap` that has seen it free holds it occupied."""
 
 
 @settings_class(frozen=True)
@@ -39,8 +41,8 @@ class Latencies:
     frame_period: float = setting(0.0, 0, 60, "s")
     """From one frame of the sensor to the next: what appears just after a frame waits for the next."""
     frames: int = setting(1, 1, 1000)
-    """Frames that have to show an obstacle until the map has it: `FRAMES_UNTIL_OCCUPIED` in a TSDF that has seen the
-    place free, 1 where the place was not known."""
+    """Frames that have to show an obstacle until the map has it: `FRAMES_UNTIL_OCCUPIED` where the TSDF has seen the
+    place free, 1 where it was not known."""
     control_period: float = setting(0.0, 0, 60, "s")
     """From one command of the controller to the next."""
 

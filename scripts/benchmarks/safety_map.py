@@ -44,17 +44,30 @@ class Saved:
 class LiveMap:
     """The map of one lane, begun with the approach.
 
+    Args:
+        lane: where the robot drives.
+        robot: its body.
+        camera: of the depth images.
+        voxel: edge, metres.
+        max_depth: range of the map, metres.
+        clearance: voxels that the robot keeps away from things.
+        noise: whether depth is that of a structured-light camera.
+
     Attributes:
         seconds: processor time of each frame fused: TSDF, field and looking up the way.
     """
 
-    def __init__(self, lane: Lane, robot: Robot, camera: Camera, voxel: float, max_depth: float) -> None:
+    def __init__(
+        self, lane: Lane, robot: Robot, camera: Camera, voxel: float, max_depth: float, clearance: float = 1.0,
+        noise: bool = False,
+    ) -> None:  # fmt: skip
         self.lane, self.robot, self.camera, self.voxel = lane, robot, camera, voxel
+        self.clearance = clearance * voxel
         context = NativeContext(1)
         self.tsdf = TsdfMap(TsdfSettings(voxel=voxel, max_depth=max_depth), context)
         self.field = DistanceField(self.tsdf, FieldSettings(max_distance=max(LiveMapTuning.field_reach, 3 * voxel)))
         self.seconds: list[float] = []
-        caster = LaneCaster(lane, camera, robot.camera_height)
+        caster = LaneCaster(lane, camera, robot.camera_height, noise=0 if noise else None)
         for x in np.arange(0.0, LiveMapTuning.approach + 1e-9, LiveMapTuning.between):
             self.add(caster.depth(x), caster.pose(x))
         self._saved, self.seconds = self._save(), []
@@ -69,10 +82,10 @@ class LiveMap:
         return found
 
     def contact(self) -> float:
-        """The x of the robot's centre at which, by the map, it comes within a voxel of something; infinite if it does
-        not."""
+        """The x of the robot's centre at which, by the map, it comes within its clearance of something; infinite if it
+        does not."""
         points, _ = self.field.surface()
-        reach = self.robot.radius + self.voxel
+        reach = self.robot.radius + self.clearance
         x, y, z = points.T
         low, high = LiveMapTuning.band_low, self.robot.heights[1]
         near = (z > low) & (z < high) & (np.abs(y) < reach) & (x > 0)

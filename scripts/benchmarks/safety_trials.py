@@ -9,7 +9,7 @@ when the newest plan has something within the protective distance ahead. Braking
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,6 @@ from safety_map import LiveMap, LiveMapTuning
 from safety_robot import Robot
 from safety_world import Lane, LaneCaster, Solid
 
-from ggslam.scene.camera import Camera
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.safety import Latencies
 
@@ -69,18 +68,15 @@ class Outcome:
 
     Attributes:
         collided: whether the robot touched the obstacle.
-        clearance: metres left along the way, negative if it went too far.
-        blind: seconds until the brake worked; infinite if it never did.
+        left: metres left along the way, negative if it went too far.
+        blind: seconds until the brake worked; infinite if it did not before the robot ran into the obstacle.
         frames: taken by the map since the obstacle appeared.
-        misplaced: metres that the map had the obstacle too far away (the voxel of clearance taken off) when the robot
-            braked.
     """
 
     collided: bool
-    clearance: float
+    left: float
     blind: float
     frames: int
-    misplaced: float
 
 
 def draw_trials(lanes: list[Lane], robot: Robot, distance: float, count: int, seed: int) -> list[Trial]:
@@ -138,18 +134,23 @@ class Chain:
 
 
 class Encounters:
-    """Runs trials on the maps of their lanes, which are made when they are needed and kept."""
+    """Runs trials on the maps of their lanes, which `make_map` makes when they are needed, and which are kept.
 
-    def __init__(self, lanes: list[Lane], robot: Robot, camera: Camera, voxel: float, max_depth: float) -> None:
-        self.lanes, self.robot, self.camera = lanes, robot, camera
-        self.voxel, self.max_depth, self.runs = voxel, max_depth, 0
+    Args:
+        lanes: where trials are.
+        robot: its body.
+        make_map: the live map of a lane after the approach.
+        noise: whether depth is that of a structured-light camera.
+    """
+
+    def __init__(self, lanes: list[Lane], robot: Robot, make_map: Callable[[Lane], LiveMap], noise: bool) -> None:
+        self.lanes, self.robot, self.make_map, self.noise = lanes, robot, make_map, noise
         self._maps: dict[int, LiveMap] = {}
 
     def map_of(self, lane: int) -> LiveMap:
         """The live map of a lane."""
         if lane not in self._maps:
-            made = LiveMap(self.lanes[lane], self.robot, self.camera, self.voxel, self.max_depth)
-            self._maps[lane] = made
+            self._maps[lane] = self.make_map(self.lanes[lane])
         return self._maps[lane]
 
     def seconds(self) -> np.ndarray:
@@ -158,9 +159,8 @@ class Encounters:
 
     def run(self, trial: Trial, speed: float, chain: Chain) -> Outcome:
         """One encounter at a speed in m/s."""
-        self.runs += 1
-        live = self.map_of(trial.lane)
-        caster = LaneCaster(self.lanes[trial.lane], self.camera, self.robot.camera_height, trial.obstacle)
+        live, noise = self.map_of(trial.lane), trial.number if self.noise else None
+        caster = LaneCaster(live.lane, live.camera, self.robot.camera_height, trial.obstacle, noise)
         try:
             return _drive(trial, speed, chain, live, caster, self.robot)
         finally:
@@ -186,9 +186,9 @@ def _drive(trial: Trial, speed: float, chain: Chain, live: LiveMap, caster: Lane
         near = (found - chain.distance - trial.start) / speed
         braked = _next_turn(max(available, near), trial.control_phase, lat.control_period)
     if braked >= last:
-        return Outcome(True, -np.inf, np.inf, frames, np.nan)
-    clearance = trial.contact - robot.brake(at(braked), speed)
-    return Outcome(clearance < 0, clearance, braked, frames, found + live.voxel - trial.contact)
+        return Outcome(True, -np.inf, np.inf, frames)
+    left = trial.contact - robot.brake(at(braked), speed)
+    return Outcome(left < 0, left, braked, frames)
 
 
 def mapped_frames(trial: Trial, chain: Chain) -> Iterator[tuple[float, float]]:

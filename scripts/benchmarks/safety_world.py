@@ -18,6 +18,7 @@ from ggslam.scene.camera import Camera
 from ggslam.synthetic.materials import Material
 from ggslam.synthetic.raycast import RayCaster
 from ggslam.synthetic.scene import Kind, Scene, Shape
+from ggslam.synthetic.sensor import noisy_depth
 from ggslam.system.tuning import Tuning
 
 MATERIAL = Material(np.full((8, 8, 3), 0.5, np.float32))
@@ -185,10 +186,21 @@ def _around(world: World, at: np.ndarray, yaw: float) -> tuple[Solid, ...]:
 
 
 class LaneCaster:
-    """Exact depth images along a lane, with one obstacle or none."""
+    """Depth images along a lane, with one obstacle or none.
 
-    def __init__(self, lane: Lane, camera: Camera, height: float, obstacle: Solid | None = None) -> None:
+    Args:
+        lane: where.
+        camera: of the images.
+        height: of the camera above the floor.
+        obstacle: besides what stands along the lane.
+        noise: seed of the noise of a structured-light camera; None: depth is exact.
+    """
+
+    def __init__(
+        self, lane: Lane, camera: Camera, height: float, obstacle: Solid | None = None, noise: int | None = None
+    ) -> None:
         self.camera, self.height = camera, height
+        self._rng = None if noise is None else np.random.default_rng([noise, 56])
         self._caster = RayCaster(lane.scene(), further=[] if obstacle is None else [obstacle.shape()])
 
     def pose(self, x: float) -> np.ndarray:
@@ -198,8 +210,10 @@ class LaneCaster:
         return T
 
     def depth(self, x: float) -> np.ndarray:
-        """Depth [H, W] in metres; +inf where there is nothing."""
+        """Depth [H, W] in metres; +inf where there is nothing, 0 where a noisy camera measures nothing."""
         depth, _ = self._caster.measure(self.camera, self.pose(x))
+        if self._rng is not None:
+            return noisy_depth(depth, self.camera, self._rng)
         return np.where(depth > 0, depth, np.float32(np.inf))
 
 
