@@ -47,7 +47,7 @@ class Latencies:
     """From one command of the controller to the next."""
 
     @property
-    def waiting(self) -> float:
+    def wait(self) -> float:
         """Seconds, at worst, from the moment an obstacle can be seen until the frame is taken with which the map has
         it, and until the controller's turn.
 
@@ -60,7 +60,7 @@ class Latencies:
     @property
     def total(self) -> float:
         """Seconds in all."""
-        return self.waiting + self.sensor + self.map + self.plan + self.network
+        return self.wait + self.sensor + self.map + self.plan + self.network
 
 
 @settings_class(frozen=True)

@@ -70,6 +70,7 @@ class Cell:
         collisions, plain_collisions: in all trials at the two predicted speeds; -1: not tried.
         trials: their number.
         map_in_trials: time of a frame in the map during the trials: what 95 % of them stay below.
+        friction, braked_share: of the robot.
     """
 
     voxel: float
@@ -84,6 +85,8 @@ class Cell:
     plain_collisions: int
     trials: int
     map_in_trials: float
+    friction: float
+    braked_share: float
 
 
 @dataclass(frozen=True)
@@ -171,7 +174,7 @@ def run_cell(experiment: Experiment, voxel: float, asked: float, map_seconds: np
     more = count_collisions(runner, trials, ignorant, chain) if plain else -1
     return Cell(
         voxel, asked, without.latencies.total, latencies.map, latencies.total, predicted, ignorant, found, collisions,
-        more, len(trials), float(np.percentile(runner.seconds(), 95)),
+        more, len(trials), float(np.percentile(runner.seconds(), 95)), robot.friction, robot.braked_share,
     )  # fmt: skip
 
 
