@@ -36,23 +36,25 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 import numpy as np
-from safety_cells import Cell, Experiment, MapTimes, measure_map, run_cell
+from safety_cells import FINE, Cell, Experiment, MapTimes, measure_map, run_cell
 from safety_figure import draw_cells
 from safety_terms import Term, try_terms
 
 from ggslam.cli.console import console, table
 
-QUICK_TRIALS, QUICK_VOXELS, QUICK_LATENCIES = 60, [0.1, 0.05], [16.0, 100.0, 500.0]
-FINE = 0.015
-"""Voxels, in metres, below which the speed without waiting is not tried: it would take half as long again."""
+FULL = 200, [0.1, 0.05, 0.02, 0.01], [16.0, 50.0, 100.0, 500.0]
+"""Trials, voxels in metres, latencies in ms."""
+QUICK = 60, [0.1, 0.05], [16.0, 100.0, 500.0]
+COARSE = 0.05
+"""Voxels, in metres, from which terms are left out one by one: with others it takes long and says the same."""
 
 
 def main() -> None:
     """Runs the experiment."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--voxels", nargs="+", type=float, default=[0.1, 0.05, 0.02, 0.01], help="metres")
-    parser.add_argument("--latencies", nargs="+", type=float, default=[16.0, 50.0, 100.0, 500.0], help="ms")
-    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--voxels", nargs="+", type=float, help="metres")
+    parser.add_argument("--latencies", nargs="+", type=float, help="ms")
+    parser.add_argument("--trials", type=int)
     parser.add_argument("--distance", type=float, default=2.0, help="protective distance, metres")
     parser.add_argument("--load", type=float, default=0.0, help="kilograms that roll along unbraked")
     parser.add_argument("--noise", action="store_true", help="depth as a structured-light camera measures it")
@@ -61,18 +63,20 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="fewer trials, coarse voxels")
     parser.add_argument("--out", type=Path, default=Path("safety"), help="folder")
     arguments = parser.parse_args()
-    experiment = Experiment(
-        trials=arguments.trials, distance=arguments.distance, noise=arguments.noise, seed=arguments.seed
+    usual = QUICK if arguments.quick else FULL
+    trials, voxels, latencies = (
+        given or default
+        for given, default in zip((arguments.trials, arguments.voxels, arguments.latencies), usual, strict=True)
     )
+    experiment = Experiment(trials=trials, distance=arguments.distance, noise=arguments.noise, seed=arguments.seed)
     experiment = replace(experiment, robot=replace(experiment.robot, load=arguments.load))
-    voxels, latencies = arguments.voxels, arguments.latencies
-    if arguments.quick:
-        experiment, voxels, latencies = replace(experiment, trials=QUICK_TRIALS), QUICK_VOXELS, QUICK_LATENCIES
     start = time.perf_counter()
     cells, measured = run_all(experiment, voxels, latencies, arguments.workers)
     print_cells(cells, measured)
-    terms = [] if arguments.quick else try_terms(experiment, max(voxels), measured[max(voxels)].seconds)
-    print_terms(terms, experiment)
+    terms = []
+    if max(voxels) >= COARSE and not arguments.quick:
+        terms = try_terms(experiment, max(voxels), measured[max(voxels)].seconds)
+        print_terms(terms, experiment)
     arguments.out.mkdir(parents=True, exist_ok=True)
     written = {"cells": [asdict(cell) for cell in cells], "terms": [asdict(term) for term in terms],
                "experiment": asdict(experiment),
@@ -85,7 +89,8 @@ def main() -> None:
 def run_all(
     experiment: Experiment, voxels: list[float], latencies: list[float], workers: int
 ) -> tuple[list[Cell], dict[float, MapTimes]]:
-    """All cells, those that take longest first, and the measured times of the maps."""
+    """All cells, those that take longest first, and the measured times of the maps. The speed without waiting is not
+    tried with fine voxels: it would take half as long again."""
     measured = {voxel: measure_map(experiment, voxel) for voxel in voxels}
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         running = [
@@ -120,8 +125,8 @@ def print_cells(cells: list[Cell], measured: dict[float, MapTimes]) -> None:
 def print_terms(terms: list[Term], experiment: Experiment) -> None:
     """What each term of the prediction is worth."""
     rows = [[t.name, f"{t.speed:.2f}", f"{t.collisions}"] for t in terms]
-    if rows:
-        console.print(table(f"speed, and collisions in {experiment.trials}", ["predicted", "m/s", "collisions"], rows))
+    title = f"speed, and collisions in {experiment.trials}"
+    console.print(table(title, ["predicted with", "m/s", "collisions"], rows))
 
 
 def _summary(times: MapTimes) -> dict[str, float]:

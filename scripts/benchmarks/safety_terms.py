@@ -35,7 +35,6 @@ def try_terms(experiment: Experiment, voxel: float, map_seconds: np.ndarray) -> 
         return replace(whole, latencies=replace(lat, **changes))  # type: ignore[arg-type]
 
     loaded = replace(experiment, robot=replace(experiment.robot, load=LOAD))
-    tight = replace(experiment, clearance=0.0)
     tries = [
         ("all terms, a voxel of clearance", experiment, whole),
         ("no wait for a frame, for the map or the controller", experiment,
@@ -45,9 +44,7 @@ def try_terms(experiment: Experiment, voxel: float, map_seconds: np.ndarray) -> 
         ("latency half as long", experiment, late(sensor=lat.sensor / 2, plan=lat.plan / 2, map=lat.map / 2)),
         (f"{LOAD:g} kg that roll along, known", loaded, replace(whole, braked_share=loaded.robot.braked_share)),
         (f"{LOAD:g} kg that roll along, not known", loaded, whole),
-        ("no clearance", tight, whole),
-        ("no clearance, but a margin of a voxel", tight, replace(whole, margin=voxel)),
-        ("half a voxel of clearance", replace(experiment, clearance=0.5), whole),
+        ("no voxel of clearance", replace(experiment, clearance=0.0), whole),
     ]  # fmt: skip
     chain = Chain(lat, map_seconds, experiment.distance)
     found = []
