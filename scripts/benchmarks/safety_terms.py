@@ -44,6 +44,7 @@ def try_terms(experiment: Experiment, voxel: float, map_seconds: np.ndarray) -> 
         ("latency half as long", experiment, late(sensor=lat.sensor / 2, plan=lat.plan / 2, map=lat.map / 2)),
         (f"{LOAD:g} kg that roll along, known", loaded, replace(whole, braked_share=loaded.robot.braked_share)),
         (f"{LOAD:g} kg that roll along, not known", loaded, whole),
+        ("all terms, noise of a structured-light camera", replace(experiment, noise=True), whole),
         ("no voxel of clearance", replace(experiment, clearance=0.0), whole),
     ]  # fmt: skip
     chain = Chain(lat, map_seconds, experiment.distance)
