@@ -14,7 +14,7 @@ FLOORS = (
     {"cli"},
     {"jobs"},
     {"runs"},
-    {"slam", "localization", "merging", "changes"},
+    {"slam", "localization", "merging", "changes", "driving"},
     {"tracking", "mapping", "loops", "movers", "objects", "volumes", "submaps", "coding", "evaluation", "viewer",
      "reporting"},
     {"rendering", "sequences", "formats", "features", "synthetic", "geometry", "sight"},

@@ -24,6 +24,15 @@ Columns = Annotated[
     int | None,
     typer.Option(help="Numbers that a .bin scan stores for each point; default: guessed from the file.", min=3),
 ]
+Body = Annotated[
+    list[str] | None,
+    typer.Option(metavar="BOX|URDF", help="The robot's own body in view, left out of depth and scans: a box "
+                 "xmin,ymin,zmin,xmax,ymax,zmax in the sensor's frame (metres; of a camera x right, y down, z forward) "
+                 "or a URDF file. May be repeated."),
+]  # fmt: skip
+BodyFrame = Annotated[
+    str | None, typer.Option(metavar="LINK", help="With a URDF file in --body: the sensor's link in it.")
+]
 LivePath = Annotated[
     Path | None,
     typer.Argument(

@@ -105,6 +105,7 @@ def submaps(
     camera: options.OwnCamera = None,
     intrinsics: options.Intrinsics = None,
     columns: options.Columns = None,
+    body: options.Body = None, body_frame: options.BodyFrame = None,
     overrides: options.Settings = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what is in the store as JSON.")] = False,
 ) -> None:  # fmt: skip
@@ -121,7 +122,7 @@ def submaps(
             source, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
             camera=camera, intrinsics=intrinsics,
         )  # fmt: skip
-        _make(SubmapsRequest(source, out, visit, poses, at, settings, reading, columns))
+        _make(SubmapsRequest(source, out, visit, poses, at, settings, reading, columns, tuple(body or ()), body_frame))
     listing = list_store(source if out is None else out, since)
     if as_json:
         typer.echo(json.dumps(json_ready(listing.to_dict()), indent=1))

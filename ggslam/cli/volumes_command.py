@@ -28,6 +28,8 @@ EPILOG = """
 
   ggslam volumes data/livingroom --esdf --slice 0.5        (poses of the recording itself)
 
+  ggslam volumes runs/kitchen --esdf --robot 0.4,0.18 --robot tall:1.2,0.3      (a map and a costmap for each)
+
   ggslam volumes data/redkitchen --scale 0.5 --live --esdf      (tracked and fused frame by frame)
 
   ggslam volumes house.grid --esdf --workers 4      (a grid store, cell by cell)
@@ -80,6 +82,16 @@ Band = Annotated[
     str, typer.Option(metavar="LOW,HIGH", help="Heights, metres above the floor, between which the ROS map looks for "
                       "obstacles."),
 ]  # fmt: skip
+Robots = Annotated[
+    list[str] | None,
+    typer.Option("--robot", metavar="[NAME:]HEIGHT,RADIUS", help="Robot, metres: with --esdf it gets a map of what it "
+                 "meets (map_NAME.pgm) and a costmap (costmap_NAME.png), for map_server. A third number is the height "
+                 "of the lowest obstacle (default 0.05). May be repeated."),
+]  # fmt: skip
+Inflation = Annotated[
+    str, typer.Option("--inflation", metavar="RADIUS,FACTOR", help="With --robot: inflation_radius (m) and "
+                      "cost_scaling_factor of nav2's inflation layer."),
+]  # fmt: skip
 Frame = Annotated[
     OutputFrame,
     typer.Option(help="Frame of meshes and occupancy: map, that of the run; floor: z up, z = 0 on the floor, in which "
@@ -112,21 +124,21 @@ def volumes(
     occupancy: Occupancy = None,
     mesh: Mesh = None,
     min_weight: MinWeight = None,
-    object_meshes: ObjectMeshes = False,
-    objects: Objects = True,
-    live: Live = False,
-    realtime: Realtime = None,
+    object_meshes: ObjectMeshes = False, objects: Objects = True,
+    live: Live = False, realtime: Realtime = None,
     onto: Onto = None,
     slice_height: SliceHeight = None,
     band: Band = "0.1,1.5",
+    robot: Robots = None,
+    inflation: Inflation = "0.55,10",
+    body: options.Body = None, body_frame: options.BodyFrame = None,
     frame: Frame = OutputFrame.map,
     driving: Driving = False,
     speeds: Speeds = "0.5,1,2,4",
     friction: Friction = 0.5,
     sensor_ms: SensorMs = 33.0, plan_ms: PlanMs = 50.0, network_ms: NetworkMs = 0.0,
     frame_ms: FrameMs = 33.3, control_ms: ControlMs = 50.0,
-    config: options.ConfigName = None,
-    settings: options.Settings = None,
+    config: options.ConfigName = None, settings: options.Settings = None,
     start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
     scale: Scale = None,
     format_name: options.Format = None,
@@ -137,11 +149,9 @@ def volumes(
     depth_kind: options.DepthKind = None, depth_delay: options.DepthDelay = None, upright: options.Upright = False,
     sequence: options.MovedSequence = None,
     skip_bad_frames: options.SkipBadFrames = False,
-    device: Device = None,
-    overwrite: Overwrite = False,
+    device: Device = None, overwrite: Overwrite = False,
     engine: options.CellEngine = options.EngineName.local,
-    workers: options.CellWorkers = None,
-    address: options.CellAddress = None,
+    workers: options.CellWorkers = None, address: options.CellAddress = None,
 ) -> None:  # fmt: skip
     """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
     from ggslam.jobs.submaps.stores import is_store
@@ -158,8 +168,10 @@ def volumes(
     request = VolumesRequest(
         source=source, sequence=reading, scale=scale, recording=sequence, out=out, voxel=voxel, esdf=esdf,
         occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live, realtime=realtime,
-        onto=onto, slice_height=slice_height, band=_band(band), frame=frame.value, latency=driving, device=device,
-        config=config, overrides=_overrides(settings, min_weight), overwrite=overwrite,
+        onto=onto, slice_height=slice_height, band=_band(band), robots=tuple(robot or ()),
+        inflation=inflation, body=tuple(body or ()), body_frame=body_frame, frame=frame.value,
+        latency=driving, device=device, config=config,
+        overrides=_overrides(settings, min_weight), overwrite=overwrite,
     )  # fmt: skip
     if is_store(source):
         return _make_of_store(request, engine, workers, address)

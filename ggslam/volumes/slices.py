@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plane slices through the distance field: arrays, pictures, and maps for ROS's map_server.
+"""Plane slices through the distance field: arrays and pictures.
 
 A slice is a grid of square cells on an oriented plane. Arrays are [H, W] with row 0 at the top, where y is largest, as
 in pictures; column 0 is where x is smallest.
@@ -7,59 +7,17 @@ in pictures; column 0 is where x is smallest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Final
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ggslam.errors import InputError
-from ggslam.system.atomic import write_bytes, write_text
-from ggslam.system.tuning import Tuning
+from ggslam.volumes.cell_grid import CellGrid, SlicePlane
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
-from ggslam.volumes.measured_points import measured_octants
+from ggslam.volumes.seen_surface import SeenSurface, unseen_surface
 from ggslam.volumes.tsdf import SIDE
-
-OCCUPIED: Final = 0
-"""Grey of an occupied cell in a ROS map."""
-FREE: Final = 254
-"""Grey of a free cell there."""
-UNKNOWN: Final = 205
-"""Grey of an unknown cell there."""
-
-
-class SliceTuning(Tuning):
-    """Limits of a slice."""
-
-    max_cells = 50_000_000
-    """Most cells."""
-
-
-_BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-
-
-@dataclass(frozen=True)
-class SlicePlane:
-    """A rectangle in space.
-
-    Attributes:
-        origin: [3], metres, where the plane's coordinates are (0, 0).
-        x_axis, y_axis: [3], orthogonal unit vectors.
-        low, high: (x, y) of the rectangle's corners on the plane, metres.
-    """
-
-    origin: np.ndarray
-    x_axis: np.ndarray
-    y_axis: np.ndarray
-    low: tuple[float, float]
-    high: tuple[float, float]
-
-    @property
-    def normal(self) -> np.ndarray:
-        """Unit vector; seen from its side, y is to the left of x."""
-        return np.cross(self.x_axis, self.y_axis)
 
 
 @dataclass(frozen=True)
@@ -131,15 +89,10 @@ def slice_field(
     Raises:
         InputError: a resolution or band that is not positive, or more than 50 million cells.
     """
-    if not resolution > 0 or (band is not None and not band[0] <= band[1]):
-        raise InputError(f"expected a positive resolution and an ascending band, found {resolution} and {band}")
-    width, height = (max(1, int(np.ceil((plane.high[a] - plane.low[a]) / resolution - 1e-6))) for a in (0, 1))
-    if width * height > SliceTuning.max_cells:
-        raise InputError(f"resolution: {width} x {height} cells are more than {SliceTuning.max_cells}")
-    x = plane.low[0] + (np.arange(width) + 0.5) * resolution
-    y = plane.low[1] + (np.arange(height) + 0.5) * resolution
-    centres = (plane.origin + y[::-1, None, None] * plane.y_axis + x[None, :, None] * plane.x_axis).reshape(-1, 3)
-    low, high = band or (0.0, 0.0)
+    if band is not None and not band[0] <= band[1]:
+        raise InputError(f"expected an ascending band, found {band} (resolution {resolution})")
+    grid, (low, high) = CellGrid.over(plane, resolution), band or (0.0, 0.0)
+    centres = grid.places().reshape(-1, 3)
     offsets = np.linspace(low, high, int(np.ceil((high - low) / field.voxel - 1e-6)) + 1)
     least = np.full(len(centres), np.nan, np.float32)
     hit, cell = np.zeros(len(centres), bool), max(resolution, field.voxel)
@@ -147,50 +100,11 @@ def slice_field(
         found = field.query(centres + offset * plane.normal).distance
         least = np.fmin(least, found)
         hit |= (found <= cell / 2) & (found >= -cell)
-    distance, occupied = least.reshape(height, width), hit.reshape(height, width)
-    local = replace(plane, origin=plane.origin - field.origin)
-    octants, grid = measured_octants(field.tsdf), (local, resolution, (low, high), occupied.shape)
-    touched = _cells_with_points(octants, field.voxel / 4, *grid)
-    points = _cells_with_points(octants, 0.0, *grid)
-    points |= _cells_with_points(octants[_thin_octants(octants, field)], field.voxel / 4, *grid)
-    # Where what is behind one side of a thing meets space seen free from another, the field has a surface that nobody
-    # saw.
-    doubtful = occupied & (cv2.dilate(touched.astype(np.uint8), _BESIDE) == 0) & touched.any()
-    occupied, behind = (occupied & ~doubtful) | points, (distance < 0) | doubtful | touched
-    top_right = (plane.low[0] + width * resolution, plane.low[1] + height * resolution)
-    whole = SlicePlane(plane.origin, plane.x_axis, plane.y_axis, plane.low, top_right)
-    return FieldSlice(whole, resolution, distance, ~np.isnan(distance), occupied, behind)
-
-
-def _thin_octants(octants: np.ndarray, field: DistanceField) -> np.ndarray:
-    """Which octants [N, 3] (from the field's origin) lie in voxels that are surface for their points alone."""
-    points, normals = field.surface()
-    lone = points[~normals.any(1)].astype(float) - field.origin
-    voxels = [np.floor(p / field.voxel).astype(np.int64) for p in (lone, octants)]
-    thin, own = ((v[:, 0] << 42) + (v[:, 1] << 21) + v[:, 2] for v in voxels)
-    return np.isin(own, thin)
-
-
-def _cells_with_points(
-    octants: np.ndarray, half: float, plane: SlicePlane, resolution: float, band: tuple[float, float],
-    shape: tuple[int, int],
-) -> np.ndarray:  # fmt: skip
-    """Cells that cubes around points [N, 3], with edges of twice `half`, overlap at the heights of a band, bool
-    [H, W]."""
-    axes = np.stack([plane.x_axis, plane.y_axis, plane.normal])
-    reach = half * np.abs(axes).sum(1)
-    points = (octants - plane.origin) @ axes.T
-    points = points[(points[:, 2] >= band[0] - reach[2]) & (points[:, 2] <= band[1] + reach[2])]
-    first, last = (
-        np.floor((points[:, :2] + side * reach[:2] - plane.low) / resolution).astype(int) for side in (-1, 1)
-    )
-    marked = np.zeros(shape, bool)
-    steps = (last - first).max(axis=0, initial=0)
-    for step in np.ndindex(*(steps + 1)):
-        column, from_bottom = np.minimum(first + step, last).T
-        inside = (column >= 0) & (column < shape[1]) & (from_bottom >= 0) & (from_bottom < shape[0])
-        marked[shape[0] - 1 - from_bottom[inside], column[inside]] = True
-    return marked
+    distance, occupied, surface = least.reshape(grid.shape), hit.reshape(grid.shape), SeenSurface.of(field, plane)
+    near, points = surface.near_points(grid, low, high), surface.with_points(grid, low, high)
+    unseen = unseen_surface(occupied, near)
+    occupied, behind = (occupied & ~unseen) | points, (distance < 0) | unseen | near
+    return FieldSlice(grid.plane, resolution, distance, ~np.isnan(distance), occupied, behind)
 
 
 def slice_picture(cut: FieldSlice, full_scale: float, smallest_side: int = 480) -> np.ndarray:
@@ -206,13 +120,18 @@ def slice_picture(cut: FieldSlice, full_scale: float, smallest_side: int = 480) 
     inner = cv2.erode(cut.occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     picture[cut.occupied & ~inner] = 0
     picture[~cut.known] = 128
-    times = max(1, -(-smallest_side // min(cut.known.shape)))
-    times = max(1, min(times, 4000 // max(cut.known.shape)))
+    times = magnification(cut.known.shape, smallest_side)
     picture = picture.repeat(times, 0).repeat(times, 1)
-    return np.concatenate([picture, _scale(picture.shape[1], full_scale, cut.resolution)])
+    return np.concatenate([picture, _scale(picture.shape[1], full_scale)])
 
 
-def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
+def magnification(shape: tuple[int, ...], smallest_side: int) -> int:
+    """By how much cells [H, W] are magnified so that the shorter side has `smallest_side` pixels, if the longer one
+    has not more than 4000 then."""
+    return max(1, min(-(-smallest_side // min(shape)), 4000 // max(shape)))
+
+
+def _scale(width: int, full_scale: float) -> np.ndarray:
     """The colours of distances with marks in metres."""
     bar = np.full((46, width, 3), 255, np.uint8)
     ramp = cv2.applyColorMap(np.linspace(255, 0, width).astype(np.uint8)[None], cv2.COLORMAP_TURBO)[..., ::-1]
@@ -224,33 +143,3 @@ def _scale(width: int, full_scale: float, resolution: float) -> np.ndarray:
         x = int(np.clip(i * (width - 1) / (marks - 1) - size / 2, 2, max(2, width - size - 2)))
         cv2.putText(bar, text, (x, 38), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
     return bar
-
-
-def ros_map(cut: FieldSlice) -> np.ndarray:
-    """A slice as a ROS map: uint8 [H, W], 0 occupied, 254 free, 205 unknown."""
-    return np.where(cut.occupied, OCCUPIED, np.where(cut.free, FREE, UNKNOWN)).astype(np.uint8)
-
-
-def write_ros_map(cut: FieldSlice, path: str | Path) -> tuple[Path, Path]:
-    """Writes a map that ROS's map_server reads: `path` with the endings .pgm (binary) and .yaml.
-
-    The map's frame is that of the plane: x and y along its axes, in metres from its origin; the yaml's origin is the
-    lower left corner of the lower left pixel.
-
-    Returns:
-        The two files.
-
-    Raises:
-        RunFolderError: a file cannot be written.
-    """
-    path = Path(path)
-    image, description = path.with_name(path.name + ".pgm"), path.with_name(path.name + ".yaml")
-    pixels = ros_map(cut)
-    write_bytes(image, f"P5\n{pixels.shape[1]} {pixels.shape[0]}\n255\n".encode() + pixels.tobytes())
-    x, y = cut.plane.low
-    write_text(
-        description,
-        f"image: {image.name}\nmode: trinary\nresolution: {cut.resolution:.6g}\norigin: [{x:.6f}, {y:.6f}, 0.0]\n"
-        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
-    )
-    return image, description

@@ -82,7 +82,7 @@ def circles() -> list[str]:
 PURPOSES = {
     "SLAM": "sight slam tracking mapping loops movers objects rendering scene geometry features native cuda",
     "recordings, files and stores": "sequences formats coding runs submaps system abi errors __init__ __main__",
-    "work on finished runs": "jobs localization merging changes volumes evaluation viewer reporting",
+    "work on finished runs": "jobs localization merging changes driving volumes evaluation viewer reporting",
     "command line": "cli",
     "generated recordings": "synthetic",
 }
@@ -109,8 +109,9 @@ def lines_by_purpose() -> dict[str, int]:
     return dict(found)
 
 
-ONLY_FOR_USERS = {"ggslam.volumes.raycast"}
-"""Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it."""
+ONLY_FOR_USERS = {"ggslam.volumes.raycast", "ggslam.driving.dynamic_layer", "ggslam.driving.outlines"}
+"""Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it; what
+moves, for robots that drive while a map is made."""
 
 
 def is_package(name: str) -> bool:

@@ -14,6 +14,7 @@ from worlds.scanner import Scanner
 from worlds.world import World
 
 from ggslam.cli.main import app
+from ggslam.driving.body_options import read_body
 from ggslam.errors import GgslamError
 from ggslam.formats.trajectory import read_tum, write_tum
 from ggslam.jobs.submaps.sensor_settings import settings_of_cloud, settings_of_scans, with_chosen
@@ -21,6 +22,7 @@ from ggslam.jobs.submaps.stores import INDOORS
 from ggslam.localization.scans import ScanSequence
 from ggslam.scene.poses import se3_exp
 from ggslam.submaps.grid import GridStore
+from ggslam.submaps.recorder import load_points
 
 
 def done(*arguments: object) -> str:
@@ -161,3 +163,17 @@ def test_the_lidar_of_the_field_is_located(shared_data: Path, tmp_path: Path) ->
     command = ["localize", case / "map.ply", case, "--columns", 3, "--start-pose", turned, "--out", tmp_path / "far"]
     done(*command)
     assert errors(tmp_path / "far", case).max() < 0.006
+
+
+def test_the_robots_body_is_left_out_of_scans(ride: Path, tmp_path: Path) -> None:
+    """A box behind the scanner, where it sees the street."""
+    done("submaps", ride, "--out", tmp_path / "a.grid", "--voxel", 0, "--stop", 1)
+    done("submaps", ride, "--out", tmp_path / "b.grid", "--voxel", 0, "--stop", 1, "--body", "-3,-0.5,-1.6,-1,0.5,1")
+    counts = []
+    for name in ("a.grid", "b.grid"):
+        with GridStore.open(tmp_path / name) as store:
+            counts.append(sum(len(load_points(store, key)["points"]) for key in store.cells()))
+    scan = ScanSequence(ride, stop=1).scan(0).points
+    body = read_body(["-3,-0.5,-1.6,-1,0.5,1"])
+    assert body is not None and 0 < body.hides(scan).mean() < 0.3
+    assert counts[1] / counts[0] == pytest.approx(1 - body.hides(scan).mean(), abs=0.1) and counts[1] < counts[0]

@@ -224,3 +224,50 @@ def test_a_band_higher_than_the_room_is_cut(room: Path, tmp_path: Path) -> None:
     made(room, "--out", tmp_path / "a", "--stop", 3, *QUICK, "--esdf", "--band", "0.1,900000")
     low, high = record(tmp_path / "a")["esdf"]["band"]
     assert 0 < low < high < 10
+
+
+def test_robots_get_maps_of_their_own(room: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a"
+    robots = ["--robot", "0.3,0.1", "--robot", "tall:1.4,0.2,0.1"]
+    assert "tall:" in made(room, "--out", out, "--stop", 6, *QUICK, "--esdf", *robots)
+    names = {"map_robot.pgm", "map_robot.yaml", "costmap_robot.png", "costmap_robot.yaml", "robot_robot.png"}
+    names |= {name.replace("_robot", "_tall") for name in names}
+    found = record(out)
+    assert names <= set(found["files"]) and all((out / name).is_file() for name in names)
+    assert set(found["esdf"]["robots"]) == {"robot", "tall"} and found["esdf"]["robots"]["tall"]["step"] == 0.1
+    low, tall = (cv2.imread(str(out / f"map_{name}.pgm"), cv2.IMREAD_UNCHANGED) for name in ("robot", "tall"))
+    costs = cv2.imread(str(out / "costmap_tall.png"), cv2.IMREAD_UNCHANGED)
+    assert low.shape == tall.shape == costs.shape[:2] and not np.array_equal(low, tall)
+    assert np.array_equal(tall == 0, (costs[..., 0] == 0) & (costs[..., 3] == 255))
+    made(room, "--out", out, "--stop", 6, *QUICK, "--esdf")
+    assert not (out / "map_tall.pgm").exists()
+
+
+def test_wrong_robots_are_refused(room: Path, tmp_path: Path) -> None:
+    few = [room, "--out", tmp_path / "a", "--stop", 1, *QUICK]
+    one_error(ggslam("volumes", *few, "--robot", "1,0.2"), "robot", "esdf")
+    one_error(ggslam("volumes", *few, "--esdf", "--robot", "tall"), "HEIGHT,RADIUS")
+    one_error(ggslam("volumes", *few, "--esdf", "--robot", "a:1,0.2", "--robot", "A:1,0.3"), "twice")
+    one_error(ggslam("volumes", *few, "--esdf", "--robot", "1,0.2", "--inflation", "1"), "RADIUS,FACTOR")
+    assert not (tmp_path / "a" / "volumes.json").exists()
+
+
+def test_the_robots_own_body_is_left_out(room: Path, tmp_path: Path) -> None:
+    """A box before the lower half of the camera hides the floor and what stands on it."""
+    few = [room, "--stop", 4, *QUICK, "--occupancy", 0.1]
+    made(*few, "--out", tmp_path / "a")
+    made(*few, "--out", tmp_path / "b", "--body", "-2,0,0.3,2,1,0.5")
+    whole, cut = (read_mesh(tmp_path / name / "mesh.ply") for name in "ab")
+    assert whole is not None and cut is not None and 0.1 < len(cut.vertices) / len(whole.vertices) < 0.8
+    urdf = tmp_path / "cart.urdf"
+    urdf.write_text(
+        '<robot name="a"><link name="camera"><collision><origin xyz="0 0.5 0.4"/><geometry><box size="4 1 0.2"/>'
+        "</geometry></collision></link></robot>"
+    )
+    made(*few, "--out", tmp_path / "c", "--body", urdf, "--body-frame", "camera")
+    same = read_mesh(tmp_path / "c" / "mesh.ply")
+    assert same is not None and np.array_equal(same.vertices, cut.vertices)
+    bad = [*few, "--out", tmp_path / "d", "--body"]
+    one_error(ggslam("volumes", *bad, tmp_path / "no.urdf", "--body-frame", "a"), "no.urdf")
+    one_error(ggslam("volumes", *bad, "1,2"), "XMIN")
+    assert not (tmp_path / "d").exists()

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ggslam.driving.body import CameraBody
+from ggslam.driving.body_options import read_body
 from ggslam.errors import ConfigError
 from ggslam.jobs.volumes.live import LiveVolumes
 from ggslam.jobs.volumes.no_returns import NoReturns
@@ -83,6 +85,22 @@ def test_after_a_correction_the_volumes_are_where_the_keyframes_are(frames: list
     assert maps.occupancy is not None and straight.occupancy is not None
     assert maps.occupancy.summary().occupied == pytest.approx(straight.occupancy.summary().occupied, rel=0.02)
     assert len(maps.times.rebuilds) == 1
+
+
+def test_the_robots_body_is_left_out_live_and_after_a_correction(frames: list[Frame]) -> None:
+    """A box before the lower half of the camera."""
+    body = read_body(["-2,0.2,0.3,2,1,0.5"])
+    assert body is not None
+    cut, maps, slam = CameraBody(body), VolumeMaps(SETTINGS), Played()
+    live = LiveVolumes(maps, lambda frame, T: None, body=body)
+    for corrections in ([], [np.eye(4)]):
+        slam.corrections = corrections
+        for frame in frames[:2]:
+            slam.play(live, frame, frame.T_world_camera)
+    straight = VolumeMaps(SETTINGS)
+    for frame in frames[:2]:
+        straight.add(cut.without(frame), frame.T_world_camera, frame.load_mask())
+    assert len(maps.times.rebuilds) == 1 and values(maps).keys() == values(straight).keys()
 
 
 def test_lost_frames_are_left_out(frames: list[Frame]) -> None:

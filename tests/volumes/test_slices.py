@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
 from distance_scenes import block_range, box, plane, sphere, union, write_scene
 
 from ggslam.errors import RunFolderError
@@ -19,10 +18,8 @@ from ggslam.volumes.slices import (
     FieldSlice,
     SlicePlane,
     plane_at_height,
-    ros_map,
     slice_field,
     slice_picture,
-    write_ros_map,
 )
 from ggslam.volumes.tsdf import TsdfMap
 
@@ -85,30 +82,6 @@ def test_any_obstacle_in_the_band_counts(field: DistanceField) -> None:
     assert not high.known.any() and not high.occupied.any()
     partly = slice_field(field, plane_at_height(field, np.array([0, 0, 1]), 0.9), 0.05, (-0.3, 0.0))
     assert partly.known[at(partly, 0, 0)] and not partly.occupied[at(partly, 0, 0)]
-
-
-def test_ros_maps_read_back(field: DistanceField, tmp_path: Path) -> None:
-    cut = slice_field(field, plane_at_height(field, np.array([0, 0, 1]), 0.0), 0.04)
-    image, description = write_ros_map(cut, tmp_path / "map")
-    told = yaml.safe_load(description.read_text())
-    assert told == {
-        "image": "map.pgm", "mode": "trinary", "resolution": 0.04, "origin": [-1.6, -1.2, 0.0], "negate": 0,
-        "occupied_thresh": 0.65, "free_thresh": 0.196,
-    }  # fmt: skip
-    assert image.read_bytes().startswith(b"P5\n")
-    pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
-    assert np.array_equal(pixels, ros_map(cut))
-
-    def pixel(x: float, y: float) -> int:
-        """As map_server places them: the origin is the lower left corner of the lower left pixel."""
-        column = int((x - told["origin"][0]) / told["resolution"])
-        from_bottom = int((y - told["origin"][1]) / told["resolution"])
-        return int(pixels[pixels.shape[0] - 1 - from_bottom, column])
-
-    assert pixel(0.7 - 0.18, 0.5) == 0 and pixel(0.7, 0.5 + 0.18) == 0
-    assert pixel(0.7, -0.5) == 254 and pixel(-0.7, 0.5) == 254
-    assert pixel(0.7, 0.5) in (0, 205)  # inside the ball: behind its surface, or never seen
-    assert set(np.unique(pixels)) <= {0, 205, 254}
 
 
 def test_pictures_show_distances_and_what_is_unknown(field: DistanceField, tmp_path: Path) -> None:

@@ -79,6 +79,15 @@ struct SurfaceImages {
   uint16_t* labels;
 };
 
+// Places [layers, rows, columns]: start + layer * layer_step + row * row_step + column * column_step, in voxels from the
+// map's origin.
+struct ColumnGrid {
+  double start[3], layer_step[3], row_step[3], column_step[3];
+  int32_t layers, rows, columns;
+};
+constexpr int kSeenBit = 1;
+constexpr int kBehindBit = 2;
+
 }  // namespace ggslam::volumes
 
 namespace ggslam {
@@ -137,6 +146,14 @@ GGSLAM_EXPORT int ggslam_tsdf_list(void* handle, int32_t* at, uint8_t* dense, ui
 // there come out as never seen.
 GGSLAM_EXPORT int ggslam_tsdf_read(void* handle, int64_t n, const int32_t* at,
                                    const ggslam::volumes::VoxelArrays* out);
+
+// Eighths of occupied voxels that points were measured in: their middles [n, 3] in voxels from the map's origin. Returns n;
+// `middles` may be null.
+GGSLAM_EXPORT int64_t ggslam_tsdf_octants(void* handle, double* middles);
+
+// What the voxels are that places [layers, rows, columns] lie in: kSeenBit, kBehindBit (behind a surface).
+GGSLAM_EXPORT int ggslam_tsdf_columns(void* handle, void* context, const ggslam::volumes::ColumnGrid* grid,
+                                      uint8_t* seen);
 
 // Writes voxels of the blocks at coordinates [n, 3], made where there are none. What `in` lacks stays as it is.
 GGSLAM_EXPORT int ggslam_tsdf_write(void* handle, int64_t n, const int32_t* at,

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.driving.body import CameraBody
+from ggslam.driving.body_options import read_body
 from ggslam.errors import ConfigError, FormatError, SequenceError
 from ggslam.formats.trajectory import read_trajectory
 from ggslam.jobs.progress import Observer
@@ -65,6 +67,8 @@ class SubmapsRequest:
         settings: fields of `SubmapSettings` that are not the default's (of a new store) or the store's.
         sequence: how the recording is read.
         columns: numbers of a point in .bin scans; None: as they tell themselves.
+        body: of the robot, left out of a recording's scans or depth, see `driving.body_options.read_body`;
+            `body_frame`: the sensor's link in a URDF file.
     """
 
     source: Path
@@ -75,6 +79,8 @@ class SubmapsRequest:
     settings: Mapping[str, Any]
     sequence: SequenceRequest
     columns: int | None = None
+    body: tuple[str, ...] = ()
+    body_frame: str | None = None
 
 
 @dataclass(frozen=True)
@@ -144,6 +150,8 @@ def make_store(request: SubmapsRequest, observer: Observer, add_run: AddRun = st
     cloud = read_cloud(source, request.columns) if is_cloud(source) else None
     settings = _settings(request, cloud, observer)
     recording = None if cloud is not None or (source / MARKER).is_file() else _open(request, settings)
+    if recording is None and request.body:
+        raise ConfigError(f"`body` is left out of a recording's scans or depth; {source} is none")
     with open_or_create(request.store, settings) as store:
         if recording is not None:
             items, poses, sights = recording
@@ -230,15 +238,19 @@ def _open(
     request: SubmapsRequest, settings: SubmapSettings
 ) -> tuple[Iterator[Frame | LaserScan], np.ndarray, FrameSights | ScanSights]:
     """Items, their poses and what takes sights from them."""
-    wanted = request.sequence
+    wanted, body = request.sequence, read_body(request.body, request.body_frame)
     if scan_files(request.source):
         scans = _scans(request)
-        return scans.stream(), _poses(request, scans.timestamps, scans.ground_truth), ScanSights(settings.axes)
+        items = scans.stream()
+        if body is not None:
+            items = (replace(scan, points=body.without(scan.points)) for scan in items)
+        return items, _poses(request, scans.timestamps, scans.ground_truth), ScanSights(settings.axes)
     refuse_unread_scans(request.source)
     frames = one_camera(wanted.open(), "a store of cells")
     sights = FrameSights(frames.camera, NativeContext())
     poses = _poses(request, frames.timestamps, frames.ground_truth, frames.pose_problem)
-    return frames.stream(masks=False), poses, sights
+    stream = frames.stream(masks=False)
+    return stream if body is None else map(CameraBody(body).without, stream), poses, sights
 
 
 def _poses(

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ggslam.driving.body import Body, CameraBody
 from ggslam.errors import ConfigError, RunFolderError
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.segmented_map import SegmentedMap
@@ -20,6 +21,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, is_valid_pose
 from ggslam.sequences import Sequence
+from ggslam.sequences.rig import RigSequence
 from ggslam.system.plurals import quantity, word_for
 from ggslam.system.tuning import Tuning
 
@@ -59,6 +61,7 @@ class FrameSource:
         label: object ids of a frame, None if it tells of none; None without objects.
         names: of object ids.
         notes: what a user should know.
+        body: of the robot, which is left out of depth; None: nothing is.
     """
 
     name: str
@@ -67,6 +70,7 @@ class FrameSource:
     label: Callable[[Frame, np.ndarray], np.ndarray | None] | None = None
     names: dict[int, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    body: CameraBody | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -76,7 +80,15 @@ class FrameSource:
         for frame in self.sequence.stream(masks="lazy" if self.label is not None else False):
             T = self.poses.get(frame.index)
             if T is not None:
+                frame = frame if self.body is None else self.body.without(frame)
                 yield PosedFrame(frame, T, None if self.label is None else self.label(frame, T))
+
+
+def body_of(body: Body | None, sequence: Sequence) -> CameraBody | None:
+    """A body as the cameras of a recording have it."""
+    if body is None:
+        return None
+    return CameraBody(body, sequence.rig.T_first_camera if isinstance(sequence, RigSequence) else None)
 
 
 def frames_of_run(

@@ -10,14 +10,18 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.driving.body import Body
+from ggslam.driving.body_options import read_body
+from ggslam.driving.inflation import parse_inflation
 from ggslam.errors import ConfigError, RunFolderError, SequenceError
 from ggslam.formats.mesh_files import check_mesh_path
 from ggslam.geometry.scene_size import scene_scale
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.run.pipeline import RunRequest, execute
-from ggslam.jobs.volumes.frames import FrameSource, frames_of_recording, frames_of_run
+from ggslam.jobs.volumes.frames import FrameSource, body_of, frames_of_recording, frames_of_run
 from ggslam.jobs.volumes.live import LiveVolumes
 from ggslam.jobs.volumes.outputs import RECORD, OutputRequest, Outputs, Surface, prepare_folder, write_outputs
+from ggslam.jobs.volumes.robot_maps import parse_robots
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
@@ -53,6 +57,10 @@ class VolumesRequest:
         onto: file of a TSDF to go on in.
         slice_height: metres above the floor of the slice through the distance field; None: as high as the camera was.
         band: lowest and highest obstacle of the ROS map, metres above the floor.
+        robots: that get maps of their own, see `driving.robot.parse_robot`.
+        inflation: how costs fall off in their costmaps, see `driving.inflation.parse_inflation`.
+        body: of the robot in view, see `driving.body_options.read_body`.
+        body_frame: the camera's link in a URDF file.
         frame: of meshes and occupancy: "map", or "floor" (z up, 0 on the floor); see `volumes.floor_frame`.
         latency: whether it is to be known how long all maps take with a frame.
         device: of torch, for the TSDF, e.g. cuda; None: the compiled core.
@@ -76,6 +84,10 @@ class VolumesRequest:
     onto: Path | None = None
     slice_height: float | None = None
     band: tuple[float, float] = (0.1, 1.5)
+    robots: tuple[str, ...] = ()
+    inflation: str = "0.55,10"
+    body: tuple[str, ...] = ()
+    body_frame: str | None = None
     frame: str = "map"
     latency: bool = False
     device: str | None = None
@@ -151,19 +163,19 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     observer = observer or SilentObserver()
     is_run = (request.source / MARKER).is_file()
     _check(request, is_run)
-    config = _config(request)
+    body, config = read_body(request.body, request.body_frame), _config(request)
     for note in [] if request.live else settings_notes(config, request.config, request.overrides):
         observer.note(note)  # a live run tells of them itself
     onto = None if request.onto is None else load_tsdf(request.onto)
     maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
     source: FrameSource | None = None
     if request.live:
-        fused = _live(request, maps, observer)
+        fused = _live(request, maps, body, observer)
         out = Path(fused.name) / "volumes"
         make_folder(out)
         prepare_folder(out)
     else:
-        source = _source(request, is_run)
+        source = _source(request, is_run, body)
         out = _folder(request, is_run)
         for note in [*source.sequence.warnings, *source.notes]:
             observer.note(note)
@@ -181,7 +193,8 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
         if frame is OutputFrame.floor and source is not None:
             _level_occupancy(maps, source, len(fused.poses), surface.T_floor_map, observer)
         wanted = OutputRequest(
-            request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame
+            request.mesh, request.object_meshes, request.slice_height, request.band, fused.names, frame,
+            parse_robots(request.robots), parse_inflation(request.inflation),
         )
         outputs = write_outputs(maps, surface, out, wanted, _record(request, config, fused), observer)
     return _outcome(out, fused, outputs)
@@ -227,6 +240,9 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
             raise ConfigError("`slice_height` needs `esdf`")
         if not abs(request.slice_height) < 1e4:
             raise ConfigError(f"`slice_height`: expected a height in metres, found {request.slice_height:g}")
+    parse_inflation(request.inflation)
+    if parse_robots(request.robots) and not request.esdf:
+        raise ConfigError("`robot` needs `esdf`")
     if request.recording is not None and not is_run:
         raise ConfigError(f"`recording` says where the recording of a run is; {request.source} is no run")
     if is_run and request.sequence != SequenceRequest(request.source, scale=request.sequence.scale):
@@ -261,10 +277,12 @@ def _folder(request: VolumesRequest, is_run: bool) -> Path:
     return out
 
 
-def _source(request: VolumesRequest, is_run: bool) -> FrameSource:
+def _source(request: VolumesRequest, is_run: bool, body: Body | None) -> FrameSource:
     if is_run:
-        return frames_of_run(RunFolder.open(request.source), request.recording, request.scale, request.objects)
-    return frames_of_recording(request.sequence, request.objects)
+        source = frames_of_run(RunFolder.open(request.source), request.recording, request.scale, request.objects)
+    else:
+        source = frames_of_recording(request.sequence, request.objects)
+    return replace(source, body=body_of(body, source.sequence))
 
 
 def _fuse(source: FrameSource, maps: VolumeMaps, observer: Observer, fit_voxel: bool) -> _Fused:
@@ -299,10 +317,10 @@ def _level_occupancy(
     maps.occupancy = level
 
 
-def _live(request: VolumesRequest, maps: VolumeMaps, observer: Observer) -> _Fused:
+def _live(request: VolumesRequest, maps: VolumeMaps, body: Body | None, observer: Observer) -> _Fused:
     """Tracks the recording into a run folder and fuses on the way."""
     fused = _Fused(maps, str(request.source))
-    follower = LiveVolumes(maps, fused.saw, request.objects, request.voxel is None)
+    follower = LiveVolumes(maps, fused.saw, request.objects, request.voxel is None, body)
     pace = [] if request.realtime is None else [f"realtime_fps={request.realtime}"]
     run = RunRequest(
         request.sequence, request.out, request.config, [*request.overrides, *pace], evaluate=False,

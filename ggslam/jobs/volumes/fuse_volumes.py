@@ -25,6 +25,8 @@ def fuse_volumes(
     frame: str = "map",
     band: tuple[float, float] = (0.1, 1.5),
     slice_height: float | None = None,
+    robots: Iterable[str] = (),
+    inflation: str = "0.55,10",
     config: str | None = None,
     overrides: Iterable[str] = (),
     observer: Observer | None = None,
@@ -44,6 +46,9 @@ def fuse_volumes(
         frame: of meshes and occupancy: "map", or "floor" (z up, 0 on the floor).
         band: lowest and highest obstacle of the ROS map, metres above the floor.
         slice_height: metres above the floor of the slice through the distance field; None: as high as the camera was.
+        robots: such as "0.4,0.18" or "tall:1.2,0.3", height and radius in metres: each gets a map of what it meets
+            and a costmap; needs `esdf`.
+        inflation: `inflation_radius` and `cost_scaling_factor` of the costmaps, as nav2 has them.
         config: a preset's name, or a YAML file; None: the defaults.
         overrides: settings as "name.of.setting=value".
         observer: receives progress updates.
@@ -59,6 +64,7 @@ def fuse_volumes(
         Path(source), SequenceRequest.of(source, selection, "fuse_volumes"), out=None if out is None else Path(out),
         voxel=voxel, esdf=esdf, occupancy=occupancy, mesh=None if mesh is None else Path(mesh),
         object_meshes=object_meshes, objects=objects, slice_height=slice_height, band=band, frame=frame,
+        robots=tuple(robots), inflation=inflation,
         config=config, overrides=list(overrides),
     )  # fmt: skip
     outcome = make_volumes(request, observer)

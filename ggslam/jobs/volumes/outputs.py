@@ -6,6 +6,8 @@
     objects.png, object_*.ply  the same in colours of objects; a mesh of each of them
     esdf.png                   the distance field at one height
     map.pgm, map.yaml          obstacles between two heights, as ROS's map_server reads them, in the floor's frame
+    map_NAME.pgm, .yaml        the same of a robot's heights; costmap_NAME.png, .yaml: what driving there costs it;
+                               robot_NAME.png: a picture of it
     occupancy.bt, .ot, .png    the occupancy map, as OctoMap reads it
     floor.yaml                 where the floor's frame is in the map's
     volumes.json               where all this is from, sizes and times
@@ -26,10 +28,14 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.driving.inflation import Inflation
+from ggslam.driving.map_files import write_map
+from ggslam.driving.robot import Robot
 from ggslam.errors import RunFolderError
 from ggslam.formats.mesh_files import write_mesh
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.volumes.pictures import mesh_picture, occupancy_picture
+from ggslam.jobs.volumes.robot_maps import floor_layers, write_robot_maps
 from ggslam.reporting.pictures import write_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.publishing import change_in_run
@@ -48,8 +54,7 @@ from ggslam.volumes.mesh import Mesh
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.octomap_files import write_octomap
 from ggslam.volumes.output_frame import OutputFrame
-from ggslam.volumes.slices import FieldSlice, plane_at_height, slice_field, slice_picture, write_ros_map
-from ggslam.volumes.tsdf import SIDE
+from ggslam.volumes.slices import FieldSlice, plane_at_height, slice_field, slice_picture
 from ggslam.volumes.tsdf_file import save_tsdf
 from ggslam.volumes.upright import Upright, estimate_up
 
@@ -81,6 +86,8 @@ class OutputRequest:
         band: lowest and highest obstacle of the ROS map, metres above the floor.
         names: of object ids.
         frame: of meshes and occupancy.
+        robots: that get maps of their own, with names.
+        inflation: how costs fall off in their costmaps.
     """
 
     mesh: Path | None
@@ -89,6 +96,8 @@ class OutputRequest:
     band: tuple[float, float]
     names: dict[int, str]
     frame: OutputFrame = OutputFrame.map
+    robots: Sequence[Robot] = ()
+    inflation: Inflation = Inflation()
 
 
 @dataclass(frozen=True)
@@ -232,18 +241,14 @@ class _Writer:
         heights, base = self.poses[:, :3, 3] @ upright.up, floor_height(upright, self.poses)
         wanted = self.request.slice_height
         height = float(np.median(heights)) if wanted is None else base + wanted
-        cut = _slice(field_, upright.up, height, field_.voxel)
+        cut = _slice(field_, upright.up, height)
         write_picture(self.path("esdf.png"), slice_picture(cut, _full_scale(cut.distance[cut.known])))
         if not cut.known.any():
             self.outputs.lines.append(f"note: nothing is known {height - base:.2f} m up: esdf.png is empty")
-        # No farther than the field reaches.
-        edge = SIDE * field_.voxel
-        reached = (field_.coordinates() + 0.5) @ upright.up * edge - base
-        low = max(self.request.band[0], float(reached.min()) - edge)
-        high = max(low, min(self.request.band[1], float(reached.max()) + edge))
-        plan = _slice(field_, upright.up, base, max(0.05, field_.voxel), (low, high))
-        image, description = write_ros_map(plan, self.staged / "map")
-        self.outputs.files += [self.out / image.name, self.out / description.name]
+        layers = floor_layers(field_, plane_at_height(field_, upright.up, base), VolumeOutputTuning.max_slice_cells)
+        plan = layers.between(*self.request.band)
+        written, robots = write_robot_maps(layers, self.request.robots, self.request.inflation, self.staged)
+        self.outputs.files += [self.out / file.name for file in (*write_map(plan, self.staged / "map"), *written)]
         axes = {"origin": plan.plane.origin, "x_axis": plan.plane.x_axis, "y_axis": plan.plane.y_axis}
         held = field_.memory_bytes / 1e6
         ground = "the floor" if upright.floor is not None else "a metre below the camera"
@@ -251,8 +256,13 @@ class _Writer:
             f"distance field: {quantity(len(field_), 'block')}, {held:.0f} MB, last update {1e3 * seconds:.0f} ms; "
             f"slice {height - base:.2f} m above {ground}",
             esdf={"blocks": len(field_), "memory_mb": held, "last_update_ms": 1e3 * seconds,
-                  "slice_height": height - base, "band": [low, high], "map_frame": axes},
+                  "slice_height": height - base, "band": plan.heights, "map_frame": axes, "robots": robots},
         )  # fmt: skip
+        for name, facts in robots.items():
+            self.outputs.lines.append(
+                f"{name}: {facts['free_m2']:.1f} m2 are free, its centre has {facts['for_its_centre_m2']:.1f} m2: "
+                f"{self.out / f'robot_{name}.png'}"
+            )
 
     def occupancy(self, occupancy: OccupancyMap) -> None:
         """The occupancy map, which is in the frame that is asked for already."""
@@ -278,13 +288,11 @@ def _words(position: np.ndarray) -> str:
     return f"({', '.join(f'{value:g}' for value in position)})"
 
 
-def _slice(
-    field_: DistanceField, up: np.ndarray, height: float, resolution: float, band: tuple[float, float] | None = None
-) -> FieldSlice:
-    """A slice, coarser than `resolution` where that would be too many cells."""
+def _slice(field_: DistanceField, up: np.ndarray, height: float) -> FieldSlice:
+    """A slice, coarser than the field's voxels where that would be too many cells."""
     plane = plane_at_height(field_, up, height)
     area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
-    return slice_field(field_, plane, max(resolution, math.sqrt(area / VolumeOutputTuning.max_slice_cells)), band)
+    return slice_field(field_, plane, max(field_.voxel, math.sqrt(area / VolumeOutputTuning.max_slice_cells)))
 
 
 def _full_scale(distances: np.ndarray) -> float:

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The band of heights that a robot passes through: where it meets obstacles, what is free, how far obstacles are.
+
+A volume's distances are three-dimensional: low above the floor they tell how near the floor is. What counts for a robot
+on the floor is how far it is, across the floor, to the nearest thing at its own heights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ggslam.abi.core import BEHIND_BIT, SEEN_BIT
+from ggslam.driving.robot import Robot
+from ggslam.errors import InputError
+from ggslam.scene.poses import inverse
+from ggslam.system.tuning import Tuning
+from ggslam.volumes.cell_grid import CellGrid, SlicePlane
+from ggslam.volumes.columns import seen_above
+from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.seen_surface import SeenSurface, unseen_surface
+from ggslam.volumes.tsdf import SIDE
+
+
+class BandTuning(Tuning):
+    """How bands are looked at."""
+
+    reach_voxels = 0.75
+    """Distance from a surface point in voxels up to which a cell is occupied: with less, walls have holes where cells
+    are smaller than voxels, for the points are up to 1.4 voxels apart."""
+    same_place = 1 / 16
+    """Surface points above one another count as one if they are this share of a cell apart."""
+
+
+@dataclass(frozen=True)
+class BandMap:
+    """What a robot meets, cell by cell.
+
+    Attributes:
+        grid: the cells, on the floor.
+        heights: lowest and highest obstacle that counts, metres above the floor.
+        occupied: bool [H, W], whether a cell has a surface in it: a surface point, or a measured point, between these
+            heights lies in it or within half a cell (three quarters of a voxel, if
+            that is more) of its centre.
+        known: bool [H, W], whether it was seen at one of the heights at least.
+        behind: bool [H, W], whether it is behind a surface at one of them, at one that no point was measured near, or
+            may have a measured point in it: not free, whatever is known.
+        distance: float32 [H, W], metres across the floor from a cell's centre to the nearest of the surface points;
+            inf if there is none.
+        points: float64 [P, 2], those points' x and y on the plane.
+    """
+
+    grid: CellGrid
+    heights: tuple[float, float]
+    occupied: np.ndarray
+    known: np.ndarray
+    behind: np.ndarray
+    distance: np.ndarray
+    points: np.ndarray
+
+    @property
+    def free(self) -> np.ndarray:
+        """Cells that were seen, with no surface in them and not behind one, bool [H, W]. A cell that was seen at some
+        of the heights only may be free."""
+        return self.known & ~self.occupied & ~self.behind
+
+    @property
+    def plane(self) -> SlicePlane:
+        """Where the cells are."""
+        return self.grid.plane
+
+    @property
+    def resolution(self) -> float:
+        """Edge of a cell, metres."""
+        return self.grid.resolution
+
+
+class HeightLayers:
+    """What a volume has above a floor, layer by layer; bands of several robots are cut from it. It stands for the
+    volume as it is when the object is made.
+
+    Args:
+        field: up to date.
+        plane: of the floor, its normal up.
+        resolution: edge of a cell, metres.
+
+    Raises:
+        InputError: a resolution that is not positive, or more than 50 million cells.
+    """
+
+    def __init__(self, field: DistanceField, plane: SlicePlane, resolution: float) -> None:
+        self.grid = CellGrid.over(plane, resolution)
+        self._field = field
+        self._surface = SeenSurface.of(field, self.grid.plane)
+        self._layers: dict[int, np.ndarray] = {}
+        edge = SIDE * field.voxel
+        middles = (field.coordinates() + 0.5) * edge + field.origin
+        heights = plane.coordinates(middles)[:, 2]
+        self._reach = (heights.min() - edge, heights.max() + edge) if len(heights) else (0.0, 0.0)
+
+    def band(self, robot: Robot) -> BandMap:
+        """What a robot meets."""
+        return self.between(*robot.band)
+
+    def between(self, low: float, high: float) -> BandMap:
+        """What there is between two heights above the floor, metres; a robot that meets all of it.
+
+        Raises:
+            InputError: the lower one is not the first.
+        """
+        if not low <= high:
+            raise InputError(f"expected two heights, the lower first, found {low} and {high}")
+        low, high = max(low, min(self._reach[0], high)), min(high, max(self._reach[1], low))
+        seen = self._see(low, high)
+        known, behind = (seen & SEEN_BIT) > 0, (seen & BEHIND_BIT) > 0
+        near = self._surface.near_points(self.grid, low, high)
+        sites = self._surface.sites
+        sites = sites[(sites[:, 2] >= low) & (sites[:, 2] <= high), :2]
+        sited = self.grid.mark(sites)
+        unseen = unseen_surface(sited, near)
+        measured = self._surface.with_points(self.grid, low, high)
+        points = np.concatenate([self._outside(sites, unseen), self.grid.centres()[measured & ~(sited & ~unseen)]])
+        points = self._thin_out(points)
+        distance = self._distance(points)
+        occupied = (sited & ~unseen) | measured
+        occupied |= distance <= max(self.grid.resolution / 2, BandTuning.reach_voxels * self._field.voxel)
+        return BandMap(self.grid, (low, high), occupied, known, behind | unseen | near, distance, points)
+
+    def _see(self, low: float, high: float) -> np.ndarray:
+        """What the voxels of a band are, together, uint8 [H, W]: layers a voxel apart, or the one at its middle."""
+        spacing = self._field.voxel
+        first, last = int(np.ceil(low / spacing - 1e-6)), int(np.floor(high / spacing + 1e-6))
+        if first > last:
+            first = last = int(np.rint((low + high) / 2 / spacing))
+        missing = [number for number in range(first, last + 1) if number not in self._layers]
+        if missing:
+            start, count = missing[0], missing[-1] + 1 - missing[0]
+            found = seen_above(self._field.tsdf, self.grid, start * spacing, spacing, count)
+            self._layers |= {start + k: layer for k, layer in enumerate(found)}
+        return np.bitwise_or.reduce([self._layers[number] for number in range(first, last + 1)])
+
+    def _outside(self, places: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """Those of places [N, 2] that lie in none of some cells, bool [H, W]."""
+        row, column, inside = self.grid.cells_of(places)
+        left_out = np.zeros(len(places), bool)
+        left_out[inside] = cells[row[inside], column[inside]]
+        return places[~left_out]
+
+    def _thin_out(self, points: np.ndarray) -> np.ndarray:
+        step = self.grid.resolution * BandTuning.same_place
+        at = np.floor((points - self.grid.plane.low) / step).astype(np.int64)
+        _, first = np.unique((at[:, 0] << 32) + at[:, 1], return_index=True)
+        return points[first]
+
+    def _distance(self, points: np.ndarray) -> np.ndarray:
+        if not len(points):
+            return np.full(self.grid.shape, np.inf, np.float32)
+        found = cKDTree(points).query(self.grid.centres().reshape(-1, 2), workers=2)[0]
+        return found.astype(np.float32).reshape(self.grid.shape)
+
+
+def floor_plane(field: DistanceField, T_floor_map: np.ndarray) -> SlicePlane:
+    """The floor as far as a field's blocks reach: z = 0 of the frame that T_floor_map [4, 4] leads to."""
+    T_map_floor = inverse(np.asarray(T_floor_map, np.float64))
+    edge = SIDE * field.voxel
+    corners = np.concatenate([field.coordinates() + shift for shift in np.ndindex(2, 2, 2)]) * edge + field.origin
+    plane = SlicePlane(T_map_floor[:3, 3], T_map_floor[:3, 0], T_map_floor[:3, 1], (0.0, 0.0), (0.0, 0.0))
+    at = plane.coordinates(corners)[:, :2] if len(corners) else np.zeros((1, 2))
+    (x0, y0), (x1, y1) = at.min(axis=0).tolist(), at.max(axis=0).tolist()
+    return SlicePlane(plane.origin, plane.x_axis, plane.y_axis, (x0, y0), (x1, y1))
+
+
+def band_map(field: DistanceField, floor: SlicePlane | np.ndarray, robot: Robot, resolution: float) -> BandMap:
+    """What a robot meets on a floor.
+
+    Args:
+        field: up to date.
+        floor: its plane, the normal up, or T_floor_map [4, 4].
+        robot: what drives.
+        resolution: edge of a cell, metres.
+
+    Raises:
+        InputError: a resolution that is not positive, or more than 50 million cells.
+    """
+    plane = floor if isinstance(floor, SlicePlane) else floor_plane(field, floor)
+    return HeightLayers(field, plane, resolution).band(robot)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Square cells on an oriented plane. Arrays are [H, W] with row 0 at the top, where y is largest, as in pictures;
+column 0 is where x is smallest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ggslam.errors import InputError
+from ggslam.system.tuning import Tuning
+
+
+class CellGridTuning(Tuning):
+    """Limits of a grid."""
+
+    max_cells = 50_000_000
+    """Most cells."""
+
+
+@dataclass(frozen=True)
+class SlicePlane:
+    """A rectangle in space.
+
+    Attributes:
+        origin: [3], metres, where the plane's coordinates are (0, 0).
+        x_axis, y_axis: [3], orthogonal unit vectors.
+        low, high: (x, y) of the rectangle's corners on the plane, metres.
+    """
+
+    origin: np.ndarray
+    x_axis: np.ndarray
+    y_axis: np.ndarray
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit vector; seen from its side, y is to the left of x."""
+        return np.cross(self.x_axis, self.y_axis)
+
+    def coordinates(self, points: np.ndarray) -> np.ndarray:
+        """x, y and height above the plane, [N, 3], of points [N, 3] in space; metres."""
+        relative = points - self.origin
+        # einsum, for BLAS is slow with three columns
+        return np.einsum("ni,ai->na", relative, np.stack([self.x_axis, self.y_axis, self.normal]))
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """The cells of a rectangle.
+
+    Attributes:
+        plane: its rectangle is that of the cells.
+        resolution: edge of a cell, metres.
+        shape: rows and columns (H, W).
+    """
+
+    plane: SlicePlane
+    resolution: float
+    shape: tuple[int, int]
+
+    @staticmethod
+    def over(plane: SlicePlane, resolution: float) -> CellGrid:
+        """The cells that cover a rectangle; it grows to the right and up to a whole number of them.
+
+        Raises:
+            InputError: a resolution that is not positive, or more than 50 million cells.
+        """
+        if not resolution > 0:
+            raise InputError(f"expected a positive resolution, found {resolution}")
+        width, height = (max(1, int(np.ceil((plane.high[a] - plane.low[a]) / resolution - 1e-6))) for a in (0, 1))
+        if width * height > CellGridTuning.max_cells:
+            raise InputError(f"resolution: {width} x {height} cells are more than {CellGridTuning.max_cells}")
+        top_right = (plane.low[0] + width * resolution, plane.low[1] + height * resolution)
+        return CellGrid(replace(plane, high=top_right), resolution, (height, width))
+
+    def centres(self) -> np.ndarray:
+        """Where the cells' centres are on the plane, (x, y) in metres, float64 [H, W, 2]."""
+        x = self.plane.low[0] + (np.arange(self.shape[1]) + 0.5) * self.resolution
+        y = self.plane.low[1] + (np.arange(self.shape[0])[::-1] + 0.5) * self.resolution
+        return np.stack(np.broadcast_arrays(x, y[:, None]), -1)
+
+    def places(self) -> np.ndarray:
+        """The same in space, float64 [H, W, 3]."""
+        centres = self.centres()
+        return np.asarray(self.plane.origin + centres @ np.stack([self.plane.x_axis, self.plane.y_axis]))
+
+    def cells_of(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows and columns of the cells that places (x, y) [N, 2] on the plane lie in, int64 [N] each, and whether they
+        lie in the grid, bool [N]; rows and columns of others lie outside of it."""
+        column, from_bottom = np.floor((np.asarray(places)[:, :2] - self.plane.low) / self.resolution).astype(int).T
+        inside = (column >= 0) & (column < self.shape[1]) & (from_bottom >= 0) & (from_bottom < self.shape[0])
+        return self.shape[0] - 1 - from_bottom, column, inside
+
+    def mark(self, places: np.ndarray, reach: Sequence[float] | np.ndarray = (0.0, 0.0)) -> np.ndarray:
+        """Cells, bool [H, W], that rectangles around places [N, 2] on the plane overlap; they reach so far from these
+        along x and y, metres."""
+        marked = np.zeros(self.shape, bool)
+        ends = [np.floor((places[:, :2] + side * np.array(reach) - self.plane.low) / self.resolution).astype(int)
+                for side in (-1, 1)]  # fmt: skip
+        steps = (ends[1] - ends[0]).max(axis=0, initial=0)
+        for step in np.ndindex(*(steps + 1)):
+            column, from_bottom = np.minimum(ends[0] + step, ends[1]).T
+            inside = (column >= 0) & (column < self.shape[1]) & (from_bottom >= 0) & (from_bottom < self.shape[0])
+            marked[self.shape[0] - 1 - from_bottom[inside], column[inside]] = True
+        return marked
