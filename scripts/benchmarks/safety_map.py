@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live map of a robot that drives along a lane: TSDF, distance field, and where on the way it shows something."""
+"""The live map of a robot that drives along a lane: TSDF, distance field and band of heights."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ import numpy as np
 from safety_robot import Robot
 from safety_world import Lane, LaneCaster
 
+from ggslam.driving.bands import band_map
+from ggslam.driving.robot import Robot as Body
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.system.tuning import Tuning
+from ggslam.volumes.cell_grid import SlicePlane
 from ggslam.volumes.esdf import DistanceField, FieldSettings
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import TsdfMap
@@ -54,7 +57,7 @@ class LiveMap:
         noise: whether depth is that of a structured-light camera.
 
     Attributes:
-        seconds: processor time of each frame fused: TSDF, field and looking up the way.
+        seconds: processor time of each frame fused: TSDF, field and the band of heights along the way.
     """
 
     def __init__(
@@ -63,6 +66,7 @@ class LiveMap:
     ) -> None:  # fmt: skip
         self.lane, self.robot, self.camera, self.voxel = lane, robot, camera, voxel
         self.clearance = clearance * voxel
+        self._body = Body(height=robot.heights[1], radius=robot.radius, step=LiveMapTuning.band_low)
         context = NativeContext(1)
         self.tsdf = TsdfMap(TsdfSettings(voxel=voxel, max_depth=max_depth), context)
         self.field = DistanceField(self.tsdf, FieldSettings(max_distance=max(LiveMapTuning.field_reach, 3 * voxel)))
@@ -84,11 +88,10 @@ class LiveMap:
     def contact(self) -> float:
         """The x of the robot's centre at which, by the map, it comes within its clearance of something; infinite if it
         does not."""
-        points, _ = self.field.surface()
         reach = self.robot.radius + self.clearance
-        x, y, z = points.T
-        low, high = LiveMapTuning.band_low, self.robot.heights[1]
-        near = (z > low) & (z < high) & (np.abs(y) < reach) & (x > 0)
+        way = SlicePlane(np.zeros(3), *np.eye(3)[:2], (0.0, -reach), (self.lane.end + reach, reach))
+        x, y = band_map(self.field, way, self._body, self.voxel).points.T
+        near = np.abs(y) < reach
         return float((x[near] - np.sqrt(reach**2 - y[near] ** 2)).min(initial=np.inf))
 
     def restore(self) -> None:
