@@ -55,12 +55,12 @@ class Experiment:
         return self.distance + TrialTuning.beyond + self.robot.radius + 0.1
 
     def make_map(self, lane: Lane, voxel: float) -> LiveMap:
-        """The live map of a lane after the approach. With fine voxels the camera is a smaller window, as wide as the
-        way where obstacles appear: what is beside it only takes time."""
-        camera = self.camera
-        if voxel < FINE:
-            camera = Camera(camera.width * 3 // 5, camera.height * 3 // 5, camera.fx, camera.fy,
-                            camera.cx * 0.6, camera.cy * 0.6)  # fmt: skip
+        """The live map of a lane after the approach. With fine voxels the camera is a smaller window, as wide and high
+        as the robot where obstacles appear: what is beside its way only takes time."""
+        c = self.camera
+        width, height = c.width * 3 // 5, c.height * 2 // 5
+        small = Camera(width, height, c.fx, c.fy, (width - 1) / 2, (height - 1) / 2)
+        camera = small if voxel < FINE else c
         return LiveMap(lane, self.robot, camera, voxel, self.max_depth, self.clearance, self.noise)
 
 

@@ -57,7 +57,8 @@ class LiveMap:
         noise: whether depth is that of a structured-light camera.
 
     Attributes:
-        seconds: processor time of each frame fused: TSDF, field and the band of heights along the way.
+        seconds: processor time of each frame fused: TSDF, field and the band of heights along the way. Frames after
+            which the field follows a restored map, too, are left out.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class LiveMap:
         self.tsdf = TsdfMap(TsdfSettings(voxel=voxel, max_depth=max_depth), context)
         self.field = DistanceField(self.tsdf, FieldSettings(max_distance=max(LiveMapTuning.field_reach, 3 * voxel)))
         self.seconds: list[float] = []
+        self._restored = False
         caster = LaneCaster(lane, camera, robot.camera_height, noise=0 if noise else None)
         for x in np.arange(0.0, LiveMapTuning.approach + 1e-9, LiveMapTuning.between):
             self.add(caster.depth(x), caster.pose(x))
@@ -82,7 +84,9 @@ class LiveMap:
         self.tsdf.integrate(depth, self.camera, T_lane_camera)
         self.field.update()
         found = self.contact()
-        self.seconds.append(time.thread_time() - start)
+        if not self._restored:
+            self.seconds.append(time.thread_time() - start)
+        self._restored = False
         return found
 
     def contact(self) -> float:
@@ -95,11 +99,11 @@ class LiveMap:
         return float((x[near] - np.sqrt(reach**2 - y[near] ** 2)).min(initial=np.inf))
 
     def restore(self) -> None:
-        """Makes the map again what it was after the approach."""
+        """Makes the map again what it was after the approach; its distance field follows with the next frame."""
         self.tsdf.clear()
         self.tsdf.write(self._saved.dense, **self._saved.voxels)
         self.tsdf.write_free(self._saved.free, self._saved.free_weight)
-        self.field.update()
+        self._restored = True
 
     def _save(self) -> Saved:
         blocks = self.tsdf.blocks()

@@ -137,6 +137,7 @@ def test_an_obstacle_is_in_the_map_after_two_frames() -> None:
         caster = LaneCaster(lanes[trial.lane], live.camera, SMALL.robot.camera_height, trial.obstacle)
         found = [live.add(caster.depth(x), caster.pose(x)) for x in (trial.start, trial.start + 0.05)]
         live.restore()
+        live.field.update()
         assert np.isinf(found[0])
         assert found[1] + live.clearance == pytest.approx(trial.contact, abs=VOXEL)
         assert np.isinf(live.contact())  # the map is again as it was
