@@ -109,6 +109,8 @@ Friction = Annotated[float, typer.Option(help="With --driving: friction between 
 SensorMs = Annotated[float, typer.Option(help="With --driving: delay of the sensor, ms.")]
 PlanMs = Annotated[float, typer.Option(help="With --driving: time that the planner takes, ms.")]
 NetworkMs = Annotated[float, typer.Option(help="With --driving: time between machines, ms.")]
+FrameMs = Annotated[float, typer.Option(help="With --driving: time from one frame of the sensor to the next, ms.")]
+ControlMs = Annotated[float, typer.Option(help="With --driving: time between commands of the controller, ms.")]
 Scale = Annotated[
     float | None, typer.Option(help="Resize the images by this factor; default: as the run did, or not at all.")
 ]
@@ -141,6 +143,7 @@ def volumes(
     speeds: Speeds = "0.5,1,2,4",
     friction: Friction = 0.5,
     sensor_ms: SensorMs = 33.0, plan_ms: PlanMs = 50.0, network_ms: NetworkMs = 0.0,
+    frame_ms: FrameMs = 33.3, control_ms: ControlMs = 50.0,
     config: options.ConfigName = None, settings: options.Settings = None,
     start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
     scale: Scale = None,
@@ -161,7 +164,7 @@ def volumes(
     from ggslam.jobs.volumes.fuse import VolumesRequest
     from ggslam.runs.recordings import SequenceRequest
 
-    braking = _make_braking(sensor_ms, plan_ms, network_ms, friction)
+    braking = _make_braking(sensor_ms, plan_ms, network_ms, frame_ms, control_ms, friction)
     reading = SequenceRequest(
         source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
@@ -184,10 +187,16 @@ def _overrides(settings: list[str] | None, min_weight: float | None) -> list[str
     return [*(settings or []), *([] if min_weight is None else [f"volumes.min_weight={min_weight}"])]
 
 
-def _make_braking(sensor_ms: float, plan_ms: float, network_ms: float, friction: float) -> Braking:
-    from ggslam.volumes.safety import Braking, Latencies
+def _make_braking(
+    sensor_ms: float, plan_ms: float, network_ms: float, frame_ms: float, control_ms: float, friction: float
+) -> Braking:
+    """A robot in places that the map has seen free."""
+    from ggslam.volumes.safety import FRAMES_UNTIL_OCCUPIED, Braking, Latencies
 
-    return Braking(Latencies(sensor_ms / 1e3, 0.0, plan_ms / 1e3, network_ms / 1e3), friction)
+    latencies = Latencies(
+        sensor_ms / 1e3, 0.0, plan_ms / 1e3, network_ms / 1e3, frame_ms / 1e3, FRAMES_UNTIL_OCCUPIED, control_ms / 1e3
+    )
+    return Braking(latencies, friction)
 
 
 def _make_of_store(
@@ -284,14 +293,15 @@ def _print_safety(outcome: VolumesOutcome, braking: Braking, speeds: list[float]
     braking = replace(braking, latencies=latencies)
     console.print(
         f"the maps know of a frame {1e3 * latencies.map:.1f} ms after it came{posed} (95 % of the frames); with sensor "
-        f"{1e3 * latencies.sensor:g}, plan {1e3 * latencies.plan:g}, network {1e3 * latencies.network:g} ms a robot is "
-        f"blind for {1e3 * latencies.total:.0f} ms", highlight=False
+        f"{1e3 * latencies.sensor:g}, plan {1e3 * latencies.plan:g}, network {1e3 * latencies.network:g} ms, and at "
+        f"worst {1e3 * latencies.wait:.0f} ms until {latencies.frames} frames show an obstacle and the controller "
+        f"has its turn, a robot is blind for {1e3 * latencies.total:.0f} ms", highlight=False
     )  # fmt: skip
     rows = [[f"{v:g} m/s", f"{braking.blind_distance(v):.2f} m", f"{braking.stopping_distance(v):.2f} m"]
             for v in speeds]  # fmt: skip
     console.print(table(f"driving, friction {braking.friction:g}", ["speed", "blind", "stopping distance"], rows))
     far = outcome.depth_range_m
     console.print(
-        f"seeing {far:.1f} m far (95 % of the depth), it stops in time up to {braking.largest_speed(far):.1f} m/s",
-        highlight=False,
+        f"seeing {far:.1f} m far (95 % of the depth), it stops in time up to {braking.largest_speed(far):.1f} m/s, if "
+        "it keeps a voxel away from what the map has", highlight=False,
     )  # fmt: skip

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,22 @@ def test_a_recording_with_poses_needs_no_run(of_recording: tuple[Path, str]) -> 
         image = cv2.imread(str(out / picture))
         assert image is not None and image.std() > 10, picture
     assert "poses of the recording itself" in printed
+
+
+def test_a_robot_is_blind_for_latencies_and_waits(of_recording: tuple[Path, str]) -> None:
+    """Two frames of 33.3 ms and a controller's turn of 50 ms on top of map, sensor (33 ms) and plan (50 ms)."""
+    printed = " ".join(of_recording[1].split())
+    maps, worst, blind = (
+        float(found[1])
+        for name in (r"know of a frame ([\d.]+) ms", r"at worst (\d+) ms", r"blind for (\d+) ms")
+        if (found := re.search(name, printed))
+    )
+    slow = maps > 33.3
+    assert worst == pytest.approx((33.3 + 2 * maps if slow else 66.6) + 50, abs=1)
+    assert blind == pytest.approx(maps + 33 + 50 + worst, abs=1.5)
+    metres = re.search(r"1 m/s\W+([\d.]+) m\W+([\d.]+) m", printed)
+    assert metres is not None and float(metres[1]) == pytest.approx(blind / 1e3, abs=0.006)
+    assert float(metres[2]) == pytest.approx(blind / 1e3 + 1 / (2 * 0.5 * 9.81), abs=0.01)
 
 
 def test_the_generated_room_stands_upright_on_its_floor(of_recording: tuple[Path, str]) -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from ggslam.errors import ConfigError
@@ -28,3 +30,21 @@ def test_impossible_values_are_refused() -> None:
         Braking(friction=0.0)
     with pytest.raises(ConfigError, match="map"):
         Latencies(map=float("nan"))
+
+
+def test_an_obstacle_waits_for_frames_map_and_controller() -> None:
+    fast = Latencies(sensor=0.02, map=0.01, plan=0.05, frame_period=0.03, frames=2, control_period=0.04)
+    assert fast.wait == pytest.approx(2 * 0.03 + 0.04)
+    assert fast.total == pytest.approx(0.08 + fast.wait)
+    slow = replace(fast, map=0.05)  # busy with a frame from before when the first is taken that shows the obstacle
+    assert slow.wait == pytest.approx(0.03 + 2 * 0.05 + 0.04)
+    assert Latencies().wait == 0
+
+
+def test_unbraked_load_and_margins_shorten_the_way() -> None:
+    plain = Braking(Latencies(0, 0, 0))
+    assert Braking(Latencies(0, 0, 0), braked_share=0.5).stopping_distance(2) == 2 * plain.stopping_distance(2)
+    kept = Braking(margin=0.3)
+    assert kept.stopping_distance(1.5) == pytest.approx(Braking().stopping_distance(1.5) + 0.3)
+    assert kept.stopping_distance(kept.largest_speed(2.0)) == pytest.approx(2.0)
+    assert kept.largest_speed(0.2) == 0
