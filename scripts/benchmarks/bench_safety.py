@@ -26,7 +26,7 @@ import json
 import os
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -36,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 import numpy as np
-from safety_cells import FINE, Cell, Experiment, MapTimes, measure_map, run_cell
+from safety_cells import FINE, Cell, Experiment, MapTimes, measure_map, run_cell, usual_seconds
 from safety_figure import draw_cells
 from safety_terms import Term, try_terms
 
@@ -89,16 +89,26 @@ def main() -> None:
 def run_all(
     experiment: Experiment, voxels: list[float], latencies: list[float], workers: int
 ) -> tuple[list[Cell], dict[float, MapTimes]]:
-    """All cells, those that take longest first, and the measured times of the maps. The speed without waiting is not
-    tried with fine voxels: it would take half as long again."""
+    """All cells, those that take longest first, and the measured times of the maps. Latencies shorter than a map takes
+    are one cell. The speed without waiting is not tried with fine voxels: it would take half as long again."""
     measured = {voxel: measure_map(experiment, voxel) for voxel in voxels}
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        running = [
-            pool.submit(run_cell, experiment, voxel, ms / 1e3, measured[voxel].seconds, voxel >= FINE)
-            for voxel in sorted(voxels)
+        running: dict[tuple[float, float], Future[Cell]] = {}
+        for voxel in sorted(voxels):
+            seconds = measured[voxel].seconds
+            for asked in (ms / 1e3 for ms in latencies):
+                key = voxel, max(asked, usual_seconds(seconds))
+                if key not in running:
+                    running[key] = pool.submit(run_cell, experiment, voxel, asked, seconds, voxel >= FINE)
+        for done in as_completed(running.values()):
+            cell = done.result()
+            line = f"{100 * cell.voxel:g} cm, {1e3 * cell.latency:.0f} ms: {cell.found:.2f} m/s"
+            console.print(line, highlight=False)
+        cells = [
+            replace(running[voxel, max(ms / 1e3, usual_seconds(times.seconds))].result(), asked=ms / 1e3)
+            for voxel, times in measured.items()
             for ms in latencies
         ]
-        cells = [future.result() for future in running]
     return sorted(cells, key=lambda cell: (-cell.voxel, cell.asked)), measured
 
 

@@ -27,7 +27,7 @@ KINDS = ("box", "disc", "pole", "panel", "end")
 class TrialTuning(Tuning):
     """What is drawn."""
 
-    beyond = 1.2
+    beyond = 0.6
     """Metres beyond the protective distance that obstacles appear within; they crowd towards it."""
     end_share = 0.1
     """Share of the trials without an obstacle."""

@@ -8,7 +8,6 @@ the place where a disc touches something are exact.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,6 +118,11 @@ class Lane:
     height: float
     end: float
 
+    def contact(self, radius: float, heights: tuple[float, float]) -> float:
+        """The x at which a disc that comes along y = 0 first touches what stands along the lane at its heights."""
+        low = [s for s in self.solids if s.low < heights[1] and s.high > heights[0]]
+        return min((x for s in low if (x := s.contact(radius)) > 0), default=np.inf)
+
     def scene(self) -> Scene:
         """The lane without obstacles."""
         wide = 2 * LaneTuning.around + 10
@@ -215,8 +219,3 @@ class LaneCaster:
         if self._rng is not None:
             return noisy_depth(depth, self.camera, self._rng)
         return np.where(depth > 0, depth, np.float32(np.inf))
-
-
-def first_contact(solids: Sequence[Solid], radius: float) -> float:
-    """The x at which a disc that comes along y = 0 touches the first of them."""
-    return min((solid.contact(radius) for solid in solids), default=np.inf)
