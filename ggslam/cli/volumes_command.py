@@ -64,6 +64,11 @@ MinWeight = Annotated[
     typer.Option(min=0, max=1000, help="Least weight of voxels that the mesh is made of, in looks from 1 m; default: "
                  "half a look from the farthest depth fused (0.01 at 7 m). More leaves out what was hardly seen."),
 ]  # fmt: skip
+BudgetMs = Annotated[
+    float | None,
+    typer.Option(min=1, max=1e6, help="With --esdf: milliseconds a frame may take for TSDF and distance field; what is "
+                 "far from the camera waits for a later frame. Default: as long as it takes."),
+]  # fmt: skip
 Mesh = Annotated[
     Path | None, typer.Option(help="Mesh file, .ply, .obj or .glb; default mesh.ply in the folder of the results.")
 ]
@@ -126,7 +131,7 @@ def volumes(
     source: SourcePath,
     out: Out = None,
     voxel: Voxel = None,
-    esdf: Esdf = False,
+    esdf: Esdf = False, budget_ms: BudgetMs = None,
     occupancy: Occupancy = None,
     mesh: Mesh = None,
     min_weight: MinWeight = None,
@@ -176,15 +181,17 @@ def volumes(
         voxel=voxel, esdf=esdf, occupancy=occupancy, mesh=mesh, object_meshes=object_meshes, objects=objects, live=live,
         realtime=realtime, onto=onto, slice_height=slice_height, band=_band(band), robots=tuple(robot or ()),
         inflation=inflation, body=tuple(body or ()), body_frame=body_frame, frame=frame.value, latency=driving,
-        device=device, config=config, overrides=_overrides(settings, min_weight), overwrite=overwrite,
+        device=device, config=config, overwrite=overwrite,
+        overrides=_overrides(settings, min_weight=min_weight, budget_ms=budget_ms),
     )  # fmt: skip
     if is_store(source):
         return _make_of_store(request, engine, workers, address)
     return _make_and_show(request, _numbers("--speeds", speeds), braking, (engine, workers, address))
 
 
-def _overrides(settings: list[str] | None, min_weight: float | None) -> list[str]:
-    return [*(settings or []), *([] if min_weight is None else [f"volumes.min_weight={min_weight}"])]
+def _overrides(settings: list[str] | None, **given: float | None) -> list[str]:
+    """The settings, and those of volumes that have options of their own."""
+    return [*(settings or []), *(f"volumes.{name}={value}" for name, value in given.items() if value is not None)]
 
 
 def _make_braking(

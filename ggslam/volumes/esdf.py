@@ -37,9 +37,6 @@ class FieldSettings:
 
     max_distance: float = setting(2.0, 1e-3, 100, "m")
     """Largest distance computed; farther voxels have this distance and no gradient."""
-    budget_ms: float = setting(0.0, 0, 1e6, "ms")
-    """Time a frame for the TSDF and the field together; what is far from the camera waits for the next frame. 0: as
-    long as it takes."""
 
 
 @dataclass(frozen=True)

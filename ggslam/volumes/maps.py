@@ -227,7 +227,7 @@ class VolumeMaps:
 
     def _time_left(self, spent: float) -> float | None:
         """Milliseconds of a frame's budget that the TSDF has left to the field; at least a little."""
-        budget = self.settings.esdf.budget_ms
+        budget = self.settings.budget_ms
         return max(budget - 1e3 * spent, 1e-3) if budget else None
 
     def _bring(self, paging: Paging, images: Sequence[PosedView]) -> float:

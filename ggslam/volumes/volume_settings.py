@@ -18,6 +18,9 @@ class VolumeTuning:
     min_weight: float = setting(0.0, 0, 1000)
     """Least weight of a voxel that is meshed, in measurements from 1 m; 0: automatic: half a measurement from the
     largest depth fused."""
+    budget_ms: float = setting(0.0, 0, 1e6, "ms")
+    """Time a frame for TSDF and distance field; what is far from the camera waits for a later frame. 0: as long as it
+    takes."""
 
 
 @settings_class(frozen=True)

@@ -220,9 +220,9 @@ def test_what_was_there_stays_if_anything_goes_wrong(
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     update, calls = DistanceField.update, []
 
-    def second_is_interrupted(field: DistanceField) -> object:
+    def second_is_interrupted(field: DistanceField, *arguments: object) -> object:
         calls.append(field)
-        return interrupted() if len(calls) == 2 else update(field)
+        return interrupted() if len(calls) == 2 else update(field, *arguments)
 
     with monkeypatch.context() as patched:
         patched.setattr(DistanceField, "update", second_is_interrupted)

@@ -61,17 +61,23 @@ def triangles(mesh: Mesh) -> set[bytes]:
     return {row.tobytes() for row in corners[mesh.triangles]}
 
 
+def assert_same_distances(a: np.ndarray, b: np.ndarray) -> None:
+    """Each field holds its own surface points, within 1/16 voxel of the map's."""
+    assert np.array_equal(np.isnan(a), np.isnan(b))
+    assert np.nanmax(np.abs(a - b), initial=0) <= SETTINGS.tsdf.voxel / 8 + 1e-6
+
+
 @pytest.mark.parametrize(("esdf", "decay_every"), [(False, 0), (False, 7), (True, 0)])
 def test_what_was_on_disk_is_as_if_it_had_stayed(
     esdf: bool, decay_every: int, seen: list[PosedView], tmp_path: Path
 ) -> None:
     settings = replace(SETTINGS, decay_every=decay_every, esdf_every=5)
     whole = fuse(seen, None, settings, esdf)
-    budget = 8_500_000 if esdf else 1_500_000
+    budget = 11_000_000 if esdf else 1_500_000
     paged = fuse(seen, Paging(tmp_path / "cells", lambda held: budget), settings, esdf)
     pager = paged.pager
     assert pager is not None and pager.written > 10 and (esdf or pager.read > 5) and len(pager) > 5
-    assert pager.most_bytes <= budget < (10_000 if esdf else 5120) * whole.tsdf.dense_blocks
+    assert pager.most_bytes <= budget < (13_000 if esdf else 5120) * whole.tsdf.dense_blocks
     assert len(list((tmp_path / "cells").iterdir())) == len(pager)
     paged.finish(), whole.finish()
     paged.save_tsdf(tmp_path / "tsdf.npz")
@@ -85,7 +91,7 @@ def test_what_was_on_disk_is_as_if_it_had_stayed(
     if esdf:
         assert paged.field is not None and whole.field is not None
         at = whole.field.coordinates()
-        assert np.array_equal(paged.field.read(at), whole.field.read(at), equal_nan=True)
+        assert_same_distances(paged.field.read(at), whole.field.read(at))
         assert all("cells" in row for row in paged.times.rows)
 
 
@@ -102,7 +108,7 @@ def test_distances_around_the_camera_do_not_miss_what_is_on_disk(seen: list[Pose
         around = replace(view, depth=np.where(view.depth < 4.0, view.depth, 0)).points()[::50]
         found, expected = maps.field.query(around), whole.field.query(around)
         assert np.array_equal(found.known, expected.known)
-        assert np.array_equal(found.distance, expected.distance, equal_nan=True)
+        assert_same_distances(found.distance, expected.distance)
     assert maps.pager is not None and maps.pager.written > 5
 
 
