@@ -33,7 +33,7 @@ class Latencies:
     sensor: float = setting(0.033, 0, 60, "s")
     """Exposure and transfer."""
     map: float = setting(0.0, 0, 60, "s")
-    """Until the map knows; measured."""
+    """Until the map knows; measured with frames that show something new."""
     plan: float = setting(0.05, 0, 60, "s")
     """Until the planner has reacted."""
     network: float = setting(0.0, 0, 60, "s")
@@ -45,17 +45,21 @@ class Latencies:
     place free, 1 where it was not known."""
     control_period: float = setting(0.0, 0, 60, "s")
     """From one command of the controller to the next."""
+    map_calm: float = setting(0.0, 0, 60, "s")
+    """Time that a frame takes in the map that shows nothing new; 0: as long as `map`."""
 
     @property
     def wait(self) -> float:
         """Seconds, at worst, from the moment an obstacle can be seen until the frame is taken with which the map has
         it, and until the controller's turn.
 
-        A map that takes longer than the frames' period is busy when an obstacle comes into view. It then takes the
-        newest frame as soon as it is done, which is up to a period old."""
-        slow = self.map > self.frame_period > 0
-        seen = self.frame_period + self.frames * self.map if slow else self.frames * self.frame_period
-        return seen + self.control_period
+        A map that takes longer than the frames' period takes the newest frame as soon as it is done with one. If it
+        takes as long with frames that show nothing new, it is busy when an obstacle comes into view."""
+        if not self.map > self.frame_period > 0:
+            return self.frames * self.frame_period + self.control_period
+        calm = self.map_calm or self.map
+        busy = calm if calm > self.frame_period else 0.0
+        return self.frame_period + busy + (self.frames - 1) * self.map + self.control_period
 
     @property
     def total(self) -> float:

@@ -8,11 +8,11 @@
 
 A robot drives along rooms and corridors of a generated world. Boxes, discs, poles and panels appear in its way, at the
 protective distance or farther. Depth is rendered exactly, fused by `TsdfMap` with `DistanceField`, and the robot brakes
-when the map has something within the protective distance. Simulated: motion, camera, and the latencies of sensor and
-planner, which fill up what the map leaves of the latencies asked for. Measured: which frame gets an obstacle into the
-map, where the map has it, and how long a frame takes in it (processor time of one thread, drawn for each frame from
-those measured on this machine at the beginning). Where a map takes longer than the latency asked for, the latency is
-what the map takes.
+when the band of its heights has something within the protective distance. Simulated: motion, camera, and the latencies
+of sensor and planner, which fill up what the map leaves of the latencies asked for. Measured: which frame gets an
+obstacle into the map, where the map has it, and how long a frame takes in it (processor time of one thread, drawn for
+each frame from those measured on this machine at the beginning, those of frames with a new obstacle apart). Where a map
+takes longer than the latency asked for, the latency is what the map takes.
 
 A second table leaves out one term of the prediction after the other, and counts the collisions that it costs.
 
@@ -36,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 import numpy as np
-from safety_cells import FINE, Cell, Experiment, MapTimes, measure_map, run_cell, usual_seconds
+from safety_cells import FINE, Cell, Experiment, MapTimes, measure_map, run_cell
 from safety_figure import draw_cells
 from safety_terms import Term, try_terms
 
@@ -75,7 +75,7 @@ def main() -> None:
     print_cells(cells, measured)
     terms = []
     if max(voxels) >= COARSE and not arguments.quick:
-        terms = try_terms(experiment, max(voxels), measured[max(voxels)].seconds)
+        terms = try_terms(experiment, max(voxels), measured[max(voxels)])
         print_terms(terms, experiment)
     arguments.out.mkdir(parents=True, exist_ok=True)
     written = {"cells": [asdict(cell) for cell in cells], "terms": [asdict(term) for term in terms],
@@ -95,17 +95,17 @@ def run_all(
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         running: dict[tuple[float, float], Future[Cell]] = {}
         for voxel in sorted(voxels):
-            seconds = measured[voxel].seconds
+            times = measured[voxel]
             for asked in (ms / 1e3 for ms in latencies):
-                key = voxel, max(asked, usual_seconds(seconds))
+                key = voxel, max(asked, times.latency)
                 if key not in running:
-                    running[key] = pool.submit(run_cell, experiment, voxel, asked, seconds, voxel >= FINE)
+                    running[key] = pool.submit(run_cell, experiment, voxel, asked, times, voxel >= FINE)
         for done in as_completed(running.values()):
             cell = done.result()
             line = f"{100 * cell.voxel:g} cm, {1e3 * cell.latency:.0f} ms: {cell.found:.2f} m/s"
             console.print(line, highlight=False)
         cells = [
-            replace(running[voxel, max(ms / 1e3, usual_seconds(times.seconds))].result(), asked=ms / 1e3)
+            replace(running[voxel, max(ms / 1e3, times.latency)].result(), asked=ms / 1e3)
             for voxel, times in measured.items()
             for ms in latencies
         ]
@@ -126,8 +126,9 @@ def print_cells(cells: list[Cell], measured: dict[float, MapTimes]) -> None:
     for voxel, times in measured.items():
         got = _summary(times)
         console.print(
-            f"voxels of {100 * voxel:g} cm: a frame takes {got['mean']:.1f} ms (95 %: {got['p95']:.1f}, longest "
-            f"{got['max']:.1f}); something in the way of a free lane in {times.false_stops} of {times.frames} frames",
+            f"voxels of {100 * voxel:g} cm: a frame takes {got['calm']:.1f} ms (95 %: {got['calm_p95']:.1f}), with an "
+            f"obstacle {got['news']:.1f} ms (95 %: {got['news_p95']:.1f}); something in the way of a free lane in "
+            f"{times.false_stops} of {len(times.calm)} frames",
             highlight=False,
         )  # fmt: skip
 
@@ -140,9 +141,10 @@ def print_terms(terms: list[Term], experiment: Experiment) -> None:
 
 
 def _summary(times: MapTimes) -> dict[str, float]:
-    ms = 1e3 * times.seconds
-    return {"mean": float(ms.mean()), "p95": float(np.percentile(ms, 95)), "max": float(ms.max()),
-            "false_stops": times.false_stops, "frames": times.frames}  # fmt: skip
+    groups = {"calm": 1e3 * times.calm, "news": 1e3 * times.news}
+    found = {name: float(ms.mean()) for name, ms in groups.items()}
+    found |= {f"{name}_p95": float(np.percentile(ms, 95)) for name, ms in groups.items()}
+    return found | {"false_stops": times.false_stops}
 
 
 if __name__ == "__main__":

@@ -72,8 +72,7 @@ class Cell:
         voxel: metres.
         asked, latency: of sensor, map, plan and network together: as asked for, and as it was (a map that takes longer
             than that takes what it takes).
-        map_latency: what 95 % of the measured times of a frame in the map stay below, as `ggslam volumes --driving`
-            has it.
+        map_latency: what 95 % of the measured times in the map stay below, of frames that show an obstacle first.
         total: latency and waiting, at worst.
         predicted: largest speed by `Braking`.
         plain: the same without waiting.
@@ -105,14 +104,19 @@ class MapTimes:
     """How a map of a voxel size does while the robot drives.
 
     Attributes:
-        seconds: processor time of frames, one thread: fusion, field, and looking up the way, [n].
+        calm, news: processor time of frames, one thread: fusion, field, and the band of heights along the way, [n] of
+            frames that show nothing new, [m] of the first two that show an obstacle.
         false_stops: frames of lanes without an obstacle in which the map has something in the way.
-        frames: of those lanes.
     """
 
-    seconds: np.ndarray
+    calm: np.ndarray
+    news: np.ndarray
     false_stops: int
-    frames: int
+
+    @property
+    def latency(self) -> float:
+        """What 95 % of the frames with an obstacle stay below, seconds."""
+        return float(np.percentile(self.news, 95))
 
 
 @lru_cache(maxsize=4)
@@ -133,58 +137,52 @@ def encounters(experiment: Experiment, voxel: float) -> Encounters:
     return Encounters(lanes, experiment.robot, lambda lane: experiment.make_map(lane, voxel), experiment.noise)
 
 
-def measure_map(experiment: Experiment, voxel: float, frames: int = 20, speed: float = 2.0) -> MapTimes:
-    """Drives along each lane, for the second half of the frames with an obstacle ahead."""
+def measure_map(experiment: Experiment, voxel: float, frames: int = 12, speed: float = 2.0) -> MapTimes:
+    """Drives along each lane without an obstacle, then shows the map some obstacles, one at a time."""
     lanes, trials = place_trials(experiment)
-    seconds, stops, obstacles = [], 0, [t.obstacle for t in trials if t.obstacle is not None]
+    calm, news, stops, ahead = [], [], 0, speed * experiment.frame_period
     for number, lane in enumerate(lanes):
         live, noise = experiment.make_map(lane, voxel), number if experiment.noise else None
-        empty, filled = (
-            LaneCaster(lane, live.camera, experiment.robot.camera_height, obstacle, noise)
-            for obstacle in (None, obstacles[number % len(obstacles)])
-        )
         # The map may be a voxel off, and things beside the way count within the clearance.
         least = lane.contact(experiment.robot.radius + live.clearance + voxel, experiment.robot.heights) - FALSE_STOP
-        for k in range(frames):
-            x = LiveMapTuning.approach + speed * experiment.frame_period * k
-            caster = filled if 2 * k >= frames else empty
-            found = live.add(caster.depth(x), caster.pose(x))
-            stops += int(caster is empty and found < least)
-        seconds += live.seconds[2:]  # the first touch new memory
-    return MapTimes(np.array(seconds), stops, len(lanes) * -(-frames // 2))
+        mine = [t.obstacle for t in trials if t.obstacle is not None and t.lane == number][:4]
+        for obstacle in (None, *mine):
+            caster = LaneCaster(lane, live.camera, experiment.robot.camera_height, obstacle, noise)
+            live.restore()
+            live.refresh()
+            begin, count = len(live.seconds), frames if obstacle is None else FRAMES_UNTIL_OCCUPIED
+            for x in LiveMapTuning.approach + ahead * np.arange(count):
+                stops += int(live.add(caster.depth(x), caster.pose(x)) < least and obstacle is None)
+            (calm if obstacle is None else news).extend(live.seconds[begin:])
+    return MapTimes(np.array(calm), np.array(news), stops)
 
 
-def usual_seconds(map_seconds: np.ndarray) -> float:
-    """What 95 % of the frames stay below in the map."""
-    return float(np.percentile(map_seconds, 95))
-
-
-def latencies_of(experiment: Experiment, asked: float, map_seconds: np.ndarray) -> Latencies:
+def latencies_of(experiment: Experiment, asked: float, times: MapTimes) -> Latencies:
     """Sensor and planner share what the map leaves of a latency, one to two."""
-    usual = usual_seconds(map_seconds)
-    rest = max(0.0, asked - usual)
+    rest = max(0.0, asked - times.latency)
     return Latencies(
-        sensor=rest / 3, map=usual, plan=2 * rest / 3, frame_period=experiment.frame_period,
+        sensor=rest / 3, map=times.latency, plan=2 * rest / 3, frame_period=experiment.frame_period,
         frames=FRAMES_UNTIL_OCCUPIED, control_period=experiment.control_period,
+        map_calm=float(np.percentile(times.calm, 95)),
     )  # fmt: skip
 
 
-def run_cell(experiment: Experiment, voxel: float, asked: float, map_seconds: np.ndarray, plain: bool = True) -> Cell:
+def run_cell(experiment: Experiment, voxel: float, asked: float, times: MapTimes, plain: bool = True) -> Cell:
     """Predicts the largest speed, tries it, and searches it.
 
     Args:
         experiment: what is common.
         voxel: metres.
         asked: latency in seconds.
-        map_seconds: as `measure_map` found them.
+        times: as `measure_map` found them.
         plain: whether the speed that leaves waiting out is tried, too.
     """
-    latencies = latencies_of(experiment, asked, map_seconds)
+    latencies = latencies_of(experiment, asked, times)
     robot = experiment.robot
     braking = Braking(latencies, robot.friction, robot.braked_share)
     without = replace(braking, latencies=replace(latencies, frame_period=0.0, frames=1, control_period=0.0))
     predicted, ignorant = (b.largest_speed(experiment.distance) for b in (braking, without))
-    chain, runner = Chain(latencies, map_seconds, experiment.distance), encounters(experiment, voxel)
+    chain, runner = Chain(latencies, times.calm, times.news, experiment.distance), encounters(experiment, voxel)
     _, trials = place_trials(experiment)
     collisions = count_collisions(runner, trials, predicted, chain)
     low = predicted if collisions == 0 else predicted / 2

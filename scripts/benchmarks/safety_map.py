@@ -105,6 +105,11 @@ class LiveMap:
         self.tsdf.write_free(self._saved.free, self._saved.free_weight)
         self._restored = True
 
+    def refresh(self) -> None:
+        """Brings the distance field up to date, so that a frame need not wait for it."""
+        self.field.update()
+        self._restored = False
+
     def _save(self) -> Saved:
         blocks = self.tsdf.blocks()
         dense = blocks.coordinates[blocks.dense]

@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-from safety_cells import Experiment, count_collisions, encounters, latencies_of, place_trials
+from safety_cells import Experiment, MapTimes, count_collisions, encounters, latencies_of, place_trials
 from safety_trials import Chain
 
 from ggslam.volumes.safety import Braking
@@ -26,9 +25,9 @@ class Term:
     collisions: int
 
 
-def try_terms(experiment: Experiment, voxel: float, map_seconds: np.ndarray) -> list[Term]:
+def try_terms(experiment: Experiment, voxel: float, times: MapTimes) -> list[Term]:
     """Leaves out one term at a time."""
-    lat = latencies_of(experiment, ASKED, map_seconds)
+    lat = latencies_of(experiment, ASKED, times)
     whole = Braking(lat, experiment.robot.friction, experiment.robot.braked_share)
 
     def late(**changes: float) -> Braking:
@@ -47,7 +46,7 @@ def try_terms(experiment: Experiment, voxel: float, map_seconds: np.ndarray) -> 
         ("all terms, noise of a structured-light camera", replace(experiment, noise=True), whole),
         ("no voxel of clearance", replace(experiment, clearance=0.0), whole),
     ]  # fmt: skip
-    chain = Chain(lat, map_seconds, experiment.distance)
+    chain = Chain(lat, times.calm, times.news, experiment.distance)
     found = []
     for name, which, braking in tries:
         speed = braking.largest_speed(experiment.distance)

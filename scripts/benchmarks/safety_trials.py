@@ -123,13 +123,15 @@ class Chain:
     """What stands between an obstacle and the brake.
 
     Attributes:
-        latencies: of sensor, plan and network, and the periods; that of the map is drawn from `map_seconds`.
-        map_seconds: measured times of a frame in the map, [n].
+        latencies: of sensor, plan and network, and the periods; that of the map is drawn from the next two.
+        calm, news: measured times of frames in the map, [n], [m], of those that show nothing new, and of those that
+            are the first to show an obstacle.
         distance: protective distance, metres.
     """
 
     latencies: Latencies
-    map_seconds: np.ndarray
+    calm: np.ndarray
+    news: np.ndarray
     distance: float
 
 
@@ -194,17 +196,15 @@ def _drive(trial: Trial, speed: float, chain: Chain, live: LiveMap, caster: Lane
 def mapped_frames(trial: Trial, chain: Chain) -> Iterator[tuple[float, float]]:
     """When the frames that the mapper takes were taken by the sensor, and when they are in the map: pairs of seconds
     since the obstacle appeared, without end. A frame that was taken before has a negative time."""
-    lat, seconds = chain.latencies, chain.map_seconds
+    lat, period = chain.latencies, chain.latencies.frame_period
     rng = np.random.default_rng([trial.number, 55])
-    period = lat.frame_period
-    begin = -TrialTuning.frames_before * max(period, float(seconds.max()))
-    free = begin - trial.mapper_phase * max(period, float(seconds.max()))
+    free = -(TrialTuning.frames_before + trial.mapper_phase) * max(period, float(chain.calm.max()))
     number = int(np.floor(free / period)) - 1
     while True:
         newest = int(np.floor((free - lat.sensor) / period - trial.frame_phase))
         number = max(newest, number + 1)
         taken = (trial.frame_phase + number) * period
-        free = max(free, taken + lat.sensor) + float(rng.choice(seconds))
+        free = max(free, taken + lat.sensor) + float(rng.choice(chain.calm if taken < 0 else chain.news))
         yield taken, free
 
 

@@ -38,6 +38,8 @@ def test_an_obstacle_waits_for_frames_map_and_controller() -> None:
     assert fast.total == pytest.approx(0.08 + fast.wait)
     slow = replace(fast, map=0.05)  # busy with a frame from before when the first is taken that shows the obstacle
     assert slow.wait == pytest.approx(0.03 + 2 * 0.05 + 0.04)
+    calm = replace(slow, map_calm=0.02)  # is done with those before
+    assert calm.wait == pytest.approx(0.03 + 0.05 + 0.04)
     assert Latencies().wait == 0
 
 
