@@ -49,16 +49,18 @@ struct BlockSites {
 class NodeTable {
  public:
   void clear(std::size_t room);
-  // `shift`: of the node's block, in voxels.
-  void add(const Node& node, const float shift[3], int32_t number);
-  NodeColumns columns() const;
+  // A node from the first voxel of its block.
+  void add(const Node& node, BlockCoordinates at, int32_t number);
+  NodeColumns columns() const;  // places are those of the nodes' own blocks, if they were added so
   const int32_t* numbers() const { return numbers_.data(); }
   int32_t number(int i) const { return numbers_[i]; }
   int count() const { return static_cast<int>(numbers_.size()); }
   // Row `i` of another table, whose origin lies at `shift` from this one's.
   void add(const NodeTable& from, int i, const float shift[3]);
+  BlockCoordinates at(int i) const { return {at_[i], at_[room_ + i], at_[2 * room_ + i]}; }
 
  private:
+  std::vector<int32_t> at_;  // of the nodes' blocks; empty: places are counted from one
   std::size_t room_ = 0;
   std::vector<float> values_;
   std::vector<int32_t> numbers_;
@@ -139,6 +141,7 @@ class Esdf {
 
   // Of the update at work.
   std::vector<SiteGroup> groups_, arrivals_;
+  NodeTable group_nodes_, arrival_nodes_;
   std::vector<SiteList> lists_;   // by slot
   std::vector<uint8_t> touched_;  // by slot
   std::vector<Quarter> quarters_;

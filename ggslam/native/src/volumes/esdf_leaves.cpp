@@ -113,17 +113,19 @@ void make_leaves(const std::vector<Site>& sites, std::ptrdiff_t most, float slac
 
 void NodeTable::clear(std::size_t room) {
   room_ = padded(room);
-  values_.resize(NodeColumns::kColumns * room_);
-  numbers_.clear();
+  if (values_.size() < NodeColumns::kColumns * room_) values_.resize(NodeColumns::kColumns * room_);
+  numbers_.clear(), at_.clear();
 }
 
-void NodeTable::add(const Node& node, const float shift[3], int32_t number) {
-  float* to = values_.data() + numbers_.size();
-  const float row[NodeColumns::kColumns] = {
-      node.middle[0] + shift[0], node.middle[1] + shift[1], node.middle[2] + shift[2], node.normal[0], node.normal[1],
-      node.normal[2], node.radius, node.half, node.within[0] + shift[0], node.within[1] + shift[1],
-      node.within[2] + shift[2]};
-  for (int c = 0; c < NodeColumns::kColumns; ++c) to[c * room_] = row[c];
+void NodeTable::add(const Node& node, BlockCoordinates at, int32_t number) {
+  at_.resize(3 * room_);
+  const std::size_t i = numbers_.size();
+  at_[i] = at.x, at_[room_ + i] = at.y, at_[2 * room_ + i] = at.z;
+  float* to = values_.data() + i;
+  for (int a = 0; a < 3; ++a) {
+    to[a * room_] = node.middle[a], to[(3 + a) * room_] = node.normal[a], to[(8 + a) * room_] = node.within[a];
+  }
+  to[6 * room_] = node.radius, to[7 * room_] = node.half;
   numbers_.push_back(number);
 }
 
@@ -137,7 +139,8 @@ void NodeTable::add(const NodeTable& from, int i, const float shift[3]) {
 }
 
 NodeColumns NodeTable::columns() const {
-  NodeColumns out;
+  NodeColumns out{};
+  for (int a = 0; a < 3; ++a) out.at[a] = at_.empty() ? nullptr : at_.data() + a * room_;
   for (int c = 0; c < NodeColumns::kColumns; ++c) out.column[c] = values_.data() + c * room_;
   out.count = count();
   return out;

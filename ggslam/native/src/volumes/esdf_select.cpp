@@ -3,7 +3,6 @@
 // enough to, or of which other voxels are known.
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
 #include <cstring>
 
 #include "volumes/esdf.hpp"
@@ -23,20 +22,20 @@ BlockCoordinates quarter_at(BlockCoordinates at) {
 
 bool same_words(const uint64_t* a, const uint64_t* b) { return std::memcmp(a, b, kSide * sizeof *a) == 0; }
 
-// The groups that may matter to a quarter with no voxel farther from its site than `most`.
-void list_near(Context& context, const std::vector<SiteGroup>& groups, const Quarter& quarter, float most,
-               NodeTable& out) {
-  NodeTable around;
-  around.clear(groups.size());
-  const int window = static_cast<int>((most + kQuarterReach) / kSide) + kQuarter + 2;
-  for (std::size_t g = 0; g < groups.size(); ++g) {
-    const Vec3i away = vector_of(groups[g].at) - vector_of(quarter.at);
-    if (std::abs(away[0]) > window || std::abs(away[1]) > window || std::abs(away[2]) > window) continue;
-    around.add(*groups[g].node, cast<float>(kSide * away).v, static_cast<int32_t>(g));
+// The groups that may matter to a quarter with no voxel farther from its site than `most`, from its first voxel.
+void list_near(Context& context, const NodeTable& nodes, const Quarter& quarter, float most, NodeTable& out) {
+  std::vector<float> least(nodes.count() + 16);
+  std::vector<int32_t> found(nodes.count());
+  NodeColumns columns = nodes.columns();
+  columns.origin = quarter.at;
+  const float middle[3] = {kQuarterMiddle, kQuarterMiddle, kQuarterMiddle};
+  const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_near);
+  const int n = kernel(columns, middle, kQuarterReach, most, least.data(), found.data());
+  out.clear(n);
+  for (int i = 0; i < n; ++i) {
+    const Vec3f shift = cast<float>(kSide * (vector_of(nodes.at(found[i])) - vector_of(quarter.at)));
+    out.add(nodes, found[i], shift.v);
   }
-  const float middle[3] = {kQuarterMiddle, kQuarterMiddle, kQuarterMiddle}, here[3] = {0, 0, 0};
-  NearSearch search;
-  search.list(context, around, middle, kQuarterReach, most, here, out);
 }
 
 }  // namespace
@@ -58,6 +57,11 @@ void Esdf::list_groups() {
     }
   };
   for (const auto& block : blocks_) add(*block, block->tree, groups_), add(*block, block->arrived, arrivals_);
+  const auto fill = [](const std::vector<SiteGroup>& groups, NodeTable& nodes) {
+    nodes.clear(groups.size());
+    for (std::size_t g = 0; g < groups.size(); ++g) nodes.add(*groups[g].node, groups[g].at, static_cast<int32_t>(g));
+  };
+  fill(groups_, group_nodes_), fill(arrivals_, arrival_nodes_);
   touched_.resize(slots_.size());
   for (std::size_t slot = 0; slot < slots_.size(); ++slot) touched_[slot] = slots_[slot] && slots_[slot]->touched;
   lists_.resize(slots_.size());
@@ -80,7 +84,7 @@ void Esdf::divide(Context& context) {
   }
   context.pool.parallel_for(quarters_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t q = begin; q < end; ++q)
-      list_near(context, arrivals_, quarters_[q], quarters_[q].farthest, quarters_[q].arrived);
+      list_near(context, arrival_nodes_, quarters_[q], quarters_[q].farthest, quarters_[q].arrived);
   });
 }
 
@@ -124,7 +128,7 @@ std::vector<int32_t> Esdf::select(Context& context) {
     if (concerned[row]) rows.push_back(static_cast<int32_t>(row)), wanted[quarter_of_[row]] = 1;
   context.pool.parallel_for(quarters_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t q = begin; q < end; ++q)
-      if (wanted[q]) list_near(context, groups_, quarters_[q], max_distance_, quarters_[q].all);
+      if (wanted[q]) list_near(context, group_nodes_, quarters_[q], max_distance_, quarters_[q].all);
   });
   return rows;
 }

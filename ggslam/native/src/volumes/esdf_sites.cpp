@@ -19,21 +19,35 @@ constexpr BlockCoordinates kFaces[6] = {{-1, 0, 0}, {1, 0, 0}, {0, -1, 0}, {0, 1
 
 BlockCoordinates operator+(BlockCoordinates a, BlockCoordinates b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 
+// A whole row of a block.
+void copy_row(const int16_t* value, const uint16_t* weight, int16_t* to) {
+  typedef int16_t Row __attribute__((vector_size(2 * kSide)));
+  Row values, weights;
+  std::memcpy(&values, value, sizeof values);
+  std::memcpy(&weights, weight, sizeof weights);
+  const Row least = Row{} - kFreeValue, unseen = Row{} + kUnseen;
+  values = values < least ? least : values;
+  values = weights == 0 ? unseen : values;
+  std::memcpy(to, &values, sizeof values);
+}
+
 // Copies what a block has in a box (its own voxels, -1: the halo before it, 8: behind) out of one at `shift`.
 void copy_values(const Tsdf& map, int64_t row, const Box3i& box, BlockCoordinates shift, int16_t* values) {
   if (row < 0) return;
   const Block& block = map.block(row);
   const VoxelBlock* from = map.voxels(block);
   if (from == nullptr && block.free_weight == 0) return;
+  const int first = box.low[0], count = box.high[0] - box.low[0];
   for (int k = box.low[2]; k < box.high[2]; ++k)
-    for (int j = box.low[1]; j < box.high[1]; ++j)
-      for (int i = box.low[0]; i < box.high[0]; ++i) {
-        const int v = (i - kSide * shift.x) + (j - kSide * shift.y) * kSide + (k - kSide * shift.z) * kSide * kSide;
-        const int16_t value = from == nullptr ? kFreeValue
-                              : from->weight[v] == 0 ? kUnseen
-                                                     : std::max<int16_t>(from->value[v], -kFreeValue);
-        values[(i + 1) + (j + 1) * kHalo + (k + 1) * kHalo * kHalo] = value;
-      }
+    for (int j = box.low[1]; j < box.high[1]; ++j) {
+      const int v = (first - kSide * shift.x) + (j - kSide * shift.y) * kSide + (k - kSide * shift.z) * kSide * kSide;
+      int16_t* to = values + (first + 1) + (j + 1) * kHalo + (k + 1) * kHalo * kHalo;
+      if (from == nullptr) std::fill_n(to, count, kFreeValue);
+      else if (count == kSide) copy_row(from->value + v, from->weight + v, to);
+      else
+        for (int i = 0; i < count; ++i)
+          to[i] = from->weight[v + i] == 0 ? kUnseen : std::max<int16_t>(from->value[v + i], -kFreeValue);
+    }
 }
 
 // How far two discs are from each other at most, voxels.

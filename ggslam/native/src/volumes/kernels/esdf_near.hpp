@@ -86,13 +86,16 @@ static inline Mask may_be_nearer(const Reach& reach, const Float from[3], const 
 static inline int nodes_near(const volumes::NodeColumns& nodes, const float middle[3], float reach, float most,
                              float* scratch, int32_t* out) {
   if (nodes.count == 0 || most < 0) return 0;
+  const int32_t origin[3] = {nodes.origin.x, nodes.origin.y, nodes.origin.z};
   Float nearest = broadcast(3e38f);
   for (int i = 0; i < nodes.count; i += kLanes) {
     Float from[3], normal[3], within[3];
     for (int a = 0; a < 3; ++a) {
-      from[a] = middle[a] - load(nodes.column[a] + i);
+      Float place = broadcast(middle[a]);
+      if (nodes.at[a] != nullptr) place += to_float((origin[a] - load_int(nodes.at[a] + i)) * volumes::kSide);
+      from[a] = place - load(nodes.column[a] + i);
       normal[a] = load(nodes.column[3 + a] + i);
-      within[a] = middle[a] - load(nodes.column[8 + a] + i);
+      within[a] = place - load(nodes.column[8 + a] + i);
     }
     const Float least = square_root(least_square(from, normal, load(nodes.column[6] + i), load(nodes.column[7] + i)));
     store(scratch + i, least);
