@@ -54,6 +54,25 @@ void store_packet(T* at, Int packet) {
       std::memcpy(at + kSide * j + kSide * kSide * k, values + kWide * (j + kHigh * k), kWide * sizeof(T));
 }
 
+// Of the lanes.
+float largest(Float a) {
+#if defined(__AVX512F__)
+  const __m256 half = _mm256_max_ps(_mm512_maskz_extractf32x8_ps(0xff, (__m512)a, 0),
+                                    _mm512_maskz_extractf32x8_ps(0xff, (__m512)a, 1));
+#elif defined(__AVX2__)
+  const __m256 half = (__m256)a;
+#endif
+#if defined(__AVX2__)
+  __m128 four = _mm_max_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1));
+  four = _mm_max_ps(four, _mm_movehl_ps(four, four));
+  return _mm_cvtss_f32(_mm_max_ss(four, _mm_shuffle_ps(four, four, 1)));
+#else
+  float most = a[0];
+  for (int lane = 1; lane < kLanes; ++lane) most = std::max(most, a[lane]);
+  return most;
+#endif
+}
+
 uint32_t equal(Int a, Int b) { return bits(both(greater_equal_int(a, b), greater_equal_int(b, a))); }
 
 // Bits as a mask of lanes.
@@ -170,8 +189,7 @@ class BlockSearch {
       const Float distance = absolute(load(out_.distance + row));
       farthest = select(greater(distance, farthest), distance, farthest);
     }
-    for (int lane = 0; lane < kLanes; ++lane) result_.farthest = std::max(result_.farthest, farthest[lane]);
-    result_.farthest /= in_.voxel;
+    result_.farthest = largest(farthest) / in_.voxel;
     return result_;
   }
 
@@ -236,6 +254,7 @@ class BlockSearch {
     const int first[3] = {x, y, z};
     for (int a = 0; a < 3; ++a) reach.half[a] = 0.5f * (kPart - 1), reach.middle[a] = first[a] + reach.half[a];
     bool any = false;
+    Float most = broadcast(-3e38f);
     for (int k = z; k < z + kPart; k += kDeep)
       for (int j = y; j < y + kPart; j += kHigh)
         for (int i = x; i < x + kPart; i += kWide) {
@@ -246,11 +265,13 @@ class BlockSearch {
           if (!any) slope_before(row, had, reach.slope);
           Float places[3];
           for (int a = 0; a < 3; ++a) places[a] = offset_[a] + static_cast<float>(corner[a]);
-          const float most = most_over(places, bound_of((Float)load_packet(out_.distance + row)), had, reach);
-          reach.most = any ? std::max(reach.most, most) : most;
+          Float distance = bound_of((Float)load_packet(out_.distance + row));
+          for (int a = 0; a < 3; ++a) distance -= (places[a] - reach.middle[a]) * reach.slope[a];
+          most = maximum(most, select(mask_of(had), distance, broadcast(-3e38f)));
           any = true;
         }
     if (!any) return;
+    reach.most = largest(most);
     for (int i = 0; i < in_.arrived.count; i += kLanes)
       for (uint32_t left = near_nodes(reach, in_.arrived.column, in_.arrived.count, i); left != 0; left &= left - 1) {
         const SiteGroup& group = in_.arrivals[in_.arrived_numbers[i + __builtin_ctz(left)]];
@@ -291,20 +312,16 @@ class BlockSearch {
   // How far lanes are from what they have, at most, but for the slope.
   static float most_over(const Float places[3], Float distance, uint32_t lanes, const Reach& reach) {
     for (int a = 0; a < 3; ++a) distance -= (places[a] - reach.middle[a]) * reach.slope[a];
-    distance = select(mask_of(lanes), distance, broadcast(-3e38f));
-    float most = -3e38f;
-    for (int lane = 0; lane < kLanes; ++lane) most = std::max(most, distance[lane]);
-    return most;
+    return largest(select(mask_of(lanes), distance, broadcast(-3e38f)));
   }
 
   // The slope of the distance, without its sign, of one of the lanes of the packet at `row`, as it is written down.
   void slope_before(int row, uint32_t lanes, float slope[3]) const {
-    alignas(64) int32_t gradient[kLanes], distance[kLanes];
-    store_int(gradient, load_packet(out_.gradient + row));
-    store_int(distance, load_packet(out_.distance + row));
     const int lane = __builtin_ctz(lanes);
-    const float scale = (distance[lane] < 0 ? -1.0f : 1.0f) / 511.0f;
-    for (int a = 0; a < 3; ++a) slope[a] = scale * static_cast<float>((gradient[lane] >> (10 * a) & 1023) - 511);
+    const int at = row + lane % kWide + lane / kWide % kHigh * kSide + lane / (kWide * kHigh) * kSide * kSide;
+    const float scale = (out_.distance[at] < 0 ? -1.0f : 1.0f) / 511.0f;
+    for (int a = 0; a < 3; ++a)
+      slope[a] = scale * static_cast<float>(static_cast<int>(out_.gradient[at] >> (10 * a) & 1023) - 511);
   }
 
   // No less than a distance that was written down, in voxels, roundings and all.
