@@ -307,6 +307,25 @@ def test_an_update_that_has_little_time_does_the_nearest_first_and_ends_the_rest
     assert not field.query(middles).stale.any()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_was_left_over_through_many_changes_is_right_in_the_end(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tsdf, all_blocks = new_map(), block_range((-1.6, -1.6, -1.6), (1.6, 1.6, 1.6), VOXEL)
+    room = box_room((-1.3, -1.4, -1.5), (1.4, 1.35, 1.2), rotation((0, 0, 1), 10 * seed))
+    ball, left = rng.uniform(-1, 1, 3), 0
+    field = DistanceField(tsdf, FieldSettings(max_distance=rng.choice([0.4, 1.0, 3.0])))
+    for step in range(25):
+        ball = np.clip(ball + rng.uniform(-0.1, 0.1, 3), -1.2, 1.2)
+        near = np.linalg.norm((all_blocks + 0.5) * 8 * VOXEL - ball, axis=1) < 0.9
+        if step % 8 == 5:
+            tsdf.erase(all_blocks[near & (rng.random(len(near)) < 0.3)])
+        else:
+            write_scene(tsdf, union(room, sphere(tuple(ball), 0.3)), all_blocks[near])
+        left += field.update(budget_ms=rng.choice([1e-3, 2.0, 1e3]), near=rng.uniform(-1, 1, 3)).stale_blocks
+    assert left > 100 and field.update().stale_blocks == 0
+    same_as_anew(field)
+
+
 def test_what_waits_for_its_update_is_marked() -> None:
     tsdf, blocks = new_map(1), block_range((-2, -2, -1.2), (2, 2, 1.2), VOXEL)
     floor = plane((0, 0, -1), (0, 0, 1))

@@ -32,8 +32,10 @@ struct FieldBlock {
   std::vector<uint32_t> owners;                      // slots of the blocks whose sites `voxels` has
   float farthest = 0;                                // no known voxel is farther from its site, voxels
   bool touched = false;                              // sites went or came since the last update
-  bool stale = true;                                 // to be computed anew, whatever it has
+  bool anew = true;                                  // to be computed, whatever it has
   uint32_t waits = 0;                                // updates that had no time for it
+  uint64_t orphans[kSide] = {};                      // voxels whose site went or moved, left over by those
+  std::vector<uint32_t> missed;                      // owners of sites that came, left over
 };
 
 // Sites of a leaf at most: of all sites; of those that came, which lie more scattered.
@@ -137,6 +139,7 @@ class Esdf {
   std::vector<FieldBlock*> slots_;                   // null: free
   std::vector<uint32_t> free_slots_;
   std::vector<std::unique_ptr<FieldBlock>> erased_;  // in this update
+  double put_off_ms_ = 0.005;                        // that it takes to put a block off
   int64_t left_ = 0;                                 // blocks that the last update had no time for
 
   // Of the update at work.

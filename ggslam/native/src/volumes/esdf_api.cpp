@@ -109,7 +109,7 @@ GGSLAM_EXPORT int ggslam_esdf_query(void* handle, void* context_, int64_t n, con
   std::vector<const FieldVoxels*> voxels(f.size());
   std::vector<uint8_t> blocks_stale(f.size());
   for (std::size_t row = 0; row < f.size(); ++row)
-    voxels[row] = f.block(row).voxels.get(), blocks_stale[row] = f.block(row).stale;
+    voxels[row] = f.block(row).voxels.get(), blocks_stale[row] = f.block(row).waits > 0;
   const QueryInput in{f.table().view(), voxels.data(), blocks_stale.data(), f.voxel(), points};
   const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_query);
   context.pool.parallel_for(static_cast<std::size_t>(n), 4096, [&](std::size_t begin, std::size_t end, int) {

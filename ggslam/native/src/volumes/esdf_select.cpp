@@ -65,9 +65,11 @@ void Esdf::list_groups() {
   touched_.resize(slots_.size());
   for (std::size_t slot = 0; slot < slots_.size(); ++slot) touched_[slot] = slots_[slot] && slots_[slot]->touched;
   lists_.resize(slots_.size());
-  for (std::size_t slot = 0; slot < slots_.size(); ++slot)
-    if (const FieldBlock* block = slots_[slot])
-      lists_[slot] = {block->sites.data(), static_cast<int32_t>(block->sites.size()), block->at};
+  for (std::size_t slot = 0; slot < slots_.size(); ++slot) {
+    const FieldBlock* block = slots_[slot];
+    lists_[slot] = {};
+    if (block) lists_[slot] = {block->sites.data(), static_cast<int32_t>(block->sites.size()), block->at};
+  }
 }
 
 // Puts the blocks into quarters, with the groups that came near them.
@@ -80,7 +82,7 @@ void Esdf::divide(Context& context) {
     const std::size_t q = places.insert(at);
     if (q == quarters_.size()) quarters_.push_back({{at.x * kQuarter, at.y * kQuarter, at.z * kQuarter}, {}, {}, 0});
     quarter_of_[row] = static_cast<int32_t>(q);
-    if (!blocks_[row]->stale) quarters_[q].farthest = std::max(quarters_[q].farthest, blocks_[row]->farthest);
+    if (!blocks_[row]->anew) quarters_[q].farthest = std::max(quarters_[q].farthest, blocks_[row]->farthest);
   }
   context.pool.parallel_for(quarters_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t q = begin; q < end; ++q)
@@ -104,7 +106,7 @@ void NearSearch::list(Context& context, const NodeTable& nodes, const float midd
 // Whether something may be different in a block.
 bool Esdf::concerns(Context& context, const FieldBlock& block, const Quarter& quarter,
                     NearSearch& search) const {
-  if (block.stale || !same_words(block.known, block.done_known) || !same_words(block.negative, block.done_negative))
+  if (block.anew || block.waits > 0 || !same_words(block.known, block.done_known) || !same_words(block.negative, block.done_negative))
     return true;
   for (const uint32_t slot : block.owners)
     if (touched_[slot]) return true;

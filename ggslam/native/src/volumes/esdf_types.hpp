@@ -83,12 +83,21 @@ struct SiteList {
   BlockCoordinates at;
 };
 
+// A site that came when there was no time for a block.
+struct MissedSite {
+  const Site* site;
+  BlockCoordinates at;  // of its block
+  uint32_t owner;
+};
+
 // A block to bring up to date.
 struct NearestInput {
   BlockCoordinates at;
   NodeColumns all, arrived;      // of groups of all sites, of those that came or moved: what may be near enough
   const int32_t *all_numbers, *arrived_numbers;  // of the groups in the columns
   const SiteGroup *groups, *arrivals;  // by number
+  const MissedSite* missed;      // that came before
+  int32_t missed_count;
   const SiteList* slots;         // of the owners that voxels have
   const uint64_t *known, *negative;
   const uint64_t *search;        // voxels whose nearest site may be any
@@ -96,7 +105,6 @@ struct NearestInput {
   const uint64_t* redo;          // voxels to be measured again from the site they have
   float voxel;                   // metres
   float max_distance;
-  float farthest;                // no known voxel is farther from its site
   float slack;                   // for roundings
 };
 

@@ -18,6 +18,8 @@ using Clock = std::chrono::steady_clock;
 
 // A block that an update had no time for comes nearer by this at the next, in blocks, so that all have their turn.
 constexpr double kNearerByWaiting = 4;
+// A block that missed so many sites is computed anew, if half of them are different ones.
+constexpr std::size_t kMostMissed = 2000;
 // Blocks that a thread takes at once.
 constexpr std::size_t kAtOnce = 4;
 
@@ -41,7 +43,10 @@ void each_bit(const uint64_t* words, const Do& f) {
 struct Worker {
   NearSearch search;
   NodeTable all, arrived;
+  std::vector<MissedSite> missed;
   int64_t blocks = 0, voxels = 0;
+  int64_t put_off = 0;
+  double put_off_ms = 0;
 };
 
 // Brings one block up to date.
@@ -53,7 +58,7 @@ class BlockUpdate {
 
   // What has to be done: voxels to search for, to measure again, and to forget.
   void plan() {
-    if (block_.stale || !block_.voxels) {
+    if (block_.anew) {
       if (!block_.voxels) block_.voxels = std::make_unique<FieldVoxels>();
       for (int row = 0; row < kVoxels; ++row) forget(*block_.voxels, row);
       std::copy_n(block_.known, kSide, search_);
@@ -65,6 +70,10 @@ class BlockUpdate {
       gone[k] = block_.done_known[k] & ~block_.known[k];
     }
     each_bit(gone, [&](int row) { forget(*block_.voxels, row); });
+    for (int k = 0; k < kSide; ++k) {
+      orphans_[k] = block_.orphans[k] & block_.known[k] & ~search_[k];
+      search_[k] |= orphans_[k];
+    }
     if (std::any_of(block_.owners.begin(), block_.owners.end(), [&](uint32_t slot) { return touched_[slot]; }))
       find_orphans();
     for (int k = 0; k < kSide; ++k)
@@ -90,7 +99,37 @@ class BlockUpdate {
   void finish() {
     std::copy_n(block_.known, kSide, block_.done_known);
     std::copy_n(block_.negative, kSide, block_.done_negative);
-    block_.stale = false, block_.waits = 0;
+    block_.anew = false, block_.waits = 0;
+    std::fill_n(block_.orphans, kSide, 0);
+    block_.missed.clear();
+  }
+
+  // Keeps what was planned for another time, with the groups that came.
+  void put_off(const NodeTable& arrived, const std::vector<SiteGroup>& arrivals) {
+    ++block_.waits;
+    if (block_.anew) return;
+    std::copy_n(orphans_, kSide, block_.orphans);
+    for (int i = 0; i < arrived.count(); ++i) {
+      const SiteGroup& group = arrivals[arrived.number(i)];
+      for (int32_t s = 0; s < group.count; ++s)
+        block_.missed.push_back(group.first + static_cast<uint32_t>(group.sites[s].voxel));
+    }
+    if (block_.missed.size() <= kMostMissed) return;
+    std::sort(block_.missed.begin(), block_.missed.end());
+    block_.missed.erase(std::unique(block_.missed.begin(), block_.missed.end()), block_.missed.end());
+    if (block_.missed.size() > kMostMissed / 2) block_.anew = true, block_.missed.clear();
+  }
+
+  // Those of the sites that came before which are there still.
+  void list_missed(const std::vector<SiteList>& lists, std::vector<MissedSite>& out) const {
+    out.clear();
+    for (const uint32_t owner : block_.missed) {
+      const SiteList& list = lists[owner / kVoxels];
+      const auto voxel = static_cast<int32_t>(owner % kVoxels);
+      const Site* end = list.sites + list.count;
+      const Site* site = std::lower_bound(list.sites, end, voxel, [](const Site& s, int32_t v) { return s.voxel < v; });
+      if (site != end && site->voxel == voxel) out.push_back({site, list.at, owner});
+    }
   }
 
   void finish(const NearestOutput& result) {
@@ -130,8 +169,9 @@ class BlockUpdate {
         }
         if (gone != nullptr) orphans |= (gone[owner % kVoxels >> 6] >> (owner & 63) & 1) << row;
       }
-      orphans_[k] = orphans & block_.known[k] & ~search_[k];
-      search_[k] |= orphans_[k];
+      orphans &= block_.known[k] & ~search_[k];
+      orphans_[k] |= orphans;
+      search_[k] |= orphans;
     }
   }
 };
@@ -170,44 +210,53 @@ void Esdf::compute(Context& context, std::vector<int32_t>& rows, const Deadline&
   context.pool.parallel_for(rows.size(), kAtOnce, [&](std::size_t begin, std::size_t end, int thread) {
     Worker& worker = workers[thread];
     for (std::size_t i = begin; i < end; ++i) {
-      // However late it is, something is done, or what is left over would never end.
-      if (i >= kAtOnce && milliseconds(start) >= left) return;
       FieldBlock& block = *blocks_[rows[i]];
       const Quarter& quarter = quarters_[quarter_of_[rows[i]]];
+      const bool anew = block.anew = block.anew || !block.voxels;
+      // However late it is, something is done, or what is left over would never end.
+      const double rest = put_off_ms_ * static_cast<double>(rows.size() - i) / static_cast<double>(workers.size());
+      const auto begun = Clock::now();
+      const bool late = i >= kAtOnce && milliseconds(start) + rest >= left;
+      if (late && anew) {
+        ++block.waits;
+        continue;
+      }
       BlockUpdate update(slots_, touched_, block);
-      const bool anew = block.stale;
       update.plan();
-      NearestInput in = update.input();
       const Vec3f middle = middle_in(block, quarter);
       const Vec3f shift = Vec3f::all(0.5f * (kSide - 1)) - middle;
       worker.arrived.clear(0), worker.all.clear(0);
       if (!anew)
         worker.search.list(context, quarter.arrived, middle.v, kBlockReach, block.farthest, shift.v, worker.arrived);
-      if (update.searches())
-        worker.search.list(context, quarter.all, middle.v, kBlockReach, max_distance_, shift.v, worker.all);
-      in.all = worker.all.columns(), in.all_numbers = worker.all.numbers();
-      in.arrived = worker.arrived.columns(), in.arrived_numbers = worker.arrived.numbers();
-      in.groups = groups_.data(), in.arrivals = arrivals_.data(), in.slots = lists_.data();
-      in.voxel = tsdf_.voxel, in.max_distance = max_distance_;
-      in.slack = slack_;
-      in.farthest = anew ? max_distance_ : block.farthest;
+      if (late) {
+        update.put_off(worker.arrived, arrivals_);
+        ++worker.put_off, worker.put_off_ms += milliseconds(begun);
+        continue;
+      }
       done[i] = 1;
-      if (!anew && worker.arrived.count() == 0 && !update.works()) {
+      update.list_missed(lists_, worker.missed);
+      if (!anew && worker.arrived.count() == 0 && worker.missed.empty() && !update.works()) {
         update.finish();
         continue;
       }
+      if (update.searches())
+        worker.search.list(context, quarter.all, middle.v, kBlockReach, max_distance_, shift.v, worker.all);
+      NearestInput in = update.input();
+      in.all = worker.all.columns(), in.all_numbers = worker.all.numbers();
+      in.arrived = worker.arrived.columns(), in.arrived_numbers = worker.arrived.numbers();
+      in.missed = worker.missed.data(), in.missed_count = static_cast<int32_t>(worker.missed.size());
+      in.groups = groups_.data(), in.arrivals = arrivals_.data(), in.slots = lists_.data();
+      in.voxel = tsdf_.voxel, in.max_distance = max_distance_, in.slack = slack_;
       const NearestOutput result = kernel(in, *block.voxels);
       update.finish(result);
       worker.blocks += result.computed > 0 || anew, worker.voxels += result.computed;
     }
   });
-  left_ = 0;
-  for (std::size_t i = 0; i < rows.size(); ++i) {
-    if (done[i]) continue;
-    blocks_[rows[i]]->stale = true;
-    ++blocks_[rows[i]]->waits;
-    ++left_;
-  }
+  left_ = static_cast<int64_t>(std::count(done.begin(), done.end(), 0));
+  int64_t put_off = 0;
+  double put_off_ms = 0;
+  for (const Worker& worker : workers) put_off += worker.put_off, put_off_ms += worker.put_off_ms;
+  if (put_off > 0) put_off_ms_ = put_off_ms / static_cast<double>(put_off);
   for (const Worker& worker : workers) stats.recomputed_blocks += worker.blocks, stats.computed_voxels += worker.voxels;
   stats.transform_ms = milliseconds(start);
 }
@@ -245,7 +294,7 @@ FieldStats Esdf::update(Context& context, const Deadline& deadline) {
 }
 
 FieldStats Esdf::recompute(Context& context) {
-  for (const auto& block : blocks_) block->stale = true;
+  for (const auto& block : blocks_) block->anew = true;
   FieldStats stats{};
   std::vector<int32_t> rows = select(context);
   compute(context, rows, {0, nullptr}, stats);

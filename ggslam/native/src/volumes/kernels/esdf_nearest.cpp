@@ -134,13 +134,15 @@ class NearSites {
   const Holder& site(int i) const { return sites_[i]; }
   const float* column(int c) const { return columns_.data() + c * room_; }
 
-  void add(const SiteGroup& group, int32_t s, const int shift[3]) {
+  void add(const Site* site, uint32_t owner, const int shift[3]) {
     const std::size_t i = sites_.size();
     if (i + kLanes >= room_) grow();
-    for (int c = 0; c < kSiteColumns; ++c)
-      columns_[c * room_ + i] = group.columns[c * group.stride + s] + (c < 3 ? static_cast<float>(shift[c]) : 0.0f);
-    sites_.push_back({group.sites + s, group.first + static_cast<uint32_t>(group.sites[s].voxel),
-                      {shift[0], shift[1], shift[2]}});
+    for (int a = 0; a < 3; ++a) {
+      columns_[a * room_ + i] = site->at[a] + static_cast<float>(shift[a]);
+      columns_[(3 + a) * room_ + i] = site->normal[a];
+    }
+    columns_[6 * room_ + i] = site->radius;
+    sites_.push_back({site, owner, {shift[0], shift[1], shift[2]}});
   }
 
  private:
@@ -164,6 +166,7 @@ struct SearchMemory {
   std::vector<int32_t> found;
   NearGroups all;                // of the part at work
   NearSites arrived;             // of the part, too
+  NearSites missed;              // of the block
   std::vector<Holder> holders;   // of the packet at work: all that were the nearest one at some time
   std::vector<Holder> recent;    // of the last packet that searched
 };
@@ -172,14 +175,19 @@ class BlockSearch {
  public:
   BlockSearch(const NearestInput& in, FieldVoxels& out, SearchMemory& memory)
       : in_(in), out_(out), scratch_(memory.scratch), found_(memory.found), all_(memory.all), arrived_(memory.arrived),
-        holders_(memory.holders), recent_(memory.recent) {
+        missed_(memory.missed), holders_(memory.holders), recent_(memory.recent) {
     for (int lane = 0; lane < kLanes; ++lane) {
       offset_[0][lane] = static_cast<float>(lane % kWide);
       offset_[1][lane] = static_cast<float>(lane / kWide % kHigh);
       offset_[2][lane] = static_cast<float>(lane / (kWide * kHigh));
     }
     scratch_.resize(in.all.count + kLanes), found_.resize(in.all.count);
-    recent_.clear();
+    recent_.clear(), missed_.clear();
+    for (int32_t i = 0; i < in.missed_count; ++i) {
+      int shift[3];
+      shift_of(in.missed[i].at, shift);
+      missed_.add(in.missed[i].site, in.missed[i].owner, shift);
+    }
   }
 
   NearestOutput run() {
@@ -200,7 +208,7 @@ class BlockSearch {
   std::vector<float>& scratch_;
   std::vector<int32_t>& found_;
   NearGroups& all_;
-  NearSites& arrived_;
+  NearSites &arrived_, &missed_;
 
   // Of the packet at work.
   Float offset_[3], place_[3];      // of the lanes, from its first voxel; from the block's
@@ -235,7 +243,7 @@ class BlockSearch {
     if (!any_in_part(in_.known, x, y, z)) return;
     const bool searches = any_in_part(in_.search, x, y, z);
     arrived_.clear(), all_.clear();
-    if (in_.arrived.count > 0) list_arrived(x, y, z);
+    if (in_.arrived.count > 0 || !missed_.empty()) list_arrived(x, y, z);
     if (!searches && arrived_.empty() && !any_in_part(in_.redo, x, y, z)) return;
     const float half = 0.5f * (kPart - 1), middle[3] = {x + half, y + half, z + half};
     if (searches) {
@@ -276,16 +284,36 @@ class BlockSearch {
       for (uint32_t left = near_nodes(reach, in_.arrived.column, in_.arrived.count, i); left != 0; left &= left - 1) {
         const SiteGroup& group = in_.arrivals[in_.arrived_numbers[i + __builtin_ctz(left)]];
         int shift[3];
-        shift_of(group, shift);
+        shift_of(group.at, shift);
         for (int32_t s = 0; s < group.count; s += kLanes)
           for (uint32_t sites = near_sites(reach, group, shift, s); sites != 0; sites &= sites - 1)
-            arrived_.add(group, s + __builtin_ctz(sites), shift);
+            add_arrived(group, s + __builtin_ctz(sites), shift);
+      }
+    for (int i = 0; i < missed_.count(); i += kLanes)
+      for (uint32_t left = near_sites(reach, missed_, i); left != 0; left &= left - 1) {
+        const Holder& holder = missed_.site(i + __builtin_ctz(left));
+        arrived_.add(holder.site, holder.owner, holder.shift);
       }
   }
 
-  void shift_of(const SiteGroup& group, int shift[3]) const {
-    shift[0] = kSide * (group.at.x - in_.at.x), shift[1] = kSide * (group.at.y - in_.at.y);
-    shift[2] = kSide * (group.at.z - in_.at.z);
+  void add_arrived(const SiteGroup& group, int32_t s, const int shift[3]) {
+    arrived_.add(group.sites + s, group.first + static_cast<uint32_t>(group.sites[s].voxel), shift);
+  }
+
+  // Of kLanes sites of a list from `i` on.
+  uint32_t near_sites(const Reach& reach, const NearSites& sites, int i) const {
+    Float from[3], normal[3];
+    for (int a = 0; a < 3; ++a) {
+      from[a] = reach.middle[a] - load(sites.column(a) + i);
+      normal[a] = load(sites.column(3 + a) + i);
+    }
+    const Float radius = load(sites.column(6) + i) + in_.slack;
+    const uint32_t near = bits(may_be_nearer(reach, from, normal, radius, broadcast(in_.slack)));
+    return sites.count() - i < kLanes ? near & ((1u << (sites.count() - i)) - 1) : near;
+  }
+
+  void shift_of(BlockCoordinates at, int shift[3]) const {
+    shift[0] = kSide * (at.x - in_.at.x), shift[1] = kSide * (at.y - in_.at.y), shift[2] = kSide * (at.z - in_.at.z);
   }
 
   // Of kLanes sites of a group from `s` on.
@@ -356,20 +384,11 @@ class BlockSearch {
 
   // Offers those that came or moved and may be nearer to some lanes than what they have.
   void offer_arrived() {
-    for (int i = 0; i < arrived_.count(); i += kLanes) {
-      Float from[3], normal[3];
-      for (int a = 0; a < 3; ++a) {
-        from[a] = reach_.middle[a] - load(arrived_.column(a) + i);
-        normal[a] = load(arrived_.column(3 + a) + i);
-      }
-      const Float radius = load(arrived_.column(6) + i) + in_.slack;
-      uint32_t left = bits(may_be_nearer(reach_, from, normal, radius, broadcast(in_.slack)));
-      if (arrived_.count() - i < kLanes) left &= (1u << (arrived_.count() - i)) - 1;
-      for (; left != 0; left &= left - 1) {
+    for (int i = 0; i < arrived_.count(); i += kLanes)
+      for (uint32_t left = near_sites(reach_, arrived_, i); left != 0; left &= left - 1) {
         const Holder& holder = arrived_.site(i + __builtin_ctz(left));
         offer(*holder.site, holder.owner, holder.shift);
       }
-    }
   }
 
   // Offers the groups that may be nearer to some of the lanes than what they have, until they have something as near as
@@ -450,8 +469,8 @@ class BlockSearch {
                                           [](const Site& s, int32_t voxel) { return s.voxel < voxel; });
       // Of those that went nothing is left; those that moved may be nearest still.
       if (site == list.sites + list.count || site->voxel != static_cast<int32_t>(owner % kVoxels)) continue;
-      const int shift[3] = {kSide * (list.at.x - in_.at.x), kSide * (list.at.y - in_.at.y),
-                            kSide * (list.at.z - in_.at.z)};
+      int shift[3];
+      shift_of(list.at, shift);
       offer(*site, owner, shift);
     }
   }
@@ -469,7 +488,7 @@ class BlockSearch {
   // The sites of a group that may be nearer to some of the lanes that ask.
   void offer(const SiteGroup& group) {
     int shift[3];
-    shift_of(group, shift);
+    shift_of(group.at, shift);
     bool moved = false;
     for (int32_t s = 0; s < group.count; s += kLanes)
       for (uint32_t left = near_sites(reach_, group, shift, s); left != 0; left &= left - 1) {
