@@ -11,6 +11,7 @@ All parts use the recordings' true poses. Parts:
     mesh      mesh and depth rendering of both maps: time, distance to the back-projected depth of all frames (true
               where the recording's depth and poses are exact), rendered depth against measured depth
     esdf      the distance field, updated every 5 frames, against computing it anew, against `edt` and scipy
+    pace      TSDF and distance field after every frame, without and with a limit
     accuracy  the distance field of scenes whose distances are known, against `edt` and scipy; needs no recording
 Open3D and edt come with `pip install 'ggslam[bench]'`; without them ours is printed alone. Occupancy has a benchmark of
 its own, bench_occupancy.py.
@@ -30,13 +31,14 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 if "--peers" in sys.argv[:-1]:  # behind our own packages, before anything looks for Open3D
     sys.path.append(sys.argv[sys.argv.index("--peers") + 1])
 
-from volume_esdf_runs import accuracy_part, esdf_part
+from volume_esdf_runs import accuracy_part, esdf_part, pace_part
 from volume_mesh_runs import compare_meshes
 from volume_runs import compare_fusion
 
 PARTS: dict[str, Callable[[Path, argparse.Namespace], None]] = {
     "tsdf": compare_fusion, "mesh": compare_meshes,
     "esdf": lambda path, arguments: esdf_part(path, tuple(arguments.esdf_voxels), frames=arguments.frames),
+    "pace": lambda path, arguments: pace_part(path, frames=arguments.frames),
 }  # fmt: skip
 
 

@@ -118,6 +118,37 @@ def esdf_part(
         print_last(field)
 
 
+def pace_part(
+    recording: Path, voxels: tuple[float, ...] = (0.04, 0.02), budgets: tuple[float | None, ...] = (None, 33.0),
+    frames: int | None = None, threads: int | None = None,
+) -> None:  # fmt: skip
+    """Prints how long TSDF and field take with every frame, without and with a limit."""
+    print(f"TSDF and distance field after every frame, {recording.name}")
+    sequence = open_sequence(recording, stop=frames)
+    for voxel in voxels:
+        for budget in budgets:
+            tsdf = TsdfMap(TsdfSettings(voxel=voxel), NativeContext(threads), points=True)
+            field, rows = DistanceField(tsdf), []
+            for index in range(len(sequence)):
+                frame = sequence.frame(index, masks=False)
+                if frame.T_world_camera is None:
+                    continue
+                start = time.perf_counter()
+                tsdf.integrate(frame.depth, sequence.camera, frame.T_world_camera, frame.color)
+                spent = 1e3 * (time.perf_counter() - start)
+                left = None if budget is None else max(0.1, budget - spent)
+                stats = field.update(left, frame.T_world_camera[:3, 3])
+                rows.append((spent, 1e3 * (time.perf_counter() - start) - spent, stats.stale_blocks / stats.blocks))
+            fusion, update, stale = np.array(rows).T
+            whole, limit = fusion + update, "no limit" if budget is None else f"{budget:g} ms"
+            print(
+                f"  {100 * voxel:.0f} cm, {limit}: fusion {fusion.mean():.1f} ms, field {update.mean():.1f}, both "
+                f"{whole.mean():.1f}, 95 % {np.percentile(whole, 95):.1f}, largest {whole.max():.1f}; "
+                f"{100 * stale.mean():.0f} % of the blocks wait",
+                flush=True,
+            )
+
+
 def print_updates(voxel: float, updates: list[UpdateStats], anew: list[float]) -> None:
     """Medians over the second half of the recording, when most of the scene is mapped."""
     half = len(anew) // 2
