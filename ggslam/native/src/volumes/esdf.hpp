@@ -84,10 +84,20 @@ class NearSearch {
 };
 
 // Blocks that lie beside each other, and the groups that may matter to them.
-struct Quarter {
+struct Region {
   BlockCoordinates at;  // of its first block
   NodeTable all, arrived;  // from the first voxel of its first block
   float farthest = 0;
+};
+
+// What a thread keeps from one block to the next.
+struct FieldWorker {
+  NearSearch search;
+  NodeTable all, arrived;
+  std::vector<MissedSite> missed;
+  int64_t blocks = 0, voxels = 0;  // that it computed
+  int64_t put_off = 0;             // blocks
+  double put_off_ms = 0;
 };
 
 // How long an update may take, and where it begins.
@@ -124,9 +134,10 @@ class Esdf {
   void list_groups();
   void divide(Context& context);
   std::vector<int32_t> select(Context& context);
-  bool concerns(Context& context, const FieldBlock& block, const Quarter& quarter, NearSearch& search) const;
+  bool concerns(Context& context, const FieldBlock& block, const Region& region, NearSearch& search) const;
   // esdf_update.cpp
   void sort(std::vector<int32_t>& rows, const Deadline& deadline) const;
+  void bring_up(Context& context, int32_t row, bool late, FieldWorker& worker);
   void compute(Context& context, std::vector<int32_t>& rows, const Deadline& deadline, FieldStats& stats);
   void forget_changes();
 
@@ -147,12 +158,12 @@ class Esdf {
   NodeTable group_nodes_, arrival_nodes_;
   std::vector<SiteList> lists_;   // by slot
   std::vector<uint8_t> touched_;  // by slot
-  std::vector<Quarter> quarters_;
-  std::vector<int32_t> quarter_of_;  // by row
+  std::vector<Region> regions_;
+  std::vector<int32_t> region_of_;  // by row
 };
 
-// The middle of a block, from the first voxel of its quarter. esdf_select.cpp
-Vec3f middle_in(const FieldBlock& block, const Quarter& quarter);
+// The middle of a block, from the first voxel of its region. esdf_select.cpp
+Vec3f middle_in(const FieldBlock& block, const Region& region);
 // Sorts sites into leaves of a few; `slack` widens their nodes. esdf_leaves.cpp
 void make_leaves(const std::vector<Site>& sites, std::ptrdiff_t most, float slack, SiteLeaves& out);
 

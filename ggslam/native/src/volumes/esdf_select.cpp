@@ -13,36 +13,36 @@ GGSLAM_DECLARE_KERNEL(int esdf_near(const ggslam::volumes::NodeColumns& nodes, c
 namespace ggslam::volumes {
 namespace {
 
-constexpr int kQuarter = 4;  // blocks along an edge
-constexpr float kQuarterMiddle = 0.5f * (kQuarter * kSide - 1), kQuarterReach = 1.7321f * kQuarterMiddle;
+constexpr int kRegion = 4;  // blocks along an edge
+constexpr float kRegionMiddle = 0.5f * (kRegion * kSide - 1), kRegionReach = 1.7321f * kRegionMiddle;
 
-BlockCoordinates quarter_at(BlockCoordinates at) {
+BlockCoordinates region_at(BlockCoordinates at) {
   return {at.x >> 2, at.y >> 2, at.z >> 2};
 }
 
 bool same_words(const uint64_t* a, const uint64_t* b) { return std::memcmp(a, b, kSide * sizeof *a) == 0; }
 
-// The groups that may matter to a quarter with no voxel farther from its site than `most`, from its first voxel.
-void list_near(Context& context, const NodeTable& nodes, const Quarter& quarter, float most, NodeTable& out) {
+// The groups that may matter to a region with no voxel farther from its site than `most`, from its first voxel.
+void list_near(Context& context, const NodeTable& nodes, const Region& region, float most, NodeTable& out) {
   std::vector<float> least(nodes.count() + 16);
   std::vector<int32_t> found(nodes.count());
   NodeColumns columns = nodes.columns();
-  columns.origin = quarter.at;
-  const float middle[3] = {kQuarterMiddle, kQuarterMiddle, kQuarterMiddle};
+  columns.origin = region.at;
+  const float middle[3] = {kRegionMiddle, kRegionMiddle, kRegionMiddle};
   const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_near);
-  const int n = kernel(columns, middle, kQuarterReach, most, least.data(), found.data());
+  const int n = kernel(columns, middle, kRegionReach, most, least.data(), found.data());
   out.clear(n);
   for (int i = 0; i < n; ++i) {
-    const Vec3f shift = cast<float>(kSide * (vector_of(nodes.at(found[i])) - vector_of(quarter.at)));
+    const Vec3f shift = cast<float>(kSide * (vector_of(nodes.at(found[i])) - vector_of(region.at)));
     out.add(nodes, found[i], shift.v);
   }
 }
 
 }  // namespace
 
-// The middle of a block, from the first voxel of its quarter.
-Vec3f middle_in(const FieldBlock& block, const Quarter& quarter) {
-  return cast<float>(kSide * (vector_of(block.at) - vector_of(quarter.at))) + Vec3f::all(0.5f * (kSide - 1));
+// The middle of a block, from the first voxel of its region.
+Vec3f middle_in(const FieldBlock& block, const Region& region) {
+  return cast<float>(kSide * (vector_of(block.at) - vector_of(region.at))) + Vec3f::all(0.5f * (kSide - 1));
 }
 
 // All sites in groups, and those that came or moved.
@@ -72,21 +72,21 @@ void Esdf::list_groups() {
   }
 }
 
-// Puts the blocks into quarters, with the groups that came near them.
+// Puts the blocks into regions, with the groups that came near them.
 void Esdf::divide(Context& context) {
   BlockTable places;
-  quarters_.clear();
-  quarter_of_.resize(blocks_.size());
+  regions_.clear();
+  region_of_.resize(blocks_.size());
   for (std::size_t row = 0; row < blocks_.size(); ++row) {
-    const BlockCoordinates at = quarter_at(blocks_[row]->at);
+    const BlockCoordinates at = region_at(blocks_[row]->at);
     const std::size_t q = places.insert(at);
-    if (q == quarters_.size()) quarters_.push_back({{at.x * kQuarter, at.y * kQuarter, at.z * kQuarter}, {}, {}, 0});
-    quarter_of_[row] = static_cast<int32_t>(q);
-    if (!blocks_[row]->anew) quarters_[q].farthest = std::max(quarters_[q].farthest, blocks_[row]->farthest);
+    if (q == regions_.size()) regions_.push_back({{at.x * kRegion, at.y * kRegion, at.z * kRegion}, {}, {}, 0});
+    region_of_[row] = static_cast<int32_t>(q);
+    if (!blocks_[row]->anew) regions_[q].farthest = std::max(regions_[q].farthest, blocks_[row]->farthest);
   }
-  context.pool.parallel_for(quarters_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
+  context.pool.parallel_for(regions_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t q = begin; q < end; ++q)
-      list_near(context, arrival_nodes_, quarters_[q], quarters_[q].farthest, quarters_[q].arrived);
+      list_near(context, arrival_nodes_, regions_[q], regions_[q].farthest, regions_[q].arrived);
   });
 }
 
@@ -104,15 +104,15 @@ void NearSearch::list(Context& context, const NodeTable& nodes, const float midd
 }
 
 // Whether something may be different in a block.
-bool Esdf::concerns(Context& context, const FieldBlock& block, const Quarter& quarter,
+bool Esdf::concerns(Context& context, const FieldBlock& block, const Region& region,
                     NearSearch& search) const {
   if (block.anew || block.waits > 0 || !same_words(block.known, block.done_known) || !same_words(block.negative, block.done_negative))
     return true;
   for (const uint32_t slot : block.owners)
     if (touched_[slot]) return true;
   float middle[3];
-  middle_in(block, quarter).to(middle);
-  return search.find(context, quarter.arrived, middle, kBlockReach, block.farthest) > 0;
+  middle_in(block, region).to(middle);
+  return search.find(context, region.arrived, middle, kBlockReach, block.farthest) > 0;
 }
 
 std::vector<int32_t> Esdf::select(Context& context) {
@@ -122,15 +122,15 @@ std::vector<int32_t> Esdf::select(Context& context) {
   context.pool.parallel_for(blocks_.size(), 64, [&](std::size_t begin, std::size_t end, int) {
     NearSearch search;
     for (std::size_t row = begin; row < end; ++row)
-      concerned[row] = concerns(context, *blocks_[row], quarters_[quarter_of_[row]], search);
+      concerned[row] = concerns(context, *blocks_[row], regions_[region_of_[row]], search);
   });
   std::vector<int32_t> rows;
-  std::vector<uint8_t> wanted(quarters_.size(), 0);
+  std::vector<uint8_t> wanted(regions_.size(), 0);
   for (std::size_t row = 0; row < blocks_.size(); ++row)
-    if (concerned[row]) rows.push_back(static_cast<int32_t>(row)), wanted[quarter_of_[row]] = 1;
-  context.pool.parallel_for(quarters_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
+    if (concerned[row]) rows.push_back(static_cast<int32_t>(row)), wanted[region_of_[row]] = 1;
+  context.pool.parallel_for(regions_.size(), 8, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t q = begin; q < end; ++q)
-      if (wanted[q]) list_near(context, group_nodes_, quarters_[q], max_distance_, quarters_[q].all);
+      if (wanted[q]) list_near(context, group_nodes_, regions_[q], max_distance_, regions_[q].all);
   });
   return rows;
 }

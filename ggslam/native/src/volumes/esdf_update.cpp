@@ -39,16 +39,6 @@ void each_bit(const uint64_t* words, const Do& f) {
     for (uint64_t left = words[k]; left != 0; left &= left - 1) f(kSide * kSide * k + __builtin_ctzll(left));
 }
 
-// What a thread keeps from one block to the next.
-struct Worker {
-  NearSearch search;
-  NodeTable all, arrived;
-  std::vector<MissedSite> missed;
-  int64_t blocks = 0, voxels = 0;
-  int64_t put_off = 0;
-  double put_off_ms = 0;
-};
-
 // Brings one block up to date.
 class BlockUpdate {
  public:
@@ -199,65 +189,69 @@ void Esdf::sort(std::vector<int32_t>& rows, const Deadline& deadline) const {
   for (std::size_t i = 0; i < rows.size(); ++i) rows[i] = order[i].second;
 }
 
+// Brings a block up to date, or puts it off.
+void Esdf::bring_up(Context& context, int32_t row, bool late, FieldWorker& worker) {
+  const auto begun = Clock::now();
+  FieldBlock& block = *blocks_[row];
+  const Region& region = regions_[region_of_[row]];
+  const bool anew = block.anew = block.anew || !block.voxels;
+  if (late && anew) {
+    ++block.waits;
+    return;
+  }
+  BlockUpdate update(slots_, touched_, block);
+  update.plan();
+  const Vec3f middle = middle_in(block, region);
+  const Vec3f shift = Vec3f::all(0.5f * (kSide - 1)) - middle;
+  worker.arrived.clear(0), worker.all.clear(0);
+  if (!anew)
+    worker.search.list(context, region.arrived, middle.v, kBlockReach, block.farthest, shift.v, worker.arrived);
+  if (late) {
+    update.put_off(worker.arrived, arrivals_);
+    ++worker.put_off, worker.put_off_ms += milliseconds(begun);
+    return;
+  }
+  update.list_missed(lists_, worker.missed);
+  if (!anew && worker.arrived.count() == 0 && worker.missed.empty() && !update.works()) {
+    update.finish();
+    return;
+  }
+  if (update.searches())
+    worker.search.list(context, region.all, middle.v, kBlockReach, max_distance_, shift.v, worker.all);
+  NearestInput in = update.input();
+  in.all = worker.all.columns(), in.all_numbers = worker.all.numbers();
+  in.arrived = worker.arrived.columns(), in.arrived_numbers = worker.arrived.numbers();
+  in.missed = worker.missed.data(), in.missed_count = static_cast<int32_t>(worker.missed.size());
+  in.groups = groups_.data(), in.arrivals = arrivals_.data(), in.slots = lists_.data();
+  in.voxel = tsdf_.voxel, in.max_distance = max_distance_, in.slack = slack_;
+  const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_nearest);
+  const NearestOutput result = kernel(in, *block.voxels);
+  update.finish(result);
+  worker.blocks += result.computed > 0 || anew, worker.voxels += result.computed;
+}
+
 void Esdf::compute(Context& context, std::vector<int32_t>& rows, const Deadline& deadline, FieldStats& stats) {
   const auto start = Clock::now();
   const double left = deadline.milliseconds > 0 ? deadline.milliseconds - stats.sites_ms - stats.select_ms
                                                 : std::numeric_limits<double>::infinity();
   sort(rows, deadline);
-  std::vector<Worker> workers(context.pool.size());
+  std::vector<FieldWorker> workers(context.pool.size());
   std::vector<uint8_t> done(rows.size(), 0);
-  const auto kernel = GGSLAM_DISPATCH(context.isa, esdf_nearest);
   context.pool.parallel_for(rows.size(), kAtOnce, [&](std::size_t begin, std::size_t end, int thread) {
-    Worker& worker = workers[thread];
     for (std::size_t i = begin; i < end; ++i) {
-      FieldBlock& block = *blocks_[rows[i]];
-      const Quarter& quarter = quarters_[quarter_of_[rows[i]]];
-      const bool anew = block.anew = block.anew || !block.voxels;
-      // However late it is, something is done, or what is left over would never end.
       const double rest = put_off_ms_ * static_cast<double>(rows.size() - i) / static_cast<double>(workers.size());
-      const auto begun = Clock::now();
+      // However late it is, something is done, or what is left over would never end.
       const bool late = i >= kAtOnce && milliseconds(start) + rest >= left;
-      if (late && anew) {
-        ++block.waits;
-        continue;
-      }
-      BlockUpdate update(slots_, touched_, block);
-      update.plan();
-      const Vec3f middle = middle_in(block, quarter);
-      const Vec3f shift = Vec3f::all(0.5f * (kSide - 1)) - middle;
-      worker.arrived.clear(0), worker.all.clear(0);
-      if (!anew)
-        worker.search.list(context, quarter.arrived, middle.v, kBlockReach, block.farthest, shift.v, worker.arrived);
-      if (late) {
-        update.put_off(worker.arrived, arrivals_);
-        ++worker.put_off, worker.put_off_ms += milliseconds(begun);
-        continue;
-      }
-      done[i] = 1;
-      update.list_missed(lists_, worker.missed);
-      if (!anew && worker.arrived.count() == 0 && worker.missed.empty() && !update.works()) {
-        update.finish();
-        continue;
-      }
-      if (update.searches())
-        worker.search.list(context, quarter.all, middle.v, kBlockReach, max_distance_, shift.v, worker.all);
-      NearestInput in = update.input();
-      in.all = worker.all.columns(), in.all_numbers = worker.all.numbers();
-      in.arrived = worker.arrived.columns(), in.arrived_numbers = worker.arrived.numbers();
-      in.missed = worker.missed.data(), in.missed_count = static_cast<int32_t>(worker.missed.size());
-      in.groups = groups_.data(), in.arrivals = arrivals_.data(), in.slots = lists_.data();
-      in.voxel = tsdf_.voxel, in.max_distance = max_distance_, in.slack = slack_;
-      const NearestOutput result = kernel(in, *block.voxels);
-      update.finish(result);
-      worker.blocks += result.computed > 0 || anew, worker.voxels += result.computed;
+      done[i] = !late;
+      bring_up(context, rows[i], late, workers[thread]);
     }
   });
   left_ = static_cast<int64_t>(std::count(done.begin(), done.end(), 0));
   int64_t put_off = 0;
   double put_off_ms = 0;
-  for (const Worker& worker : workers) put_off += worker.put_off, put_off_ms += worker.put_off_ms;
+  for (const FieldWorker& worker : workers) put_off += worker.put_off, put_off_ms += worker.put_off_ms;
   if (put_off > 0) put_off_ms_ = put_off_ms / static_cast<double>(put_off);
-  for (const Worker& worker : workers) stats.recomputed_blocks += worker.blocks, stats.computed_voxels += worker.voxels;
+  for (const FieldWorker& worker : workers) stats.recomputed_blocks += worker.blocks, stats.computed_voxels += worker.voxels;
   stats.transform_ms = milliseconds(start);
 }
 
