@@ -195,8 +195,8 @@ class DistanceField:
     def query(self, points: np.ndarray) -> FieldValues:
         """Distances and gradients at points [N, 3] in metres, interpolated between the voxels around.
 
-        A point is known if the voxel that it is in is. Where others of the eight voxels around it are not, they are
-        extrapolated from that one. Points that are not finite are not known.
+        The gradient is that of the interpolated distance over a voxel to each side. A point is known if the voxel that
+        it is in is. Where others around it are not, they are extrapolated from that one. Points that are not finite are not known.
         """
         where = np.ascontiguousarray(points, np.float64)
         if where.ndim != 2 or where.shape[1] != 3:

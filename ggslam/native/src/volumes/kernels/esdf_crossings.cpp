@@ -20,7 +20,7 @@ constexpr float kHalfRoot = 0.70710678f;
 constexpr float kRim[8][2] = {{1, 0}, {-1, 0}, {0, 1}, {0, -1}, {kHalfRoot, kHalfRoot}, {-kHalfRoot, kHalfRoot},
                               {kHalfRoot, -kHalfRoot}, {-kHalfRoot, -kHalfRoot}};
 // How far a rim may stand out of the surface, voxels: less is noise.
-constexpr float kMayStandOut = 0.2f;
+constexpr float kMayStandOut = 0.1f;
 constexpr float kRadiusSteps = 8;
 
 bool seen(int16_t value) { return value != kUnseen; }

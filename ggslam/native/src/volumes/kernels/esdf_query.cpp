@@ -25,25 +25,35 @@ struct Reader {
   const FieldVoxels* block = nullptr;
   bool valid = false, stale = false;
 
+  // The distance of a voxel; NaN if it is not known.
+  float distance(int x, int y, int z) {
+    go_to({x >> 3, y >> 3, z >> 3});
+    return block == nullptr ? std::numeric_limits<float>::quiet_NaN() : block->distance[row_of(x, y, z)];
+  }
+
   bool read(const int v[3], Sample& out) {
-    const BlockCoordinates wanted{v[0] >> 3, v[1] >> 3, v[2] >> 3};
+    out.distance = distance(v[0], v[1], v[2]);
+    if (out.distance != out.distance) return false;
+    unpack(block->gradient[row_of(v[0], v[1], v[2])], out.gradient);
+    return true;
+  }
+
+ private:
+  static int row_of(int x, int y, int z) { return (x & 7) + (y & 7) * kSide + (z & 7) * kSide * kSide; }
+
+  void go_to(BlockCoordinates wanted) {
     if (!valid || wanted.x != at.x || wanted.y != at.y || wanted.z != at.z) {
       const int32_t row = block_row(in.table, wanted);
       block = row < 0 ? nullptr : in.voxels[row];
       stale = row >= 0 && in.stale[row];
       at = wanted, valid = true;
     }
-    if (block == nullptr) return false;
-    const int row = (v[0] & 7) + (v[1] & 7) * kSide + (v[2] & 7) * kSide * kSide;
-    out.distance = block->distance[row];
-    if (out.distance != out.distance) return false;
-    unpack(block->gradient[row], out.gradient);
-    return true;
   }
 };
 
-// At `place`, in voxels, centres at whole numbers. Corners that are unknown are extrapolated from `home`, the voxel
-// that the point is in.
+// At `place`, in voxels, centres at whole numbers. The gradient is that of the interpolated distance, from a voxel before to
+// a voxel behind along each axis: single discs stand out or back at edges, and turn what is measured from one of them.
+// Voxels that are unknown are extrapolated from `home`, the voxel that the point is in.
 void interpolate(Reader& reader, const double place[3], const int home[3], const Sample& centre, float voxel,
                  Sample& out) {
   int low[3];
@@ -52,23 +62,35 @@ void interpolate(Reader& reader, const double place[3], const int home[3], const
     const double below = std::floor(place[a]);
     low[a] = static_cast<int>(below), t[a] = static_cast<float>(place[a] - below);
   }
+  const auto distance_at = [&](int x, int y, int z) {
+    float distance = reader.distance(x, y, z);
+    if (distance != distance)
+      distance = centre.distance + voxel * (centre.gradient[0] * static_cast<float>(x - home[0]) +
+                                            centre.gradient[1] * static_cast<float>(y - home[1]) +
+                                            centre.gradient[2] * static_cast<float>(z - home[2]));
+    return distance;
+  };
+  // Those of the corners around the place (1 and 2 along each axis) and of their neighbours along the axes.
+  float near[4][4][4];
+  for (int k = 0; k < 4; ++k)
+    for (int j = 0; j < 4; ++j) {
+      const bool outside = k % 3 == 0, both = outside && j % 3 == 0;
+      if (both) continue;
+      const bool ends = !outside && j % 3 != 0;
+      for (int i = ends ? 0 : 1; i < (ends ? 4 : 3); ++i)
+        near[k][j][i] = distance_at(low[0] + i - 1, low[1] + j - 1, low[2] + k - 1);
+    }
   out = Sample{};
-  for (int corner = 0; corner < 8; ++corner) {
-    float weight = 1;
-    int v[3];
-    for (int a = 0; a < 3; ++a) {
-      const int up = corner >> a & 1;
-      v[a] = low[a] + up;
-      weight *= up ? t[a] : 1 - t[a];
-    }
-    Sample s;
-    if (!reader.read(v, s)) {
-      s = centre;
-      for (int a = 0; a < 3; ++a) s.distance += centre.gradient[a] * voxel * static_cast<float>(v[a] - home[a]);
-    }
-    out.distance += weight * s.distance;
-    for (int a = 0; a < 3; ++a) out.gradient[a] += weight * s.gradient[a];
-  }
+  for (int k = 1; k < 3; ++k)
+    for (int j = 1; j < 3; ++j)
+      for (int i = 1; i < 3; ++i) {
+        const float weight = (i == 2 ? t[0] : 1 - t[0]) * (j == 2 ? t[1] : 1 - t[1]) * (k == 2 ? t[2] : 1 - t[2]);
+        out.distance += weight * near[k][j][i];
+        out.gradient[0] += weight * (near[k][j][i + 1] - near[k][j][i - 1]);
+        out.gradient[1] += weight * (near[k][j + 1][i] - near[k][j - 1][i]);
+        out.gradient[2] += weight * (near[k + 1][j][i] - near[k - 1][j][i]);
+      }
+  for (int a = 0; a < 3; ++a) out.gradient[a] /= 2 * voxel;
 }
 
 }  // namespace
