@@ -196,7 +196,8 @@ class DistanceField:
         """Distances and gradients at points [N, 3] in metres, interpolated between the voxels around.
 
         The gradient is that of the interpolated distance over a voxel to each side. A point is known if the voxel that
-        it is in is. Where others around it are not, they are extrapolated from that one. Points that are not finite are not known.
+        it is in is. Where others around it are not, they are extrapolated from that one. Points that are not finite are
+        not known.
         """
         where = np.ascontiguousarray(points, np.float64)
         if where.ndim != 2 or where.shape[1] != 3:

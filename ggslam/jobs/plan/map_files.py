@@ -99,8 +99,8 @@ def open_plan_map(request: MapRequest) -> PlanMap:
         return open_store_map(path, request.robot, request.fly, request.cell, request.reach, request.settings.unknown,
                               request.start)  # fmt: skip
     said = (
-        "expected volumes (a folder with tsdf.npz, a run or grid store with `volumes`), an OctoMap (.bt, .ot) or a ROS "
-        "map (.yaml)"
+        "expected volumes (a folder with tsdf.npz, or a run or grid store with a folder called volumes), an OctoMap "
+        "(.bt, .ot) or a ROS map (.yaml)"
     )
     if path.is_dir():
         raise FormatError(f"{path}: {said}; `ggslam volumes` makes volumes of a run, a recording or a store")

@@ -248,7 +248,7 @@ def open_store_map(
     keys = cells.within(start - StoreMapTuning.floor_around_m, start + StoreMapTuning.floor_around_m, TSDF)
     keys = keys or [key for key in cells.store.cells() if TSDF in cells.store.cell(key).parts][:1]
     if not keys:
-        raise FormatError(f"{path}: has no volumes: `ggslam volumes {path} --esdf` makes them")
+        raise FormatError(f"{path}: has no volumes: `ggslam volumes {path}` makes them")
     voxel = _voxel_of(cells.arrays(keys[0], TSDF), volumes)
     T_floor_map = _floor_around(cells, source, start)
     name, cell = path.name, cell_of(voxel)

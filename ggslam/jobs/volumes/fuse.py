@@ -246,7 +246,7 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
 def _check_memory(request: VolumesRequest, config: Config) -> None:
     limited = config.memory_limit_mb or config.volumes.budget_mb
     if limited and (request.onto is not None or request.device is not None):
-        raise ConfigError("`memory_limit_mb` and `volumes.budget_mb` go neither with `onto` nor with `device`")
+        raise ConfigError("memory_limit_mb and volumes.budget_mb go neither with `onto` nor with `device`")
 
 
 def _check_mesh(path: Path, source: Path) -> None:
