@@ -53,7 +53,7 @@ class OccupancySettings(OccupancyTuning):
             )
 
         if self.most_hits > 1 and not self.quantize:
-            raise Conflict("most_hits", f"needs `quantize`, found {self.most_hits} without it")
+            raise Conflict("most_hits", f"needs quantize, found {self.most_hits} without it")
 
     @classmethod
     def with_raised_odds(cls) -> OccupancySettings:
