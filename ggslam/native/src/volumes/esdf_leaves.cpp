@@ -141,7 +141,7 @@ void NodeTable::add(const NodeTable& from, int i, const float shift[3]) {
 NodeColumns NodeTable::columns() const {
   NodeColumns out{};
   for (int a = 0; a < 3; ++a) out.at[a] = at_.empty() ? nullptr : at_.data() + a * room_;
-  for (int c = 0; c < NodeColumns::kColumns; ++c) out.column[c] = values_.data() + c * room_;
+  out.first = values_.data(), out.stride = room_;
   out.count = count();
   return out;
 }

@@ -57,13 +57,16 @@ struct SiteGroup {
   uint32_t first;        // its voxel 0 among owners
 };
 
-// Nodes as arrays, from the centre of the first voxel of one block, or each of its own; `column[c]` has room for a full vector behind `count`.
+// Nodes as columns, from the centre of the first voxel of one block, or each of its own; with room for a full vector behind
+// them.
 struct NodeColumns {
   static constexpr int kColumns = 11;  // as Node
-  const float* column[kColumns];
+  const float* first;
+  std::size_t stride;
   int count;
   const int32_t* at[3];  // blocks of the nodes, if their places are counted from those
   BlockCoordinates origin;  // then: of the block from whose first voxel places in question are counted
+  const float* column(int c) const { return first + c * stride; }
 };
 
 // Whose distance a voxel has: voxel of a block's slot, 512 slot + row.

@@ -93,11 +93,11 @@ static inline int nodes_near(const volumes::NodeColumns& nodes, const float midd
     for (int a = 0; a < 3; ++a) {
       Float place = broadcast(middle[a]);
       if (nodes.at[a] != nullptr) place += to_float((origin[a] - load_int(nodes.at[a] + i)) * volumes::kSide);
-      from[a] = place - load(nodes.column[a] + i);
-      normal[a] = load(nodes.column[3 + a] + i);
-      within[a] = place - load(nodes.column[8 + a] + i);
+      from[a] = place - load(nodes.column(a) + i);
+      normal[a] = load(nodes.column(3 + a) + i);
+      within[a] = place - load(nodes.column(8 + a) + i);
     }
-    const Float least = square_root(least_square(from, normal, load(nodes.column[6] + i), load(nodes.column[7] + i)));
+    const Float least = square_root(least_square(from, normal, load(nodes.column(6) + i), load(nodes.column(7) + i)));
     store(scratch + i, least);
     const Float there = within[0] * within[0] + within[1] * within[1] + within[2] * within[2];
     nearest = minimum(nearest, select(greater(broadcast(static_cast<float>(nodes.count - i)), lane_numbers()), there,

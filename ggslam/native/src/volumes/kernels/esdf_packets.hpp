@@ -81,6 +81,42 @@ Mask mask_of(uint32_t lanes) {
 #endif
 }
 
+// Those lanes of the packet at (x, y, z) whose bits are set.
+uint32_t lanes_of(const uint64_t* words, int x, int y, int z) {
+  uint32_t lanes = 0;
+  for (int k = 0; k < kDeep; ++k)
+    for (int j = 0; j < kHigh; ++j) {
+      const uint32_t wide = static_cast<uint32_t>(words[z + k] >> (x + kSide * (y + j))) & ((1u << kWide) - 1);
+      lanes |= wide << (kWide * (j + kHigh * k));
+    }
+  return lanes;
+}
+
+constexpr int kHere[3] = {0, 0, 0};
+constexpr float kNoReach = -3e38f;  // Reach.most where there is nothing
+
+// Discs as columns: middle, normal, radius, and of nodes half the thickness; with room for a full vector behind them.
+struct Discs {
+  const float* first;
+  std::size_t stride;
+  int32_t count;
+  const float* column(int c) const { return first + c * stride; }
+};
+
+Discs discs_of(const SiteGroup& group) { return {group.columns, group.stride, group.count}; }
+
+// Which of kLanes discs from `i` on, wider by `slack`, may be nearer to one of some voxels than what that has; places of
+// discs are from `shift`.
+uint32_t may_be_nearer(const Reach& reach, const Discs& discs, const int shift[3], float slack, Float half, int i) {
+  Float from[3], normal[3];
+  for (int a = 0; a < 3; ++a) {
+    from[a] = (reach.middle[a] - static_cast<float>(shift[a])) - load(discs.column(a) + i);
+    normal[a] = load(discs.column(3 + a) + i);
+  }
+  const uint32_t near = bits(may_be_nearer(reach, from, normal, load(discs.column(6) + i) + slack, half));
+  return discs.count - i < kLanes ? near & ((1u << (discs.count - i)) - 1) : near;
+}
+
 // From the middles of discs to the lanes, and how far those are from the discs.
 struct Gap {
   Float from[3], height, aside;  // along the normal; beside it, from the middle
@@ -98,7 +134,7 @@ class NearGroups {
   bool empty() const { return count_ == 0; }
   int count() const { return count_; }
   int32_t number(int i) const { return numbers_[i]; }
-  const float* column(int c) const { return columns_.data() + c * room_; }
+  Discs discs() const { return {columns_.data(), room_, count_}; }
 
   void reserve(int count) {
     room_ = static_cast<std::size_t>(count + kLanes);
@@ -108,7 +144,7 @@ class NearGroups {
   }
 
   void add(const NodeColumns& from, const int32_t* numbers, int i) {
-    for (int c = 0; c < kColumns; ++c) columns_[c * room_ + count_] = from.column[c][i];
+    for (int c = 0; c < kColumns; ++c) columns_[c * room_ + count_] = from.column(c)[i];
     numbers_[count_++] = numbers[i];
   }
 
@@ -127,7 +163,7 @@ class NearSites {
   bool empty() const { return sites_.empty(); }
   int count() const { return static_cast<int>(sites_.size()); }
   const Holder& site(int i) const { return sites_[i]; }
-  const float* column(int c) const { return columns_.data() + c * room_; }
+  Discs discs() const { return {columns_.data(), room_, count()}; }
 
   void add(const Site* site, uint32_t owner, const int shift[3]) {
     const std::size_t i = sites_.size();
