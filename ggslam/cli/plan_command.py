@@ -76,14 +76,12 @@ def plan(
     out: Out = None,
 ) -> None:
     """Plan a path through a map: short, wide where it can be, smooth; or tell why there is none (exit code 3)."""
-    from ggslam.driving.robot import parse_robot
     from ggslam.jobs.plan.plan_path import PICTURE, RECORD, plan_path
 
     _check_place("--from", start)
     _check_place("--to", goal)
-    size = None if robot is None else parse_robot(robot)
     found = plan_path(
-        path, start, goal, robot=size, fly=fly, clearance=clearance, unknown=unknown, margin=margin, weight=weight,
+        path, start, goal, robot=robot, fly=fly, clearance=clearance, unknown=unknown, margin=margin, weight=weight,
         frame=frame.value, out=out,
     )  # fmt: skip
     _print(found)
