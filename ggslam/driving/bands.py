@@ -106,7 +106,7 @@ class HeightLayers:
 
     def band(self, robot: Robot) -> BandMap:
         """What a robot meets, and where it would fall."""
-        found = self.between(*robot.band)
+        found = self._between(*robot.band, self._floor_seen)
         drops = self.drops(robot.step)
         if not drops.any():
             return found
@@ -131,12 +131,15 @@ class HeightLayers:
         Raises:
             InputError: the lower one is not the first.
         """
+        return self._between(low, high, False)
+
+    def _between(self, low: float, high: float, on_floor: bool) -> BandMap:
         if not low <= high:
             raise InputError(f"expected two heights, the lower first, found {low} and {high}")
         low, high = max(low, min(self._reach[0], high)), min(high, max(self._reach[1], low))
         seen = self._see(low, high)
         known, behind = (seen & SEEN_BIT) > 0, (seen & BEHIND_BIT) > 0
-        near = self._surface.near_points(self.grid, low, high)
+        near = self._surface.near_points(self.grid, low, high, on_floor)
         sites = self._surface.sites(low, high)
         sited = self.grid.mark(sites)
         sites = self._outside(sites, unseen_surface(sited, near))
