@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from ggslam.cli.console import console
+from ggslam.errors import ConfigError
 from ggslam.system.plurals import quantity
 from ggslam.volumes.output_frame import OutputFrame
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from ggslam.driving.planner import PlannedPath
 
 NO_PATH_EXIT_CODE: Final = 3
+MOST_METRES: Final = 1e7
+"""Largest coordinate of a place."""
 EPILOG = """
 [bold]Examples[/]
 
@@ -73,12 +76,12 @@ def plan(
     out: Out = None,
 ) -> None:
     """Plan a path through a map: short, wide where it can be, smooth; or tell why there is none (exit code 3)."""
-    from ggslam.driving.robot import parse_robot
     from ggslam.jobs.plan.plan_path import PICTURE, RECORD, plan_path
 
-    size = None if robot is None else parse_robot(robot)
+    _check_place("--from", start)
+    _check_place("--to", goal)
     found = plan_path(
-        path, start, goal, robot=size, fly=fly, clearance=clearance, unknown=unknown, margin=margin, weight=weight,
+        path, start, goal, robot=robot, fly=fly, clearance=clearance, unknown=unknown, margin=margin, weight=weight,
         frame=frame.value, out=out,
     )  # fmt: skip
     _print(found)
@@ -86,6 +89,14 @@ def plan(
         console.print(f"wrote {RECORD} and {PICTURE} to {out}", highlight=False, markup=False)
     if not found.is_found:
         raise typer.Exit(NO_PATH_EXIT_CODE)
+
+
+def _check_place(option: str, place: tuple[float, float, float]) -> None:
+    if not all(abs(value) < MOST_METRES for value in place):
+        found = " ".join(f"{value:g}" for value in place)
+        raise ConfigError(
+            f"{option}: expected three numbers of metres within {MOST_METRES / 1e3:,.0f} km, found {found}"
+        )
 
 
 def _print(found: PlannedPath) -> None:

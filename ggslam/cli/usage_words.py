@@ -87,7 +87,8 @@ def _value_of(parameter: Any, words: list[str]) -> str | None:
     for place, word in enumerate(words):
         name, equals, value = word.partition("=")
         if name in parameter.opts:
-            return value if equals else words[place + 1] if place + 1 < len(words) else None
+            count = max(1, getattr(parameter, "nargs", 1))
+            return value if equals else " ".join(words[place + 1 : place + 1 + count]) or None
     return None
 
 
@@ -107,7 +108,8 @@ def _expectation(parameter: Any) -> str | None:
     if not whole and not number:
         return None
     low, high = getattr(source, "min", None), getattr(source, "max", None)
-    wanted = "expected a whole number" if whole else "expected a number"
+    count, kind = max(1, getattr(parameter, "nargs", 1)), "whole number" if whole else "number"
+    wanted = f"expected a {kind}" if count == 1 else f"expected {count} {kind}s"
     if low is not None and high is not None:
         return f"{wanted}, {low:g} to {high:g}"
     if low is not None:

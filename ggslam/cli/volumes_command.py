@@ -110,12 +110,17 @@ Poses = Annotated[
 ]
 Driving = Annotated[bool, typer.Option("--driving", help="Print how fast a robot may drive with these maps.")]
 Speeds = Annotated[str, typer.Option(help="With --driving: speeds to list, m/s.")]
-Friction = Annotated[float, typer.Option(help="With --driving: friction between wheels and ground.")]
-SensorMs = Annotated[float, typer.Option(help="With --driving: delay of the sensor, ms.")]
-PlanMs = Annotated[float, typer.Option(help="With --driving: time that the planner takes, ms.")]
-NetworkMs = Annotated[float, typer.Option(help="With --driving: time between machines, ms.")]
-FrameMs = Annotated[float, typer.Option(help="With --driving: time from one frame of the sensor to the next, ms.")]
-ControlMs = Annotated[float, typer.Option(help="With --driving: time between commands of the controller, ms.")]
+Friction = Annotated[float, typer.Option(min=0.01, max=2, help="With --driving: friction between wheels and ground.")]
+SensorMs = Annotated[float, typer.Option(min=0, max=60_000, help="With --driving: delay of the sensor, ms.")]
+PlanMs = Annotated[float, typer.Option(min=0, max=60_000, help="With --driving: time that the planner takes, ms.")]
+NetworkMs = Annotated[float, typer.Option(min=0, max=60_000, help="With --driving: time between machines, ms.")]
+FrameMs = Annotated[
+    float,
+    typer.Option(min=0, max=60_000, help="With --driving: time from one frame of the sensor to the next, ms."),
+]
+ControlMs = Annotated[
+    float, typer.Option(min=0, max=60_000, help="With --driving: time between commands of the controller, ms.")
+]
 Scale = Annotated[
     float | None, typer.Option(help="Resize the images by this factor; default: as the run did, or not at all.")
 ]
@@ -182,15 +187,17 @@ def volumes(
         realtime=realtime, onto=onto, slice_height=slice_height, band=_band(band), robots=tuple(robot or ()),
         inflation=inflation, body=tuple(body or ()), body_frame=body_frame, frame=frame.value, latency=driving,
         device=device, config=config, overwrite=overwrite,
-        overrides=_overrides(settings, min_weight=min_weight, budget_ms=budget_ms),
+        overrides=_overrides(settings, esdf, min_weight=min_weight, budget_ms=budget_ms),
     )  # fmt: skip
     if is_store(source):
         return _make_of_store(request, engine, workers, address)
-    return _make_and_show(request, _numbers("--speeds", speeds), braking, (engine, workers, address))
+    return _make_and_show(request, _speeds(speeds), braking, (engine, workers, address))
 
 
-def _overrides(settings: list[str] | None, **given: float | None) -> list[str]:
+def _overrides(settings: list[str] | None, esdf: bool, **given: float | None) -> list[str]:
     """The settings, and those of volumes that have options of their own."""
+    if given["budget_ms"] is not None and not esdf:
+        raise ConfigError("--budget-ms needs --esdf")
     return [*(settings or []), *(f"volumes.{name}={value}" for name, value in given.items() if value is not None)]
 
 
@@ -272,6 +279,13 @@ def _numbers(option: str, text: str) -> list[float]:
     return values
 
 
+def _speeds(text: str) -> list[float]:
+    values = _numbers("--speeds", text)
+    if min(values) < 0:
+        raise ConfigError(f'--speeds: expected numbers of 0 and more like "0.5,1,2", found {text!r}')
+    return values
+
+
 def _band(text: str) -> tuple[float, float]:
     values = _numbers("--band", text)
     if len(values) != 2 or values[0] >= values[1]:
@@ -287,8 +301,8 @@ def _print(outcome: VolumesOutcome) -> None:
     ]  # fmt: skip
     unit = f"{'an' if outcome.unit == 'instant' else 'a'} {outcome.unit}"
     console.print(table(f"ms {unit}", ["", "mean", "95 %", "largest", f"by {outcome.window} {outcome.unit}s"], rows))
-    for line in outcome.lines:
-        console.print(line, highlight=False, markup=False)
+    for line in outcome.lines:  # a command in them is copied whole
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     console.print(f"wrote {quantity(len(outcome.files), 'file')} to {outcome.out}", highlight=False, markup=False)
 
 

@@ -2,12 +2,13 @@
 """The band of heights that a robot passes through: where it meets obstacles, what is free, how far obstacles are.
 
 A volume's distances are three-dimensional: low above the floor they tell how near the floor is. What counts for a robot
-on the floor is how far it is, across the floor, to the nearest thing at its own heights.
+on the floor is how far it is, across the floor, to the nearest thing at its own heights. Stairs that lead down and
+holes have nothing at these heights: they are told by free space that was seen below the floor.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -45,13 +46,13 @@ class BandMap:
         heights: lowest and highest obstacle that counts, metres above the floor.
         occupied: bool [H, W], whether a cell has a surface in it: a surface point, or a measured point, between these
             heights lies in it or within half a cell (three quarters of a voxel, if
-            that is more) of its centre.
+            that is more) of its centre; or whether the floor falls away there, see `HeightLayers.drops`.
         known: bool [H, W], whether it was seen at one of the heights at least.
         behind: bool [H, W], whether it is behind a surface at one of them, at one that no point was measured near, or
             may have a measured point in it: not free, whatever is known.
-        distance: float32 [H, W], metres across the floor from a cell's centre to the nearest of the surface points;
-            inf if there is none.
-        points: float64 [P, 2], those points' x and y on the plane.
+        distance: float32 [H, W], metres across the floor from a cell's centre to the nearest of the surface points, or
+            cells where the floor falls away; inf if there is none.
+        points: float64 [P, 2], x and y on the plane of the surface points.
     """
 
     grid: CellGrid
@@ -87,14 +88,15 @@ class HeightLayers:
         field: up to date.
         plane: of the floor, its normal up.
         resolution: edge of a cell, metres.
+        floor_seen: whether the plane is a floor, and no guess: what is free below it is then no floor.
 
     Raises:
         InputError: a resolution that is not positive, or more than 50 million cells.
     """
 
-    def __init__(self, field: DistanceField, plane: SlicePlane, resolution: float) -> None:
+    def __init__(self, field: DistanceField, plane: SlicePlane, resolution: float, floor_seen: bool = True) -> None:
         self.grid = CellGrid.over(plane, resolution)
-        self._field = field
+        self._field, self._floor_seen = field, floor_seen
         self._surface = SeenSurface(field, self.grid.plane)
         self._layers: dict[int, np.ndarray] = {}
         edge = SIDE * field.voxel
@@ -103,8 +105,25 @@ class HeightLayers:
         self._reach = (heights.min() - edge, heights.max() + edge) if len(heights) else (0.0, 0.0)
 
     def band(self, robot: Robot) -> BandMap:
-        """What a robot meets."""
-        return self.between(*robot.band)
+        """What a robot meets, and where it would fall."""
+        found = self._between(*robot.band, self._floor_seen)
+        drops = self.drops(robot.step)
+        if not drops.any():
+            return found
+        distance = np.minimum(found.distance, self._distance(self.grid.outline(drops)))
+        distance[drops] = np.minimum(distance[drops], 0)
+        return replace(found, occupied=found.occupied | drops, distance=distance)
+
+    def drops(self, step: float) -> np.ndarray:
+        """Cells, bool [H, W], where the floor falls away by more than `step` metres: a view has seen free space so far
+        below the plane, and a voxel farther. Where nobody looked down, none is known. None at all if the plane is no
+        floor that was seen."""
+        if not self._floor_seen:
+            return np.zeros(self.grid.shape, bool)
+        # Half a voxel more: the voxel around a place that low reaches half its edge up.
+        layer = np.floor(-step / self._field.voxel - 0.5 + 1e-6) * self._field.voxel
+        seen = self._see(layer, layer)
+        return ((seen & SEEN_BIT) > 0) & ((seen & BEHIND_BIT) == 0)
 
     def between(self, low: float, high: float) -> BandMap:
         """What there is between two heights above the floor, metres; a robot that meets all of it.
@@ -112,12 +131,15 @@ class HeightLayers:
         Raises:
             InputError: the lower one is not the first.
         """
+        return self._between(low, high, False)
+
+    def _between(self, low: float, high: float, on_floor: bool) -> BandMap:
         if not low <= high:
             raise InputError(f"expected two heights, the lower first, found {low} and {high}")
         low, high = max(low, min(self._reach[0], high)), min(high, max(self._reach[1], low))
         seen = self._see(low, high)
         known, behind = (seen & SEEN_BIT) > 0, (seen & BEHIND_BIT) > 0
-        near = self._surface.near_points(self.grid, low, high)
+        near = self._surface.near_points(self.grid, low, high, on_floor)
         sites = self._surface.sites(low, high)
         sited = self.grid.mark(sites)
         sites = self._outside(sites, unseen_surface(sited, near))
@@ -181,7 +203,9 @@ def floor_plane(field: DistanceField, T_floor_map: np.ndarray) -> SlicePlane:
     return SlicePlane(plane.origin, plane.x_axis, plane.y_axis, (x0, y0), (x1, y1))
 
 
-def band_map(field: DistanceField, floor: SlicePlane | np.ndarray, robot: Robot, resolution: float) -> BandMap:
+def band_map(
+    field: DistanceField, floor: SlicePlane | np.ndarray, robot: Robot, resolution: float, floor_seen: bool = True
+) -> BandMap:
     """What a robot meets on a floor.
 
     Args:
@@ -189,9 +213,10 @@ def band_map(field: DistanceField, floor: SlicePlane | np.ndarray, robot: Robot,
         floor: its plane, the normal up, or T_floor_map [4, 4].
         robot: what drives.
         resolution: edge of a cell, metres.
+        floor_seen: whether it is a floor, and no guess, see `HeightLayers`.
 
     Raises:
         InputError: a resolution that is not positive, or more than 50 million cells.
     """
     plane = floor if isinstance(floor, SlicePlane) else floor_plane(field, floor)
-    return HeightLayers(field, plane, resolution).band(robot)
+    return HeightLayers(field, plane, resolution, floor_seen).band(robot)

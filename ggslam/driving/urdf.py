@@ -19,6 +19,7 @@ import numpy as np
 from ggslam.driving.body import BodyShape
 from ggslam.errors import FormatError
 from ggslam.scene.poses import inverse
+from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import read_untrusted
 
@@ -109,11 +110,15 @@ def _places(root: Element) -> dict[str, np.ndarray]:
     for joint in root.findall("joint"):
         name, kind = _name(joint), joint.get("type")
         if kind != "fixed":
-            _refuse(f"joint {name!r}: expected a fixed one, found {kind!r}: the body has to keep its shape")
+            _refuse(
+                f"joint {name!r}: expected a fixed one, found {kind!r}: leave out parts that move"
+            )
         parent, child = (_link_of(joint, which, links) for which in ("parent", "child"))
         if child in joints:
             _refuse(f"joint {name!r}: link {child!r} has two parents")
         joints[child] = parent, _origin(joint)
+    if not links:
+        _refuse("has no <link>; of a xacro file make a URDF first")
     tops = [name for name in links if name not in joints]
     if len(tops) != 1:
         _refuse(f"expected one link without a parent, found {len(tops)}: {', '.join(tops[:5])}")
@@ -186,5 +191,7 @@ def _numbers(element: Element, attribute: str, count: int, default: str | None =
     except ValueError:
         values = []
     if len(values) != count or not all(abs(value) <= UrdfTuning.max_m for value in values):
-        _refuse(f"<{element.tag}>: {attribute}: expected {count} numbers within {UrdfTuning.max_m:g}, found {text!r}")
+        found = "none" if text is None else repr(text)
+        _refuse(f"<{element.tag}>: {attribute}: expected {quantity(count, 'number')} within {UrdfTuning.max_m:g}, "
+                f"found {found}")  # fmt: skip
     return values

@@ -95,6 +95,15 @@ class CellGrid:
         inside = (column >= 0) & (column < self.shape[1]) & (from_bottom >= 0) & (from_bottom < self.shape[0])
         return self.shape[0] - 1 - from_bottom, column, inside
 
+    def outline(self, cells: np.ndarray) -> np.ndarray:
+        """Places [N, 2] on the plane along the edges of cells, bool [H, W], that have a neighbour which is none of
+        them: corners and middles of edges."""
+        around = np.pad(cells, 1, constant_values=False)
+        inner = np.logical_and.reduce([around[r : r + self.shape[0], c : c + self.shape[1]] for r in range(3)
+                                       for c in range(3)])  # fmt: skip
+        steps = (np.stack(np.meshgrid(*2 * [(-0.5, 0.0, 0.5)]), -1) * self.resolution).reshape(-1, 2)
+        return (self.centres()[cells & ~inner][:, None] + steps).reshape(-1, 2)
+
     def mark(self, places: np.ndarray, reach: Sequence[float] | np.ndarray = (0.0, 0.0)) -> np.ndarray:
         """Cells, bool [H, W], that rectangles around places [N, 2] on the plane overlap; they reach so far from these
         along x and y, metres."""

@@ -9,9 +9,19 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.cell_grid import CellGrid, SlicePlane
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.measured_points import measured_octants
+
+
+class SeenSurfaceTuning(Tuning):
+    """What counts as a floor's own points."""
+
+    floor_reach = 1.25
+    """Height of the middle of an eighth of a voxel above a floor up to which the floor may lie in it, in halves of its
+    height; more than 1 by what floors are found off."""
+
 
 _BESIDE = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
@@ -53,9 +63,14 @@ class SeenSurface:
         """The surface points between two heights: x and y, float64 [n, 2], metres."""
         return self._sites.between(low, high)
 
-    def near_points(self, grid: CellGrid, low: float, high: float) -> np.ndarray:
-        """Cells, bool [H, W], that may have a measured point in them between two heights: none of them is free."""
-        return grid.mark(self._octants.between(low - self._reach[2], high + self._reach[2]), self._reach[:2])
+    def near_points(self, grid: CellGrid, low: float, high: float, on_floor: bool = False) -> np.ndarray:
+        """Cells, bool [H, W], that may have a measured point in them between two heights: none of them is free.
+
+        `on_floor`: the plane is a floor. Eighths of voxels that it lies in are full of its own points; of coarse voxels
+        they reach up to the lower height and would leave no cell free."""
+        reach = self._reach[2]
+        lowest = max(low - reach, min(SeenSurfaceTuning.floor_reach * reach, low)) if on_floor else low - reach
+        return grid.mark(self._octants.between(lowest, high + reach), self._reach[:2])
 
     def with_points(self, grid: CellGrid, low: float, high: float) -> np.ndarray:
         """Cells, bool [H, W], that have one: the middle of an eighth lies in them, or any part of one of a thin

@@ -4,6 +4,7 @@ of ggslam: written from what map_server publishes of its files."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,17 +60,23 @@ def turned(
     return T
 
 
-def room_field(T_floor_map: np.ndarray, voxel: float = 0.04) -> DistanceField:
-    """The room as a volume in the map's frame; known up to the truncation behind its surfaces."""
+def room_field(
+    T_floor_map: np.ndarray,
+    voxel: float = 0.04,
+    distance_of: Callable[[np.ndarray], np.ndarray] = room_distance,
+    deepest: float = 0.0,
+) -> DistanceField:
+    """The room, or what `distance_of` says of points [N, 3] down to z = -`deepest`, as a volume in the map's frame;
+    known up to the truncation behind its surfaces."""
     tsdf = TsdfMap(TsdfSettings(voxel=voxel))
-    corners = np.array([[x, y, z] for x in (-0.2, 4.51) for y in (-0.2, 3.27) for z in (-0.2, 2.4)])
+    corners = np.array([[x, y, z] for x in (-0.2, 4.51) for y in (-0.2, 3.27) for z in (-0.2 - deepest, 2.4)])
     R, t = T_floor_map[:3, :3], T_floor_map[:3, 3]
     own, edge = (corners - t) @ R, SIDE * voxel
     ranges = [np.arange(np.floor(a), np.ceil(b)) for a, b in zip(own.min(0) / edge, own.max(0) / edge, strict=True)]
     blocks = np.stack(np.meshgrid(*ranges, indexing="ij"), -1).reshape(-1, 3).astype(np.int32)
     k, j, i = np.unravel_index(np.arange(VOXELS), (SIDE,) * 3)
     centres = (blocks[:, None] * SIDE + np.stack([i, j, k], -1)[None] + 0.5) * voxel
-    distance = room_distance(centres.reshape(-1, 3) @ R.T + t).reshape(len(blocks), VOXELS)
+    distance = distance_of(centres.reshape(-1, 3) @ R.T + t).reshape(len(blocks), VOXELS)
     limit = tsdf.settings.truncation
     value = np.rint(np.clip(distance / limit, -1, 1) * FREE_VALUE)
     free = (value == FREE_VALUE).all(1)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -223,3 +224,16 @@ def test_other_mistakes_are_told(tmp_path: Path) -> None:
     (tmp_path / "bare.urdf").write_text('<robot><link name="camera"/></robot>')
     with pytest.raises(FormatError, match="no link has"):
         read_urdf(tmp_path / "bare.urdf", "camera")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('<robot xmlns:xacro="x"><xacro:include filename="a"/></robot>', "has no <link>; of a xacro file make a URDF"),
+        (URDF.replace(' length="', ' long="'), "<cylinder>: length: expected 1 number within 1000, found none"),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path: Path, text: str, reason: str) -> None:
+    (tmp_path / "cart.urdf").write_text(text)
+    with pytest.raises(FormatError, match=re.escape(reason)):
+        read_urdf(tmp_path / "cart.urdf", "camera")

@@ -118,7 +118,7 @@ def test_cells_ahead_are_where_it_will_be() -> None:
 
 def test_the_static_map_is_free_where_it_passed_and_nothing_stays() -> None:
     seen, field, _ = film()
-    band = HeightLayers(field, PLANE, 0.05).band(Robot(0.6, 0.1, 0.1))
+    band = HeightLayers(field, PLANE, 0.05, floor_seen=False).band(Robot(0.6, 0.1, 0.1))
     layer = seen[-1][1]
     passed = np.zeros(GRID.shape, bool)
     for n in range(BEGINS + 6, LAST):

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "driving"))
 from plan_scenes import Y_DOWN, Column, Room, along, exact_clearance, room_tsdf  # noqa: E402
 
 from ggslam.driving.robot import Robot  # noqa: E402
-from ggslam.errors import FormatError  # noqa: E402
+from ggslam.errors import ConfigError, FormatError, InputError  # noqa: E402
 from ggslam.jobs.plan.plan_path import plan_path  # noqa: E402
 from ggslam.jobs.plan.ros_maps import read_ros_map  # noqa: E402
 from ggslam.jobs.plan.store_maps import StoreFloor, StoreSpace  # noqa: E402
@@ -233,3 +233,13 @@ def test_a_robot_under_a_table(tmp_path: Path) -> None:
     assert under.is_found and under.length == pytest.approx(2.8, abs=0.02)
     high = plan_path(tmp_path, *ends, robot=Robot(1.2, 0.2))
     assert not high.is_found and "no way" in str(high.reason)
+
+
+def test_a_robot_in_words_is_the_same(volumes: Path) -> None:
+    ends = in_map(START), in_map(GOAL)
+    told, made = (plan_path(volumes, *ends, robot=robot) for robot in ("0.7,0.23,0.1", Robot(0.7, 0.23, 0.1)))
+    assert told.asked == 0.23 and np.array_equal(told.points, made.points) and told.is_found
+    with pytest.raises(ConfigError, match="HEIGHT,RADIUS"):
+        plan_path(volumes, *ends, robot="0.7")
+    with pytest.raises(InputError, match="goal: expected three finite numbers of metres, found kitchen"):
+        plan_path(volumes, ends[0], "kitchen")  # type: ignore[arg-type]

@@ -20,7 +20,7 @@ Extent = tuple[tuple[float, float], tuple[float, float]]
 
 def band_cells(
     field: DistanceField, T_floor_map: np.ndarray, robot: Robot, cell: float, reach: float, unknown: bool,
-    extent: Extent | None = None,
+    extent: Extent | None = None, floor_seen: bool = True,
 ) -> tuple[tuple[float, float], np.ndarray]:  # fmt: skip
     """A robot's band.
 
@@ -32,13 +32,14 @@ def band_cells(
         reach: metres; what is farther from obstacles counts as this far.
         unknown: whether cells that nobody saw may be entered.
         extent: part of the floor; None: as far as the field's blocks reach.
+        floor_seen: whether it is a floor, and no guess: where it falls away is then an obstacle.
 
     Returns:
         Where the first cell begins on the floor (x, y), metres, and clearances float32 [Y, X].
     """
     plane = floor_plane(field, T_floor_map)
     plane = plane if extent is None else replace(plane, low=extent[0], high=extent[1])
-    band = band_map(field, plane, robot, cell)
+    band = band_map(field, plane, robot, cell, floor_seen)
     clearance = np.minimum(band.distance, np.float32(reach))
     if not unknown:
         clearance = np.where(band.free | band.occupied, clearance, np.float32(np.nan))

@@ -111,7 +111,7 @@ def _of_tsdf(path: Path, request: MapRequest) -> PlanMap:
     tsdf = load_tsdf(path)
     field = DistanceField(tsdf, FieldSettings(max_distance=max(2 * tsdf.settings.voxel, request.reach + 0.1)))
     field.update()
-    T_floor_map = _floor_beside(path)
+    T_floor_map, floor_seen = _floor_beside(path)
     if T_floor_map is None:
         T_floor_map = floor_of_field(field)
     if request.fly:
@@ -119,30 +119,32 @@ def _of_tsdf(path: Path, request: MapRequest) -> PlanMap:
         frame = field_frame(field.origin, field.voxel, step)
         return PlanMap(_name(path), 3, step * field.voxel, frame, FieldCells(field, step), T_floor_map)
     cell = request.cell(field.voxel)
-    low, clearance = band_cells(field, T_floor_map, request.robot, cell, request.reach, request.settings.unknown)
+    low, clearance = band_cells(field, T_floor_map, request.robot, cell, request.reach, request.settings.unknown,
+                                floor_seen=floor_seen)  # fmt: skip
     T_grid_map = translation(-np.array([*low, 0.0])) @ T_floor_map
     return PlanMap(_name(path), 2, cell, T_grid_map, WholeArray((0, 0, 0), clearance), T_floor_map)
 
 
-def _floor_beside(path: Path, of_files: bool = False) -> np.ndarray | None:
-    """T_floor_map [4, 4] as floor.yaml beside a file says, None: there is none. `of_files`: from the frame that meshes
-    and occupancy beside it are in."""
+def _floor_beside(path: Path, of_files: bool = False) -> tuple[np.ndarray | None, bool]:
+    """T_floor_map [4, 4] as floor.yaml beside a file says, None: there is none; and whether it is no guess. `of_files`:
+    from the frame that meshes and occupancy beside it are in."""
     file = path.parent / FLOOR_FILE
     if not file.is_file():
-        return None
+        return None, True
     values = read_yaml(file)
     numbers = values.get("T_floor_map")
     good = isinstance(numbers, list) and len(numbers) == 16 and all(isinstance(v, (int, float)) for v in numbers)
     if not good or not np.isfinite(np.array(numbers, float)).all():
         raise FormatError(f"{file}: T_floor_map: expected 16 finite numbers, found {str(numbers)[:80]}")
+    seen = values.get("floor_was_seen") is not False
     if of_files and values.get("files_are_in") == OutputFrame.floor.value:
-        return np.eye(4)
-    return np.array(numbers, float).reshape(4, 4)
+        return np.eye(4), seen
+    return np.array(numbers, float).reshape(4, 4), seen
 
 
 def _of_octomap(path: Path, request: MapRequest) -> PlanMap:
     occupancy = read_octomap(path)
-    T_floor_map = _floor_beside(path, of_files=True)
+    T_floor_map, _ = _floor_beside(path, of_files=True)
     if T_floor_map is None:  # z is up there
         T_floor_map = translation(-np.array([0.0, 0.0, request.start[2]]))
     reach, unknown = request.reach, request.settings.unknown

@@ -16,7 +16,7 @@ import numpy as np
 
 from ggslam.driving.plan_settings import PlanSettings
 from ggslam.driving.planner import PlannedPath, Planner
-from ggslam.driving.robot import Robot
+from ggslam.driving.robot import Robot, parse_robot
 from ggslam.errors import InputError
 from ggslam.jobs.plan.map_files import MapRequest, open_plan_map
 from ggslam.jobs.plan.pictures import path_picture
@@ -33,7 +33,7 @@ def plan_path(
     start: Sequence[float],
     goal: Sequence[float],
     *,
-    robot: Robot | None = None,
+    robot: Robot | str | None = None,
     fly: bool = False,
     clearance: float | None = None,
     unknown: bool = False,
@@ -48,7 +48,8 @@ def plan_path(
         path: folder of volumes, run or grid store with volumes, OctoMap (.bt, .ot) or ROS map (.yaml).
         start, goal: [3], metres. For a robot that drives heights do not count, but where a map does not tell where its
             floor is: there it is as high as the start.
-        robot: its size; None: 0.4 m high, 0.2 m in radius.
+        robot: its size, such as "0.4,0.2": height and radius in metres; a third number is the height that it can drive
+            over. None: 0.4 m high, 0.2 m in radius.
         fly: whether it flies.
         clearance: least distance from its middle to obstacles, metres; None: its radius, for one that flies that of the
             ball around it.
@@ -66,7 +67,8 @@ def plan_path(
     """
     if frame not in ("map", "floor"):
         raise InputError(f"frame: expected map or floor, found {frame!r}")
-    robot, settings = robot or Robot(), PlanSettings(margin=margin, weight=weight, unknown=unknown)
+    robot = parse_robot(robot) if isinstance(robot, str) else robot or Robot()
+    settings = PlanSettings(margin=margin, weight=weight, unknown=unknown)
     if clearance is None:
         clearance = math.hypot(robot.radius, robot.height / 2) if fly else robot.radius
     ends = np.array([_place("start", start), _place("goal", goal)])
@@ -106,7 +108,10 @@ def _record(planner: Planner, found: PlannedPath, ends: np.ndarray, frame: str, 
 
 
 def _place(name: str, values: Sequence[float]) -> np.ndarray:
-    point = np.asarray(values, np.float64)
+    try:
+        point = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        point = np.zeros(0)
     if point.shape != (3,) or not np.isfinite(point).all():
-        raise InputError(f"{name}: expected three finite numbers of metres, found {list(values)}")
+        raise InputError(f"{name}: expected three finite numbers of metres, found {str(values)[:80]}")
     return point

@@ -19,8 +19,8 @@ from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name, read_untrusted, read_untrusted_text
 
 _PGM: Final = re.compile(rb"P5(?:\s+#[^\n]*)*\s+(\d{1,9})(?:\s+#[^\n]*)*\s+(\d{1,9})(?:\s+#[^\n]*)*\s+(\d{1,5})\s")
-_UNKNOWN: Final = 0.4
-"""A shade that is neither occupied nor free by map_server's own thresholds."""
+_MODES: Final = ("trinary", "scale", "raw")
+_THRESHOLDS: Final = {"occupied_thresh": 0.65, "free_thresh": 0.196}
 _MOST_RAW: Final = 100
 """Largest occupancy in mode `raw`."""
 
@@ -59,9 +59,8 @@ def read_ros_map(path: Path) -> RosMap:
     if not isinstance(origin, list) or len(origin) != 3 or not 1e-4 <= resolution <= 1e3:
         raise FormatError(f"{path}: expected a resolution of 0.0001 to 1000 m and an origin of three numbers")
     x, y, yaw = (_number(path, "origin", value) for value in origin)
-    shade = _shades(path, values)[::-1]
-    occupied = shade > _number(path, "occupied_thresh", values.get("occupied_thresh", 0.65))
-    free = shade < _number(path, "free_thresh", values.get("free_thresh", 0.196))
+    limits = [_number(path, name, values.get(name, usual)) for name, usual in _THRESHOLDS.items()]
+    occupied, free = (cells[::-1] for cells in _cells(path, values, *limits))
     return RosMap(occupied, free & ~occupied, resolution, (x, y, yaw))
 
 
@@ -76,19 +75,25 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return values
 
 
-def _shades(path: Path, values: dict[str, Any]) -> np.ndarray:
-    """How occupied the map's pixels are, float32 [H, W] in [0, 1]."""
-    name = values.get("image")
+def _cells(path: Path, values: dict[str, Any], least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels are more occupied than `least`, and which less than `most`: bool [H, W] both; neither: unknown."""
+    name, mode = values.get("image"), values.get("mode", "trinary")
     if not isinstance(name, str) or not is_plain_name(name):
         raise FormatError(f"{path}: image: expected the name of a file beside it, found {str(name)[:80]!r}")
-    picture, largest = _read_image(path.parent / name)
-    grey = (picture[..., :3].mean(axis=2) if picture.ndim == 3 else picture).astype(np.float32)
-    if values.get("mode") == "raw":
-        return np.where(grey <= _MOST_RAW, grey / _MOST_RAW, np.float32(_UNKNOWN))
-    shade = grey / largest if values.get("negate", 0) not in (0, False) else 1 - grey / largest
-    if picture.ndim == 3 and picture.shape[2] == 4:
-        shade = np.where(picture[..., 3] == 0, np.float32(_UNKNOWN), shade)
-    return np.asarray(shade)
+    if mode not in _MODES:
+        raise FormatError(f"{path}: mode: expected {', '.join(_MODES)}, found {str(mode)[:80]!r}")
+    picture, white = _read_image(path.parent / name)
+    # Of grey images the levels are looked at, in double precision as map_server does: a shade may be a threshold.
+    plain = picture.ndim == 2
+    grey = np.arange(256.0**picture.dtype.itemsize) if plain else picture[..., :3].mean(axis=2)
+    known = np.ones(grey.shape, bool)
+    shade = grey / white if values.get("negate", 0) not in (0, False) else 1 - grey / white
+    if mode == "raw":
+        shade, known = grey / _MOST_RAW, grey <= _MOST_RAW
+    elif not plain and picture.shape[2] == 4:
+        known = picture[..., 3] == white if mode == "scale" else picture[..., 3] > 0
+    occupied, free = known & (shade > least), known & (shade < most)
+    return (occupied[picture], free[picture]) if plain else (occupied, free)
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, int]:

@@ -141,7 +141,7 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     _check(request, is_run)
     body, config = read_body(request.body, request.body_frame), _config(request)
     _check_memory(request, config)
-    for note in [] if request.live else settings_notes(config, request.config, request.overrides):
+    for note in [] if request.live else settings_notes(_without_options(config), request.config, request.overrides):
         observer.note(note)  # a live run tells of them itself
     onto = None if request.onto is None else load_tsdf(request.onto)
     maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
@@ -172,9 +172,9 @@ def _write(
     maps = fused.maps
     maps.finish()
     if not maps.block_counts()[0] or (request.onto is None and not fused.depth_ranges):  # free space alone has no floor
-        limits = maps.settings.tsdf
+        limits, but = maps.settings.tsdf, " that `body` leaves" if request.body else ""
         raise SequenceError(
-            f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame"
+            f"{request.source}: no depth from {limits.min_depth:g} to {limits.max_depth:g} m in any frame{but}"
         )
     surface, frame = Surface.of(maps, fused.poses), output_frame(request.frame)
     if frame is OutputFrame.floor and source is not None:
@@ -194,6 +194,13 @@ def _config(request: VolumesRequest) -> Config:
         raise ConfigError("`voxel`: with `onto` the voxels are those of the file")
     tsdf = replace(config.volumes.tsdf, voxel=request.voxel)
     return replace(config, volumes=replace(config.volumes, tsdf=tsdf))
+
+
+def _without_options(config: Config) -> Config:
+    """The settings but those that `ggslam volumes` has options for, which are nothing to be warned of."""
+    plain = type(config.volumes)()
+    own = {name: getattr(plain, name) for name in ("min_weight", "budget_ms")}
+    return replace(config, volumes=replace(config.volumes, **own))
 
 
 def _set_pace(settings: VolumeSettings, request: VolumesRequest) -> VolumeSettings:

@@ -243,7 +243,8 @@ class _Writer:
         write_picture(self.path("esdf.png"), slice_picture(cut, _full_scale(cut.distance[cut.known])))
         if not cut.known.any():
             self.outputs.lines.append(f"note: nothing is known {height - base:.2f} m up: esdf.png is empty")
-        layers = floor_layers(field_, plane_at_height(field_, upright.up, base), VolumeOutputTuning.max_slice_cells)
+        layers = floor_layers(field_, plane_at_height(field_, upright.up, base), VolumeOutputTuning.max_slice_cells,
+                              upright.floor is not None)  # fmt: skip
         plan = layers.between(*self.request.band)
         written, robots = write_robot_maps(layers, self.request.robots, self.request.inflation, self.staged)
         self.outputs.files += [self.out / file.name for file in (*write_map(plan, self.staged / "map"), *written)]
@@ -257,9 +258,10 @@ class _Writer:
                   "slice_height": height - base, "band": plan.heights, "map_frame": axes, "robots": robots},
         )  # fmt: skip
         for name, facts in robots.items():
+            drops = f", the floor falls away on {facts['drops_m2']:.1f} m2" if facts["drops_m2"] else ""
             self.outputs.lines.append(
-                f"{name}: {facts['free_m2']:.1f} m2 are free, its centre has {facts['for_its_centre_m2']:.1f} m2: "
-                f"{self.out / f'robot_{name}.png'}"
+                f"{name}: {facts['free_m2']:.1f} m2 are free, its centre has {facts['for_its_centre_m2']:.1f} m2"
+                f"{drops}: {self.out / f'robot_{name}.png'}"
             )
 
     def occupancy(self, occupancy: OccupancyMap) -> None:

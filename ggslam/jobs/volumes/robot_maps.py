@@ -46,10 +46,10 @@ def parse_robots(texts: Sequence[str]) -> list[Robot]:
     return robots
 
 
-def floor_layers(field: DistanceField, floor: SlicePlane, most_cells: int) -> HeightLayers:
-    """What a volume has above its floor, in cells that are larger where there would be too many."""
+def floor_layers(field: DistanceField, floor: SlicePlane, most_cells: int, seen: bool) -> HeightLayers:
+    """What a volume has above its floor, `seen` or guessed, in cells that are larger where there would be too many."""
     area = (floor.high[0] - floor.low[0]) * (floor.high[1] - floor.low[1])
-    return HeightLayers(field, floor, max(FloorMapTuning.cell_m, field.voxel, math.sqrt(area / most_cells)))
+    return HeightLayers(field, floor, max(FloorMapTuning.cell_m, field.voxel, math.sqrt(area / most_cells)), seen)
 
 
 def write_robot_maps(
@@ -64,7 +64,8 @@ def write_robot_maps(
         folder: is there.
 
     Returns:
-        The files; and of each robot its size, the area in square metres that is free, and that its centre may be in.
+        The files; and of each robot its size, and square metres: that are free, that its centre may be in, and where
+        the floor falls away.
     """
     files, facts = [], {}
     for robot in robots:
@@ -83,5 +84,6 @@ def write_robot_maps(
         facts[robot.name] = {
             "height": robot.height, "radius": robot.radius, "step": robot.step,
             "free_m2": cell * np.count_nonzero(band.free), "for_its_centre_m2": cell * np.count_nonzero(reachable),
+            "drops_m2": cell * np.count_nonzero(layers.drops(robot.step)),
         }  # fmt: skip
     return files, facts
