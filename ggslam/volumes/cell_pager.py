@@ -54,6 +54,7 @@ class CellPager:
 
     Attributes:
         tsdf, cells: the TSDF and its grid.
+        folder: where cells are.
         written, read: cells that went to disk, and that came back because views needed them.
         most_bytes: the most that TSDF and distance field took when an instant was done.
         exceeded: whether that was more than allowed: what one instant's views need has to be in memory.
@@ -65,7 +66,7 @@ class CellPager:
         self.cells = VolumeCells.of(tsdf.settings)
         self.written = self.read = self.most_bytes = 0
         self.exceeded = False
-        self.tsdf, self._folder, self._allowed = tsdf, folder, allowed
+        self.tsdf, self.folder, self._allowed = tsdf, folder, allowed
         beside = HeldDistanceTuning.margin_voxels * tsdf.settings.voxel
         self._around = math.ceil((distances + beside) / self.cells.edge) if distances else 0
         self._away: dict[CellKey, int] = {}
@@ -208,18 +209,18 @@ class CellPager:
         return freed
 
     def _write(self, key: CellKey, arrays: dict[str, np.ndarray]) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         write_bytes(self._path(key), arrays_to_bytes(**arrays))
         self._away[key] = self._decays
         self._last_seen.pop(key, None)
         self.written += 1
 
     def _path(self, key: CellKey) -> Path:
-        return self._folder / f"{key[0]}_{key[1]}_{key[2]}.npz"
+        return self.folder / f"{key[0]}_{key[1]}_{key[2]}.npz"
 
     def clear(self) -> None:
         """Forgets what is on disk; the TSDF is cleared by who calls."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
         self._away, self._last_seen, self._wanted, self._decays, self._stale = {}, {}, set(), 0, None
 
 

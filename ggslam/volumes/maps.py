@@ -20,12 +20,14 @@ import torch
 from ggslam.errors import ConfigError, InputError
 from ggslam.scene.frame import Frame
 from ggslam.system.tuning import Tuning
-from ggslam.volumes.cell_export import mesh_of_cells, save_cells
+from ggslam.volumes.cell_export import save_cells
+from ggslam.volumes.cell_mesh import mesh_cells
 from ggslam.volumes.cell_pager import CellPager
 from ggslam.volumes.cell_rebuild import StoredView
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.held_distances import HeldDistanceTuning, HeldValues, held_values
 from ggslam.volumes.mesh import Mesh, extract_mesh
+from ggslam.volumes.mesh_parts import MeshParts
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.posed_view import PosedScan, PosedView
 from ggslam.volumes.tsdf import TsdfMap
@@ -164,10 +166,14 @@ class VolumeMaps:
         return held_values(values, border, voxel)
 
     def mesh(self, min_triangles: int = 0) -> Mesh:
-        """The surface of the TSDF; see `volumes.mesh.extract_mesh`."""
+        """The surface of the TSDF in memory; see `volumes.mesh.extract_mesh`."""
+        return self.mesh_parts(min_triangles).whole()
+
+    def mesh_parts(self, min_triangles: int = 0) -> MeshParts:
+        """The surface of the finished TSDF; of cells on disk it stays there, and is gone with them."""
         if self.pager is not None and len(self.pager):
-            return mesh_of_cells(self.pager, self.settings.min_weight or None, min_triangles)
-        return extract_mesh(self.tsdf, self.settings.min_weight or None, min_triangles)
+            return mesh_cells(self.pager, self.settings.min_weight or None, min_triangles)
+        return MeshParts.of(extract_mesh(self.tsdf, self.settings.min_weight or None, min_triangles))
 
     def save_tsdf(self, path: Path) -> None:
         """Writes the finished TSDF."""
