@@ -51,7 +51,7 @@ def mesh_cells(pager: CellPager, min_weight: float | None, min_triangles: int) -
         part = _in_memory(pager, with_neighbours(own, 1) & pager.keys())
         mesh, shared = _triangles_of(part, own, pager, min_weight)
         _write(folder, numbering.boxes, *numbering.add(box, mesh, shared))
-    return _finished(folder, numbering, max(min_triangles, 1))
+    return _without_specks(folder, numbering, max(min_triangles, 1))
 
 
 # --- boxes -----------------------------------------------------------------------------------------------------------
@@ -182,7 +182,7 @@ def _parts(folder: Path, count: int, large: np.ndarray) -> Iterator[tuple[MeshPa
         yield part.part(stays[part.mesh.triangles[:, 0]]), numbers[first & ~stays]
 
 
-def _finished(folder: Path, numbering: _Numbering, min_triangles: int) -> MeshParts:
+def _without_specks(folder: Path, numbering: _Numbering, min_triangles: int) -> MeshParts:
     """The parts of all boxes, without small pieces."""
     large, count = numbering.large(min_triangles), numbering.boxes
     objects: set[int] = set()

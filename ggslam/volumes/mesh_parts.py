@@ -56,7 +56,7 @@ class MeshParts:
     def __iter__(self) -> Iterator[MeshPart]:
         return self._read()
 
-    def changed(self, change: Callable[[Mesh], Mesh]) -> MeshParts:
+    def apply(self, change: Callable[[Mesh], Mesh]) -> MeshParts:
         """The same with each part changed by a function that leaves vertices and triangles in their order."""
         return MeshParts(
             lambda: (replace(part, mesh=change(part.mesh)) for part in self), self.vertices, self.triangles,

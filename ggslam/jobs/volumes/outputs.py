@@ -135,7 +135,7 @@ class Surface:
         """The mesh relative to `origin`."""
         if not self.origin.any():
             return self.parts
-        return self.parts.changed(lambda part: replace(part, vertices=(part.vertices - self.origin).astype(np.float32)))
+        return self.parts.apply(lambda part: replace(part, vertices=(part.vertices - self.origin).astype(np.float32)))
 
     @staticmethod
     def of(maps: VolumeMaps, poses: Sequence[np.ndarray]) -> Surface:
@@ -200,7 +200,7 @@ class _Writer:
         """The surface."""
         parts, is_level = self.surface.parts, self.request.frame is OutputFrame.floor
         if is_level:
-            parts = parts.changed(lambda part: part.in_frame(self.T_out_map))
+            parts = parts.apply(lambda part: part.in_frame(self.T_out_map))
         path = self.request.mesh or self.path("mesh.ply")
         if self.request.mesh is not None:
             self.outputs.files.append(path)
