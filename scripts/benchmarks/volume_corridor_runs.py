@@ -112,12 +112,15 @@ def _print(title: str, maps: VolumeMaps, stretches: list[Stretch]) -> None:
             f"{s.cpu_ms.mean():.1f} {np.percentile(s.cpu_ms, 95):.1f}), {s.held / 1e6:.0f} MB; occupancy "
             f"{s.occupancy_ms.mean():.1f} (CPU time), {s.occupancy / 1e6:.1f} MB; process {s.rss_mb:.0f} MB"
         )
-    first, last = stretches[0], stretches[-1]
+    for other in (1, 2):  # the first tenth may not fill the memory that is allowed
+        _print_ratios(other, stretches[other - 1], stretches[-1])
+
+
+def _print_ratios(length: int, first: Stretch, last: Stretch) -> None:
+    times = [float(f(last.cpu_ms) / f(first.cpu_ms)) for f in (np.mean, partial(np.percentile, q=95))]
     occupied = last.occupancy_ms.mean() / first.occupancy_ms.mean()
-    late = float(np.percentile(last.cpu_ms, 95) / np.percentile(first.cpu_ms, 95))
     print(
-        f"    10x / 1x: CPU time {last.cpu_ms.mean() / first.cpu_ms.mean():.2f} (95 %: {late:.2f}), memory "
-        f"{last.held / first.held:.2f}; occupancy: CPU time {occupied:.2f}, "
-        f"memory {last.occupancy / max(1, first.occupancy):.2f}",
+        f"    10x / {length}x: CPU time {times[0]:.2f} (95 %: {times[1]:.2f}), memory {last.held / first.held:.2f}; "
+        f"occupancy: CPU time {occupied:.2f}, memory {last.occupancy / max(1, first.occupancy):.2f}",
         flush=True,
     )

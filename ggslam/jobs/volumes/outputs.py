@@ -73,7 +73,7 @@ class VolumeOutputTuning(Tuning):
     """Most cells of a slice."""
     min_piece_triangles = 50
     """Pieces of the mesh with fewer triangles are left out: specks of noise in the air."""
-    upright_vertices = 2_000_000
+    upright_vertices = 500_000
     """Most vertices that the direction up is found from."""
 
 

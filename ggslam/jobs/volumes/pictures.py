@@ -27,7 +27,7 @@ class MeshPictureTuning(Tuning):
     """Height of a picture, in pixels."""
     elevation = math.radians(40)
     """Angle at which the camera looks down, in radians."""
-    sample = 2_000_000
+    sample = 500_000
     """Most vertices of which it is decided where to look from."""
 
 
