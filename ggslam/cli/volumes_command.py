@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -40,8 +40,8 @@ EPILOG = """
 SourcePath = Annotated[
     Path,
     typer.Argument(
-        metavar="SOURCE", help="Folder that `ggslam run` wrote, of a recording or of laser scans, or a grid store "
-        "made of runs."
+        metavar="SOURCE",
+        help="Folder that `ggslam run` wrote, of a recording or of laser scans, or a grid store made of runs.",
     ),
 ]
 
@@ -133,53 +133,39 @@ Overwrite = Annotated[
 
 
 def volumes(
-    source: SourcePath,
-    out: Out = None,
-    voxel: Voxel = None,
-    esdf: Esdf = False, budget_ms: BudgetMs = None,
-    occupancy: Occupancy = None,
-    mesh: Mesh = None,
-    min_weight: MinWeight = None,
-    object_meshes: ObjectMeshes = False, objects: Objects = True,
+    source: SourcePath, out: Out = None,
+    voxel: Voxel = None, esdf: Esdf = False, budget_ms: BudgetMs = None, occupancy: Occupancy = None,
+    mesh: Mesh = None, min_weight: MinWeight = None, object_meshes: ObjectMeshes = False, objects: Objects = True,
     live: Live = False, realtime: Realtime = None,
     onto: Onto = None,
-    slice_height: SliceHeight = None,
-    band: Band = "0.1,1.5",
-    robot: Robots = None,
-    inflation: Inflation = "0.55,10",
+    slice_height: SliceHeight = None, band: Band = "0.1,1.5", robot: Robots = None, inflation: Inflation = "0.55,10",
     body: options.Body = None, body_frame: options.BodyFrame = None,
     frame: Frame = OutputFrame.map,
-    driving: Driving = False,
-    speeds: Speeds = "0.5,1,2,4",
-    friction: Friction = 0.5,
+    driving: Driving = False, speeds: Speeds = "0.5,1,2,4", friction: Friction = 0.5,
     sensor_ms: SensorMs = 33.0, plan_ms: PlanMs = 50.0, network_ms: NetworkMs = 0.0,
     frame_ms: FrameMs = 33.3, control_ms: ControlMs = 50.0,
     config: options.ConfigName = None, settings: options.Settings = None,
-    start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1,
-    scale: Scale = None,
+    start: options.Start = 0, stop: options.Stop = None, stride: options.Stride = 1, scale: Scale = None,
     format_name: options.Format = None, depth_scale: options.DepthScale = None,
     pose_convention: options.PoseConvention = None,
     camera: options.OwnCamera = None, intrinsics: options.Intrinsics = None,
     depth_camera: options.DepthCamera = None,
     depth_kind: options.DepthKind = None, depth_delay: options.DepthDelay = None, upright: options.Upright = False,
-    sequence: options.MovedSequence = None,
-    poses: Poses = None, columns: options.Columns = None,
+    sequence: options.MovedSequence = None, poses: Poses = None, columns: options.Columns = None,
     skip_bad_frames: options.SkipBadFrames = False,
     device: Device = None, overwrite: Overwrite = False,
     engine: options.CellEngine = options.EngineName.local,
     workers: options.CellWorkers = None, address: options.CellAddress = None,
 ) -> None:  # fmt: skip
     """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
-    from ggslam.jobs.submaps.stores import is_store
     from ggslam.jobs.volumes.fuse import VolumesRequest
     from ggslam.runs.recordings import SequenceRequest
 
-    braking = _make_braking(sensor_ms, plan_ms, network_ms, frame_ms, control_ms, friction)
     reading = SequenceRequest(
         source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
         camera=camera, intrinsics=intrinsics, depth_camera=depth_camera, depth_kind=depth_kind,
-            depth_delay=depth_delay, upright=upright,
+        depth_delay=depth_delay, upright=upright,
     )  # fmt: skip
     request = VolumesRequest(
         source=source, sequence=reading, scale=scale, recording=sequence, poses=poses, columns=columns, out=out,
@@ -189,9 +175,27 @@ def volumes(
         device=device, config=config, overwrite=overwrite,
         overrides=_overrides(settings, esdf, min_weight=min_weight, budget_ms=budget_ms),
     )  # fmt: skip
-    if is_store(source):
-        return _make_of_store(request, engine, workers, address)
-    return _make_and_show(request, _speeds(speeds), braking, (engine, workers, address))
+    braking = _make_braking(sensor_ms, plan_ms, network_ms, frame_ms, control_ms, friction)
+    _make_of_source(request, _Cells(engine, workers, address), _speeds(speeds), braking)
+
+
+class _Cells(NamedTuple):
+    """Where the cells of a grid store are made."""
+
+    engine: options.EngineName
+    workers: int | None
+    address: str | None
+
+
+def _make_of_source(request: VolumesRequest, cells: _Cells, speeds: list[float], braking: Braking) -> None:
+    """Makes the volumes of a grid store, or of a run or recording, and prints what came of it."""
+    from ggslam.jobs.submaps.stores import is_store
+
+    if is_store(request.source):
+        return _make_of_store(request, cells)
+    if cells != _Cells(options.EngineName.local, None, None):
+        raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
+    return _make_and_show(request, speeds, braking)
 
 
 def _overrides(settings: list[str] | None, esdf: bool, **given: float | None) -> list[str]:
@@ -213,9 +217,7 @@ def _make_braking(
     return Braking(latencies, friction)
 
 
-def _make_of_store(
-    request: VolumesRequest, engine: options.EngineName, workers: int | None, address: str | None
-) -> None:
+def _make_of_store(request: VolumesRequest, cells: _Cells) -> None:
     """Makes the volumes of a store and prints what came of it."""
     from dataclasses import replace
 
@@ -231,12 +233,12 @@ def _make_of_store(
     if request != plain or request.sequence != type(request.sequence)(request.source):
         chosen = "--out, --voxel, --esdf, --min-weight, --config, --set"
         raise ConfigError(f"of a grid store {chosen} and the workers can be chosen")
-    if address is not None and engine is not options.EngineName.ray:
+    if cells.address is not None and cells.engine is not options.EngineName.ray:
         raise ConfigError("--address is for --engine ray")
     settings = load_config(request.config, request.overrides).volumes
     if request.voxel is not None:
         settings = replace(settings, tsdf=replace(settings.tsdf, voxel=request.voxel))
-    where = Engine(engine.value, workers, address)
+    where = Engine(cells.engine.value, cells.workers, cells.address)
     with progress_bar() as bar:
         outcome = make_store_volumes(
             request.source, request.out, settings=settings, esdf=request.esdf, engine=where,
@@ -253,13 +255,10 @@ def _make_of_store(
         raise typer.Exit(2)
 
 
-def _make_and_show(request: VolumesRequest, speeds: list[float], braking: Braking, cells: tuple[object, ...]) -> None:
-    """Makes the maps and prints times, files and, where it was asked for, how fast a robot may drive; `cells` are
-    options that are for stores."""
+def _make_and_show(request: VolumesRequest, speeds: list[float], braking: Braking) -> None:
+    """Makes the maps and prints times, files and, where it was asked for, how fast a robot may drive."""
     from ggslam.jobs.volumes.fuse import make_volumes
 
-    if cells != (options.EngineName.local, None, None):
-        raise ConfigError("--engine, --workers and --address are for grid stores, and this is none")
     with progress_bar() as bar:
         outcome = make_volumes(request, ProgressObserver(bar))
     _print(outcome)

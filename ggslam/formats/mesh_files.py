@@ -15,7 +15,8 @@ the room.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,7 +26,7 @@ import numpy as np
 from ggslam.errors import FormatError
 from ggslam.formats.linear_light import vertex_colors
 from ggslam.formats.optional_package import package_for
-from ggslam.formats.ply import write_ply
+from ggslam.formats.ply import RowParts, write_ply_elements
 from ggslam.formats.triangle_mesh import majority_labels
 from ggslam.formats.writer import SurfaceMesh, Takes, Writer
 from ggslam.scene.origin import local_origin, stored_positions
@@ -101,19 +102,64 @@ def _write_ply(
     path: str | Path, vertices: np.ndarray, triangles: np.ndarray, normals: np.ndarray | None,
     colors: np.ndarray | None, labels: np.ndarray | None,
 ) -> None:  # fmt: skip
-    columns: dict[str, np.ndarray] = dict(zip("xyz", stored_positions(vertices).T, strict=True))
-    if normals is not None:
-        columns |= dict(zip(("nx", "ny", "nz"), normals.T.astype(np.float32), strict=True))
-    if colors is not None:
-        columns |= dict(zip(("red", "green", "blue"), colors.T.astype(np.uint8), strict=True))
-    if labels is not None:
-        columns["object_id"] = labels.astype(np.uint16)
-    rows = np.empty(len(vertices), [(name, column.dtype) for name, column in columns.items()])
+    part = PlyPart(vertices, triangles, normals, colors, labels)
+    write_ply_mesh(path, lambda: iter([part]), len(vertices), len(triangles))
+
+
+@dataclass(frozen=True)
+class PlyPart:
+    """Rows of a PLY file's mesh, see `write_mesh`: vertices that follow those of the part before, and triangles.
+
+    Attributes:
+        triangles: int [F, 3], rows of vertices among those of all parts.
+    """
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    normals: np.ndarray | None = None
+    colors: np.ndarray | None = None
+    labels: np.ndarray | None = None
+
+
+def write_ply_mesh(path: str | Path, parts: Callable[[], Iterator[PlyPart]], vertices: int, triangles: int) -> None:
+    """Writes the PLY file of `write_mesh` part by part, so that the mesh is never all in memory.
+
+    Args:
+        path: of the file.
+        parts: gives the parts, each with the same of normals, colours and labels; is called several times.
+        vertices, triangles: of all parts together.
+
+    Raises:
+        RunFolderError: the file cannot be written.
+    """
+    stored = np.result_type(np.float32, *(stored_positions(part.vertices).dtype for part in parts()))
+    first = next(parts(), PlyPart(np.zeros((0, 3)), np.zeros((0, 3), np.int32)))
+    faces = np.dtype([("vertex_indices", np.int32, (3,))])
+    elements = {
+        "vertex": RowParts(vertices, _rows_of(first, stored).dtype, (_rows_of(part, stored) for part in parts())),
+        "face": RowParts(triangles, faces, (_faces_of(part, faces) for part in parts())),
+    }
+    write_ply_elements(path, elements)
+
+
+def _rows_of(part: PlyPart, stored: np.dtype) -> np.ndarray:
+    columns: dict[str, np.ndarray] = dict(zip("xyz", part.vertices.T.astype(stored), strict=True))
+    if part.normals is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), part.normals.T.astype(np.float32), strict=True))
+    if part.colors is not None:
+        columns |= dict(zip(("red", "green", "blue"), part.colors.T.astype(np.uint8), strict=True))
+    if part.labels is not None:
+        columns["object_id"] = part.labels.astype(np.uint16)
+    rows = np.empty(len(part.vertices), [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         rows[name] = column
-    faces = np.empty(len(triangles), [("vertex_indices", np.int32, (3,))])
-    faces["vertex_indices"] = triangles
-    write_ply(path, {"vertex": rows, "face": faces})
+    return rows
+
+
+def _faces_of(part: PlyPart, dtype: np.dtype) -> np.ndarray:
+    faces = np.empty(len(part.triangles), dtype)
+    faces["vertex_indices"] = part.triangles
+    return faces
 
 
 def _trimesh(path: str | Path) -> ModuleType:

@@ -96,14 +96,37 @@ def write_ply_parts(
         ValueError: a name, type or comment that PLY cannot express, or another number of rows than `count`.
         RunFolderError: the file cannot be written.
     """
-    written = 0
+    write_ply_elements(path, {element: RowParts(count, dtype, parts)}, comments, sized_names)
+
+
+@dataclass(frozen=True)
+class RowParts:
+    """Rows of an element that come in parts.
+
+    Attributes:
+        count: of all parts together.
+        dtype: of a row.
+        parts: structured arrays of this type.
+    """
+
+    count: int
+    dtype: np.dtype
+    parts: Iterable[np.ndarray]
+
+
+def write_ply_elements(
+    path: str | Path, elements: Mapping[str, RowParts], comments: Sequence[str] = (), sized_names: bool = False
+) -> None:
+    """Writes a file of elements whose rows come in parts, one element after the other; see `write_ply_parts`."""
     with atomic_write(path) as temporary, temporary.open("wb") as file:
-        file.write(_header({element: (count, dtype)}, comments, sized_names))
-        for rows in parts:
-            file.write(_pack(rows).tobytes())
-            written += len(rows)
-        if written != count:
-            raise InputError(f"{path}: {written} rows were given, {count} were announced")
+        file.write(_header({name: (rows.count, rows.dtype) for name, rows in elements.items()}, comments, sized_names))
+        for rows in elements.values():
+            written = 0
+            for part in rows.parts:
+                file.write(_pack(part).tobytes())
+                written += len(part)
+            if written != rows.count:
+                raise InputError(f"{path}: {written} rows were given, {rows.count} were announced")
 
 
 def _header(elements: Mapping[str, tuple[int, np.dtype]], comments: Sequence[str], sized_names: bool) -> bytes:

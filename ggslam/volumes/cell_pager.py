@@ -3,7 +3,8 @@
 tell of it.
 
 What is fused is the same as without a pager. The distance field follows the TSDF: what leaves it has no distances, so
-cells around those in view stay as far as distances reach.
+cells around those in view stay as far as distances reach. Distances farther away are those of what is in memory, see
+`volumes.held_distances`.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from ggslam.system.tuning import Tuning
 from ggslam.volumes.block_arrays import decay_blocks, put_blocks, take_blocks
 from ggslam.volumes.cell_rebuild import CellRebuild, StoredView
 from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.held_distances import HeldDistanceTuning, distance_to_cells
 from ggslam.volumes.posed_view import PosedView
 from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.volume_cells import CellKey, VolumeCells, as_keys, with_neighbours
@@ -52,6 +54,7 @@ class CellPager:
 
     Attributes:
         tsdf, cells: the TSDF and its grid.
+        folder: where cells are.
         written, read: cells that went to disk, and that came back because views needed them.
         most_bytes: the most that TSDF and distance field took when an instant was done.
         exceeded: whether that was more than allowed: what one instant's views need has to be in memory.
@@ -63,8 +66,9 @@ class CellPager:
         self.cells = VolumeCells.of(tsdf.settings)
         self.written = self.read = self.most_bytes = 0
         self.exceeded = False
-        self.tsdf, self._folder, self._allowed = tsdf, folder, allowed
-        self._around = math.ceil(distances / self.cells.edge)
+        self.tsdf, self.folder, self._allowed = tsdf, folder, allowed
+        beside = HeldDistanceTuning.margin_voxels * tsdf.settings.voxel
+        self._around = math.ceil((distances + beside) / self.cells.edge) if distances else 0
         self._away: dict[CellKey, int] = {}
         """Cells on disk, and how often weights had decayed when they went."""
         self._wanted: set[CellKey] = set()
@@ -133,6 +137,15 @@ class CellPager:
         self.clear()
         self._stale = CellRebuild(views, self.cells, self.tsdf.origin)
 
+    def border(self, points: np.ndarray, most: float) -> np.ndarray:
+        """Metres [N] from points [N, 3] in the world to the nearest cell that is on disk or to be fused again; infinite
+        where that is farther than `most`."""
+        return distance_to_cells(points - self.tsdf.origin, self.cells, most, self._not_held)
+
+    def _not_held(self, keys: set[CellKey]) -> set[CellKey]:
+        away = keys & self._away.keys()
+        return away if self._stale is None else away | self._stale.still_to_fuse(keys)
+
     def _load(self, keys: set[CellKey]) -> None:
         for key in sorted(keys):
             put_blocks(self.tsdf, self.arrays(key))
@@ -196,18 +209,18 @@ class CellPager:
         return freed
 
     def _write(self, key: CellKey, arrays: dict[str, np.ndarray]) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         write_bytes(self._path(key), arrays_to_bytes(**arrays))
         self._away[key] = self._decays
         self._last_seen.pop(key, None)
         self.written += 1
 
     def _path(self, key: CellKey) -> Path:
-        return self._folder / f"{key[0]}_{key[1]}_{key[2]}.npz"
+        return self.folder / f"{key[0]}_{key[1]}_{key[2]}.npz"
 
     def clear(self) -> None:
         """Forgets what is on disk; the TSDF is cleared by who calls."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
         self._away, self._last_seen, self._wanted, self._decays, self._stale = {}, {}, set(), 0, None
 
 

@@ -58,6 +58,8 @@ class CellRebuild:
     def __init__(self, views: Sequence[StoredView], cells: VolumeCells, origin: np.ndarray) -> None:
         self._views, self._cells, self._origin = list(views), cells, origin
         self._built: set[CellKey] = set()
+        self._seen: dict[CellKey, bool] = {}
+        """Whether some view sees a cell, of those that were asked for."""
         self._frustums: list[tuple[np.ndarray, Frustums]] = []
         cameras = {view.camera: view.camera for view in self._views}
         for camera in cameras.values():
@@ -108,6 +110,15 @@ class CellRebuild:
         own = [key in todo for key in map(tuple, self._cells.keys_of(blocks.coordinates).tolist())]
         put_blocks(tsdf, decay_blocks(take_blocks(alone, blocks, np.flatnonzero(own)), tsdf, decays))
         self._built |= todo
+
+    def still_to_fuse(self, keys: set[CellKey]) -> set[CellKey]:
+        """Those of the cells that some view sees and that are not fused yet."""
+        new = np.array(sorted(keys - self._built - self._seen.keys())).reshape(-1, 3)
+        seen = np.zeros(len(new), bool)
+        for _, frustums in self._frustums:
+            seen |= frustums.touch(new * self._cells.edge, (new + 1) * self._cells.edge).any(0)
+        self._seen.update(zip(map(tuple, new.tolist()), seen.tolist(), strict=True))
+        return {key for key in keys - self._built if self._seen[key]}
 
     def _views_of(self, keys: np.ndarray) -> list[int]:
         """Numbers of the views that see some of the cells [n, 3], in order."""

@@ -17,14 +17,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, InputError
 from ggslam.scene.frame import Frame
 from ggslam.system.tuning import Tuning
-from ggslam.volumes.cell_export import mesh_of_cells, save_cells
+from ggslam.volumes.cell_export import save_cells
+from ggslam.volumes.cell_mesh import mesh_cells
 from ggslam.volumes.cell_pager import CellPager
 from ggslam.volumes.cell_rebuild import StoredView
 from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.held_distances import HeldDistanceTuning, HeldValues, held_values
 from ggslam.volumes.mesh import Mesh, extract_mesh
+from ggslam.volumes.mesh_parts import MeshParts
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.posed_view import PosedScan, PosedView
 from ggslam.volumes.tsdf import TsdfMap
@@ -145,11 +148,32 @@ class VolumeMaps:
         self.tsdf = TsdfMap(tsdf, self.context, points=self.tsdf.points)
         self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
 
+    def query(self, points: np.ndarray) -> HeldValues:
+        """Distances and gradients at points [N, 3] in metres, see `DistanceField.query`, and what they are worth while
+        cells are on disk: all in view of the last instant are those of the whole map.
+
+        Raises:
+            InputError: there is no distance field.
+        """
+        if self.field is None:
+            raise InputError("query: expected volumes with a distance field (`esdf`), found none")
+        values, voxel = self.field.query(points), self.field.voxel
+        if self.pager is None:
+            border = np.full(len(values.distance), np.inf)
+        else:
+            margin = HeldDistanceTuning.margin_voxels * voxel
+            border = self.pager.border(np.asarray(points, np.float64), self.settings.esdf.max_distance + margin)
+        return held_values(values, border, voxel)
+
     def mesh(self, min_triangles: int = 0) -> Mesh:
-        """The surface of the TSDF; see `volumes.mesh.extract_mesh`."""
+        """The surface of the TSDF in memory; see `volumes.mesh.extract_mesh`."""
+        return self.mesh_parts(min_triangles).whole()
+
+    def mesh_parts(self, min_triangles: int = 0) -> MeshParts:
+        """The surface of the finished TSDF; of cells on disk it stays there, and is gone with them."""
         if self.pager is not None and len(self.pager):
-            return mesh_of_cells(self.pager, self.settings.min_weight or None, min_triangles)
-        return extract_mesh(self.tsdf, self.settings.min_weight or None, min_triangles)
+            return mesh_cells(self.pager, self.settings.min_weight or None, min_triangles)
+        return MeshParts.of(extract_mesh(self.tsdf, self.settings.min_weight or None, min_triangles))
 
     def save_tsdf(self, path: Path) -> None:
         """Writes the finished TSDF."""
@@ -210,7 +234,7 @@ class VolumeMaps:
         if self.field is not None and every and self._on_device is None and number % every == every - 1:
             start = time.perf_counter()
             here = images[0].T_world_camera[:3, 3] if images else None
-            self.field.update(self._time_left(row["tsdf"]), here)
+            self.field.update(self.settings.left_for_field_ms(1e3 * row["tsdf"]), here)
             row["esdf"] = time.perf_counter() - start
         if self.occupancy is not None:
             start = time.perf_counter()
@@ -224,11 +248,6 @@ class VolumeMaps:
         self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
         self.points += sum(view.point_count for view in views)
-
-    def _time_left(self, spent: float) -> float | None:
-        """Milliseconds of a frame's budget that the TSDF has left to the field; at least a little."""
-        budget = self.settings.budget_ms
-        return max(budget - 1e3 * spent, 1e-3) if budget else None
 
     def _bring(self, paging: Paging, images: Sequence[PosedView]) -> float:
         """Brings what is on disk of what images may tell of; returns the seconds that took."""

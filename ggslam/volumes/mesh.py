@@ -97,11 +97,16 @@ def extract_mesh(tsdf: TsdfMap, min_weight: float | None = None, min_triangles: 
     return without_small_pieces(mesh, min_triangles) if min_triangles > 1 else mesh
 
 
+def empty_mesh() -> Mesh:
+    """A mesh of nothing."""
+    none = np.zeros((0, 3), np.float32)
+    return Mesh(none, none, none.astype(np.uint8), np.zeros(0, np.uint16), none.astype(np.int32))
+
+
 def join_meshes(parts: list[Mesh]) -> Mesh:
     """Meshes as one: vertices that are the same bit for bit become one, with what the first has of them."""
     if not parts:
-        none = np.zeros((0, 3), np.float32)
-        return Mesh(none, none, none.astype(np.uint8), np.zeros(0, np.uint16), none.astype(np.int32))
+        return empty_mesh()
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     triangles = [part.triangles + start for part, start in zip(parts, starts, strict=False)]
@@ -116,10 +121,16 @@ def join_meshes(parts: list[Mesh]) -> Mesh:
     return Mesh(vertices[rows], normals, colors, labels, place[number.reshape(-1)][np.concatenate(triangles)])
 
 
-def without_small_pieces(mesh: Mesh, min_triangles: int) -> Mesh:
-    """A mesh without its connected pieces of fewer triangles."""
+def pieces_of(mesh: Mesh) -> tuple[int, np.ndarray]:
+    """How many connected pieces a mesh has, and the number of each vertex' piece, int [V]."""
     first, second, third = mesh.triangles.T
     rows, columns = np.concatenate([first, second]), np.concatenate([second, third])
     links = coo_array((np.ones(len(rows), bool), (rows, columns)), (len(mesh.vertices),) * 2)
-    piece = connected_components(links, directed=False)[1][first]
+    count, of_vertex = connected_components(links, directed=False)
+    return int(count), of_vertex
+
+
+def without_small_pieces(mesh: Mesh, min_triangles: int) -> Mesh:
+    """A mesh without its connected pieces of fewer triangles."""
+    piece = pieces_of(mesh)[1][mesh.triangles[:, 0]]
     return mesh.part(np.bincount(piece)[piece] >= min_triangles if len(piece) else np.zeros(0, bool))

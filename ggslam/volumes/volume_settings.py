@@ -22,6 +22,11 @@ class VolumeTuning:
     """Time a frame for TSDF and distance field; what is far from the camera waits for a later frame. 0: as long as it
     takes."""
 
+    def left_for_field_ms(self, fusion_ms: float) -> float | None:
+        """Milliseconds of a frame's budget that fusing, which took `fusion_ms`, leaves to the distance field: at least
+        a little, so that it never waits for good; None: as long as it takes."""
+        return max(self.budget_ms - fusion_ms, 1e-3) if self.budget_ms else None
+
 
 @settings_class(frozen=True)
 class VolumeSettings(VolumeTuning):

@@ -4,14 +4,14 @@
 
     python scripts/benchmarks/bench_sensors.py
     python scripts/benchmarks/bench_sensors.py --parts scans --submaps data/clouds/kitti_07_submaps
-    python scripts/benchmarks/bench_sensors.py --parts corridor --recording /tmp/corridor --limits 0 20
+    python scripts/benchmarks/bench_sensors.py --parts ranges
 
 Parts:
     scans     laser scanners of 16, 64 and 128 rings walk through a generated world; with --submaps also clouds with
               poses (folders with points.bin, graph.txt), each as a scan from its pose
     cameras   rigs of one to four cameras of 640x480, and one of 1280x720, in a room with a ball
-    corridor  a recording (`ggslam synth DIR --scene corridor`) as far as 1/10, 3/10 and all of it, with and without a
-              limit for TSDF and distance field (--limits, MB, 0: none)
+    ranges    the scanner of 64 rings in a world four times as large, seen up to 40 m: by the range of what is seen, how
+              far surfaces are from the truth, and how much of what was measured has none
 
 Times are CPU time, that of all threads added up. off: distance of the mesh's vertices from the true surface.
 """
@@ -21,10 +21,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -34,6 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "volumes"))
 
 import numpy as np
 from analytic_scenes import Box, Sphere, Union, looking_at, render_depth, small_camera
+from scipy.spatial import cKDTree
 from worlds.distance import world_distance
 from worlds.plan import make_world
 from worlds.pose_graph import read_pose_graph
@@ -41,9 +43,8 @@ from worlds.scanner import Scanner
 from worlds.walk import walk
 
 from ggslam.formats.cloud_files import read_cloud_file
-from ggslam.sequences import Sequence as Recording
-from ggslam.sequences import open_sequence
-from ggslam.volumes.maps import Paging, VolumeMaps
+from ggslam.scene.poses import transform_points
+from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.posed_view import PosedScan, PosedView
 from ggslam.volumes.scan_faces import ScanFaces
 from ggslam.volumes.settings import TsdfSettings
@@ -56,6 +57,10 @@ SCANNERS = {
     "128 rings, 2048": Scanner(rings=128, columns=2048, noise=0.0),
 }
 ROOM = Union((Box((-2.0, -1.3, -2.2), (2.3, 1.4, 1.9), inside_out=True), Sphere((0.9, 0.4, 0.8), 0.4)))
+LARGE = 4.0
+"""How many times as large the world of `ranges` is: halls of up to 40 m."""
+RANGES = (0, 5, 10, 15, 20, 30, 40)
+"""Metres from the nearest scanner."""
 SIDES = np.array([(0, 0, 1), (1, 0, 0), (0, 0, -1), (-1, 0, 0)], float)
 
 
@@ -126,58 +131,54 @@ def cameras() -> None:
         line(f"{count} x {width}x{height}, 2 cm", maps, rates, off)
 
 
-def corridor(recording: Path, limits: Sequence[float], esdf: bool, voxel: float) -> None:
-    """Lengths, with and without a limit."""
-    whole = open_sequence(recording)
-    for limit in limits:
-        for part in (0.1, 0.3, 1.0):
-            maps = VolumeMaps(VolumeSettings(tsdf=TsdfSettings(voxel=voxel), esdf_every=1), esdf=esdf)
-            count = round(part * len(whole))
-            with tempfile.TemporaryDirectory() as folder:
-                if limit:
-                    maps.paging = Paging(Path(folder) / "cells", partial(_constant, int(1e6 * limit)))
-                spent, most = _walk(maps, whole[:count])
-            pager, last = maps.pager, spent[-count // 3 :]
-            moved = "" if pager is None else f", {pager.written} cells to disk, {pager.read} back"
+def ranges() -> None:
+    """A scanner of 64 rings in a world four times as large: errors by the distance from the nearest place of a scan."""
+    world, scanner = make_world(30.0, 3), SCANNERS["64 rings, 2 cm"]
+    small = replace(scanner, farthest=80 / LARGE, noise=scanner.noise / LARGE)
+    poses = walk(world, 8.0, 1)[::4]
+    placed = [_scaled(T) for T in poses]
+    found = [(LARGE * small.scan(world, T, k).points).astype(np.float32) for k, T in enumerate(poses)]
+    faces = ScanFaces.of(found[0])
+    seen = [[PosedScan(points, T, faces)] for points, T in zip(found, placed, strict=True)]
+    points = [transform_points(p[::20].astype(float), T) for p, T in zip(found, placed, strict=True)]
+    measured, places = np.concatenate(points), cKDTree([T[:3, 3] for T in placed])
+    for voxel in (0.1, 0.2):
+        maps, rates = fuse(seen, voxel, 40.0, 2 * voxel)
+        line(f"64 rings, 2 cm, {100 * voxel:g} cm, far", maps, rates, None)
+        vertices = maps.mesh(50).vertices.astype(float)
+        off = 1e3 * LARGE * np.abs(world_distance(world, vertices / LARGE))
+        missing = cKDTree(vertices).query(measured)[0] > voxel
+        away, measured_away = places.query(vertices)[0], places.query(measured)[0]
+        for low, high in pairwise(RANGES):
+            here = off[(away >= low) & (away < high)]
+            gaps = missing[(measured_away >= low) & (measured_away < high)]
+            if not len(here):
+                continue
             print(
-                f"{count:5} frames, limit {limit:g} MB: {spent.mean():.1f} ms a frame, last third {last.mean():.1f} "
-                f"(95 % {np.percentile(last, 95):.1f}), {most / 1e6:.0f} MB at most{moved}", flush=True,
+                f"    {low:2} to {high:2} m: {len(here):7} vertices, off {np.median(here):.1f} mm (median), "
+                f"{here.mean():.1f} (mean), {np.percentile(here, 95):.1f} (95 %); {100 * gaps.mean():.1f} % of the "
+                "points have no mesh within a voxel", flush=True,
             )  # fmt: skip
 
 
-def _constant(bytes_: int, held: int) -> int:
-    return bytes_
-
-
-def _walk(maps: VolumeMaps, frames: Recording) -> tuple[np.ndarray, int]:
-    """CPU milliseconds of each frame, and the most bytes of TSDF and distance field."""
-    spent, most = [], 0
-    for frame in frames.stream(masks=False):
-        assert frame.T_world_camera is not None
-        spent.append(_spent(partial(maps.add, frame, frame.T_world_camera)))
-        field = 0 if maps.field is None else maps.field.memory_bytes
-        most = max(most, maps.tsdf.memory_bytes + field)
-    return 1e3 * np.array(spent), most
+def _scaled(T: np.ndarray) -> np.ndarray:
+    placed = T.copy()
+    placed[:3, 3] *= LARGE
+    return placed
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("scans", "cameras", "corridor")
-    parser.add_argument("--parts", nargs="+", choices=parts, default=["scans", "cameras"])
+    parts = ("scans", "cameras", "ranges")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
     parser.add_argument("--submaps", type=Path)
-    parser.add_argument("--recording", type=Path, help="of a corridor")
-    parser.add_argument("--limits", type=float, nargs="+", default=[0, 20], help="MB")
-    parser.add_argument("--esdf", action="store_true", help="corridor: with the distance field after every frame")
-    parser.add_argument("--voxel", type=float, default=0.04, help="corridor: metres")
     a = parser.parse_args()
     if "scans" in a.parts:
         scans(a.submaps)
     if "cameras" in a.parts:
         cameras()
-    if "corridor" in a.parts:
-        if a.recording is None:
-            parser.error("corridor: expected --recording")
-        corridor(a.recording, a.limits, a.esdf, a.voxel)
+    if "ranges" in a.parts:
+        ranges()
 
 
 if __name__ == "__main__":

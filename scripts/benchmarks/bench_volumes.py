@@ -12,6 +12,9 @@ All parts use the recordings' true poses. Parts:
               where the recording's depth and poses are exact), rendered depth against measured depth
     esdf      the distance field, updated every 5 frames, against computing it anew, against `edt` and scipy
     pace      TSDF and distance field after every frame, without and with a limit
+    corridor  a long walk (`ggslam synth DIR --scene corridor --frames 2400`) at 4 and 2 cm with a distance field after
+              every frame, with a limit of memory (--limits) and without: time and memory of the first, second, fifth
+              and last tenth of the way
     accuracy  the distance field of scenes whose distances are known, against `edt` and scipy; needs no recording
 Open3D and edt come with `pip install 'ggslam[bench]'`; without them ours is printed alone. Occupancy has a benchmark of
 its own, bench_occupancy.py.
@@ -31,6 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 if "--peers" in sys.argv[:-1]:  # behind our own packages, before anything looks for Open3D
     sys.path.append(sys.argv[sys.argv.index("--peers") + 1])
 
+from volume_corridor_runs import corridor_part
 from volume_esdf_runs import accuracy_part, esdf_part, pace_part
 from volume_mesh_runs import compare_meshes
 from volume_runs import compare_fusion
@@ -39,16 +43,24 @@ PARTS: dict[str, Callable[[Path, argparse.Namespace], None]] = {
     "tsdf": compare_fusion, "mesh": compare_meshes,
     "esdf": lambda path, arguments: esdf_part(path, tuple(arguments.esdf_voxels), frames=arguments.frames),
     "pace": lambda path, arguments: pace_part(path, frames=arguments.frames),
+    "corridor": lambda path, arguments: corridor_part(
+        path, tuple(arguments.corridor_voxels), tuple(arguments.limits), arguments.frames
+    ),
 }  # fmt: skip
+
+USUAL = ("tsdf", "mesh", "esdf", "pace", "accuracy")
+"""Parts for any recording."""
 
 
 def main() -> None:
     """Runs the chosen parts on each recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", nargs="*", type=Path)
-    parser.add_argument("--parts", nargs="+", choices=[*PARTS, "accuracy"], default=[*PARTS, "accuracy"])
+    parser.add_argument("--parts", nargs="+", choices=[*PARTS, "accuracy"], default=USUAL)
     parser.add_argument("--voxels", nargs="+", type=float, default=[0.1, 0.05, 0.02, 0.01], help="of the TSDF, metres")
     parser.add_argument("--esdf-voxels", nargs="+", type=float, default=[0.08, 0.04, 0.02], help="metres")
+    parser.add_argument("--corridor-voxels", nargs="+", type=float, default=[0.04, 0.02], help="metres")
+    parser.add_argument("--limits", nargs="+", type=float, default=[80, 450], help="corridor: MB, for each voxel size")
     parser.add_argument("--frames", type=int, help="only the first of a recording")
     parser.add_argument("--views", type=int, help="only so many, spread over the recording")
     parser.add_argument("--peers", type=Path, help="site-packages of another environment that has Open3D")

@@ -17,6 +17,7 @@ from ggslam.sequences import open_sequence
 from ggslam.volumes.esdf import DistanceField, FieldSettings, UpdateStats
 from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf import FREE_VALUE, FULL_WEIGHT, SIDE, VOXELS, TsdfMap
+from ggslam.volumes.volume_settings import VolumeSettings
 
 QUERIES = 2_000_000
 Scene = Callable[[np.ndarray], np.ndarray]
@@ -119,7 +120,7 @@ def esdf_part(
 
 
 def pace_part(
-    recording: Path, voxels: tuple[float, ...] = (0.04, 0.02), budgets: tuple[float | None, ...] = (None, 33.0),
+    recording: Path, voxels: tuple[float, ...] = (0.04, 0.02), budgets: tuple[float, ...] = (0.0, 33.0),
     frames: int | None = None, threads: int | None = None,
 ) -> None:  # fmt: skip
     """Prints how long TSDF and field take with every frame, without and with a limit."""
@@ -127,7 +128,8 @@ def pace_part(
     sequence = open_sequence(recording, stop=frames)
     for voxel in voxels:
         for budget in budgets:
-            tsdf = TsdfMap(TsdfSettings(voxel=voxel), NativeContext(threads), points=True)
+            settings = VolumeSettings(tsdf=TsdfSettings(voxel=voxel), budget_ms=budget)
+            tsdf = TsdfMap(settings.tsdf, NativeContext(threads), points=True)
             field, rows = DistanceField(tsdf), []
             for index in range(len(sequence)):
                 frame = sequence.frame(index, masks=False)
@@ -136,11 +138,10 @@ def pace_part(
                 start = time.perf_counter()
                 tsdf.integrate(frame.depth, sequence.camera, frame.T_world_camera, frame.color)
                 spent = 1e3 * (time.perf_counter() - start)
-                left = None if budget is None else max(0.1, budget - spent)
-                stats = field.update(left, frame.T_world_camera[:3, 3])
+                stats = field.update(settings.left_for_field_ms(spent), frame.T_world_camera[:3, 3])
                 rows.append((spent, 1e3 * (time.perf_counter() - start) - spent, stats.stale_blocks / stats.blocks))
             fusion, update, stale = np.array(rows).T
-            whole, limit = fusion + update, "no limit" if budget is None else f"{budget:g} ms"
+            whole, limit = fusion + update, f"{budget:g} ms" if budget else "no limit"
             print(
                 f"  {100 * voxel:.0f} cm, {limit}: fusion {fusion.mean():.1f} ms, field {update.mean():.1f}, both "
                 f"{whole.mean():.1f}, 95 % {np.percentile(whole, 95):.1f}, largest {whole.max():.1f}; "

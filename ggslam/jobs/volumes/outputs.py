@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from ggslam.driving.inflation import Inflation
 from ggslam.driving.map_files import write_map
 from ggslam.driving.robot import Robot
 from ggslam.errors import RunFolderError
-from ggslam.formats.mesh_files import write_mesh
+from ggslam.formats.mesh_files import PlyPart, write_mesh, write_ply_mesh
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.volumes.pictures import mesh_picture, occupancy_picture
 from ggslam.jobs.volumes.robot_maps import floor_layers, write_robot_maps
@@ -51,6 +51,7 @@ from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import FLOOR_FILE, FloorTuning, floor_from_map, floor_height, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh
+from ggslam.volumes.mesh_parts import MeshParts
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.octomap_files import write_octomap
 from ggslam.volumes.output_frame import OutputFrame
@@ -72,6 +73,8 @@ class VolumeOutputTuning(Tuning):
     """Most cells of a slice."""
     min_piece_triangles = 50
     """Pieces of the mesh with fewer triangles are left out: specks of noise in the air."""
+    upright_vertices = 500_000
+    """Most vertices that the direction up is found from."""
 
 
 @dataclass(frozen=True)
@@ -104,14 +107,14 @@ class Surface:
     """What there is to see, and how it lies.
 
     Attributes:
-        mesh: in the map's frame.
+        parts: of the mesh, in the map's frame.
         upright: which way is up, and where the floor is, seen from `origin`.
         poses: T_map_camera [N, 4, 4] of the frames that were fused.
         T_floor_map: float64 [4, 4], see `floor_frame`; the floor's frame lies below `origin`.
         origin: of the TSDF in the map's frame, [3] metres: zero, but for maps far from it.
     """
 
-    mesh: Mesh
+    parts: MeshParts
     upright: Upright
     poses: np.ndarray
     T_floor_map: np.ndarray
@@ -123,20 +126,28 @@ class Surface:
         return moved_pose(self.poses, -self.origin)
 
     @property
-    def near_mesh(self) -> Mesh:
+    def mesh(self) -> Mesh:
+        """All of the mesh in memory."""
+        return self.parts.whole()
+
+    @property
+    def near_mesh(self) -> MeshParts:
         """The mesh relative to `origin`."""
-        mesh = self.mesh
-        return replace(mesh, vertices=(mesh.vertices - self.origin).astype(np.float32)) if self.origin.any() else mesh
+        if not self.origin.any():
+            return self.parts
+        return self.parts.apply(lambda part: replace(part, vertices=(part.vertices - self.origin).astype(np.float32)))
 
     @staticmethod
     def of(maps: VolumeMaps, poses: Sequence[np.ndarray]) -> Surface:
         """The surface of finished maps."""
-        mesh, stacked, origin = maps.mesh(VolumeOutputTuning.min_piece_triangles), np.array(poses), maps.tsdf.origin
+        parts, origin = maps.mesh_parts(VolumeOutputTuning.min_piece_triangles), maps.tsdf.origin
+        stacked = np.array(poses)
         near = moved_pose(stacked, -origin)
         # Marching cubes' vertices are spread evenly enough over surfaces to stand for their area.
-        upright = estimate_up(near, mesh.vertices - origin if origin.any() else mesh.vertices, mesh.normals)
+        vertices, normals = parts.sample(VolumeOutputTuning.upright_vertices)
+        upright = estimate_up(near, vertices - origin if origin.any() else vertices, normals)
         T_floor_map = floor_from_map(upright, near) @ translation(-origin)
-        return Surface(mesh, upright, stacked, T_floor_map, origin)
+        return Surface(parts, upright, stacked, T_floor_map, origin)
 
 
 @dataclass
@@ -187,26 +198,23 @@ class _Writer:
 
     def mesh(self) -> None:
         """The surface."""
-        mesh = self.surface.mesh
-        if self.request.frame is OutputFrame.floor:
-            mesh = mesh.in_frame(self.T_out_map)
+        parts, is_level = self.surface.parts, self.request.frame is OutputFrame.floor
+        if is_level:
+            parts = parts.apply(lambda part: part.in_frame(self.T_out_map))
         path = self.request.mesh or self.path("mesh.ply")
         if self.request.mesh is not None:
             self.outputs.files.append(path)
-        objects = mesh.objects()
-        labels = mesh.labels if objects else None
-        arrays = (mesh.vertices, mesh.triangles, mesh.normals, mesh.colors)
-        write_mesh(path, *arrays, labels, self.request.names, self.request.frame is OutputFrame.floor)
-        facts = {"vertices": len(mesh.vertices), "triangles": len(mesh.triangles), "objects": objects}
+        objects = parts.objects
+        _write_mesh(path, parts, self.request.names, is_level)
+        facts = {"vertices": parts.vertices, "triangles": parts.triangles, "objects": objects}
         none = "" if facts["triangles"] else "; no surface was found: voxels may be too large, or depth seen too rarely"
         self.tell(f"mesh: {facts['vertices']} vertices, {facts['triangles']} triangles{none}", mesh=facts)
         if self.request.object_meshes:
-            self._object_meshes(mesh, objects)
+            self._object_meshes(parts, objects)
 
-    def _object_meshes(self, mesh: Mesh, objects: list[int]) -> None:
-        labels = mesh.triangle_labels()
+    def _object_meshes(self, parts: MeshParts, objects: list[int]) -> None:
         for number in objects:
-            part, name = mesh.part(labels == number), self.request.names.get(number, "object")
+            part, name = parts.of_object(number), self.request.names.get(number, "object")
             safe = "".join(c if c.isalnum() else "_" for c in name)
             path = self.path(f"object_{number}_{safe}.ply")
             write_mesh(path, part.vertices, part.triangles, part.normals, part.colors, part.labels)
@@ -284,6 +292,24 @@ class _Writer:
         )  # fmt: skip
 
 
+def _write_mesh(path: Path, parts: MeshParts, names: dict[int, str], is_level: bool) -> None:
+    """A PLY part by part; other formats need all of the mesh in memory."""
+
+    def rows() -> Iterator[PlyPart]:
+        for part in parts:
+            mesh, new = part.mesh, part.first
+            labels = mesh.labels[new] if parts.objects else None
+            triangles = part.numbers[mesh.triangles]
+            yield PlyPart(mesh.vertices[new], triangles, mesh.normals[new], mesh.colors[new], labels)
+
+    if path.suffix.lower() == ".ply":
+        write_ply_mesh(path, rows, parts.vertices, parts.triangles)
+        return
+    mesh = parts.whole()
+    labels = mesh.labels if parts.objects else None
+    write_mesh(path, mesh.vertices, mesh.triangles, mesh.normals, mesh.colors, labels, names, is_level)
+
+
 def _words(position: np.ndarray) -> str:
     return f"({', '.join(f'{value:g}' for value in position)})"
 
@@ -355,7 +381,7 @@ def _write_all(writer: _Writer, maps: VolumeMaps, record: dict[str, Any], observ
     writer.mesh()
     writer.floor()
     mesh, upright = writer.surface.near_mesh, writer.surface.upright
-    if len(mesh.triangles):
+    if mesh.triangles:
         write_picture(writer.path("mesh.png"), mesh_picture(mesh, writer.poses, upright.up))
         if writer.outputs.record["mesh"]["objects"]:
             write_picture(writer.path("objects.png"), mesh_picture(mesh, writer.poses, upright.up, by_object=True))

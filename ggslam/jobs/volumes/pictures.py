@@ -10,11 +10,11 @@ import numpy as np
 
 from ggslam.objects.colors import id_palette
 from ggslam.reporting.cloud_pictures import CloudView, draw_cloud, view_along
-from ggslam.reporting.mesh_pictures import draw_mesh
+from ggslam.reporting.mesh_pictures import MeshDrawing
 from ggslam.reporting.pictures import side_by_side
 from ggslam.scene.origin import moved_pose
 from ggslam.system.tuning import Tuning
-from ggslam.volumes.mesh import Mesh
+from ggslam.volumes.mesh_parts import MeshParts
 from ggslam.volumes.occupancy import OccupancyMap
 
 
@@ -27,6 +27,8 @@ class MeshPictureTuning(Tuning):
     """Height of a picture, in pixels."""
     elevation = math.radians(40)
     """Angle at which the camera looks down, in radians."""
+    sample = 500_000
+    """Most vertices of which it is decided where to look from."""
 
 
 def from_above(poses: np.ndarray, points: np.ndarray, up: np.ndarray) -> CloudView:
@@ -55,11 +57,15 @@ def from_a_camera(poses: np.ndarray, up: np.ndarray) -> CloudView:
     )
 
 
-def mesh_picture(mesh: Mesh, poses: np.ndarray, up: np.ndarray, by_object: bool = False) -> np.ndarray:
+def mesh_picture(mesh: MeshParts, poses: np.ndarray, up: np.ndarray, by_object: bool = False) -> np.ndarray:
     """A mesh from a camera and from above, uint8 [H, W, 3], in its colours or those of its objects."""
-    colors = id_palette()[mesh.labels] if by_object else mesh.colors
-    views = [from_a_camera(poses, up), from_above(poses, mesh.vertices, up)]
-    return side_by_side([draw_mesh(mesh.vertices, mesh.triangles, mesh.normals, colors, view) for view in views])
+    spread = mesh.sample(MeshPictureTuning.sample)[0]
+    drawings = [MeshDrawing(view) for view in (from_a_camera(poses, up), from_above(poses, spread, up))]
+    for part in (part.mesh for part in mesh):
+        colors = id_palette()[part.labels] if by_object else part.colors
+        for drawing in drawings:
+            drawing.add(part.vertices, part.triangles, part.normals, colors)
+    return side_by_side([drawing.picture for drawing in drawings])
 
 
 def occupancy_picture(occupancy: OccupancyMap, poses: np.ndarray, up: np.ndarray) -> np.ndarray:
