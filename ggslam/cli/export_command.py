@@ -132,7 +132,8 @@ Frame = Annotated[
 Zoom = Annotated[
     float,
     typer.Option(help="Formats of Gaussians: how many times larger than the run's images they will be drawn (of a map "
-                 "trained at 320x240, 4 for a window of 1280x960): sharper at that size, blurred in smaller windows."),
+                 "trained at 320x240, 4 for a window of 1280x960; 0.5 for one of 160x120): right at that size, softer "
+                 "or fainter at others."),
 ]  # fmt: skip
 
 Up = Annotated[

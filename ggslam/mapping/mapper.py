@@ -21,6 +21,7 @@ from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
 from ggslam.mapping.mean_map import MeanMap
+from ggslam.mapping.other_sizes import picture_of_turn
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.pruning import is_look_due, prune
 from ggslam.mapping.residency import Residency
@@ -45,7 +46,7 @@ class MapperTuning(Tuning):
     to 0.4 dB once they are cut to bytes."""
     noisy_steps = 2
     """Steps per iteration of the final refinement where depth is noisy, each on a quarter of the pixels."""
-    end_share = 1.2
+    end_share = 1.3
     """Iterations of the final refinement per iteration before it."""
     live_end_share = 0.4
     """The same in real time."""
@@ -194,9 +195,7 @@ class Mapper(ABC):
 
     # --- growth ------------------------------------------------------------------------------------------------------
 
-    def add_keyframe(
-        self, frame: Frame, T_world_camera: np.ndarray, labeller: Labeller | None = None
-    ) -> Keyframe:
+    def add_keyframe(self, frame: Frame, T_world_camera: np.ndarray, labeller: Labeller | None = None) -> Keyframe:
         """Makes a keyframe of `frame` seen from `T_world_camera` [4, 4] and inserts what the map lacks there.
 
         Args:
@@ -295,16 +294,25 @@ class Mapper(ABC):
             self._step(keyframe, (1.0, 1.0), self._choose_grid(keyframe), self._is_identity_due(keyframe))
             self._count_iteration()
 
-    def _iterate_wholly(self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0) -> None:
-        """One iteration of the final refinement on some keyframes: a step on all pixels of one or, where depth is
-        noisy, several on every second pixel of as many. It is the same whether identities are trained, too, or not."""
+    def _iterate_wholly(
+        self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0, done: float = 1.0
+    ) -> None:
+        """One iteration of the final refinement, of which `done`, 0 to 1, is over, on some keyframes: a step on all
+        pixels of one or, where depth is noisy, several on every second pixel of as many. It is the same whether
+        identities are trained, too, or not."""
         for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
             keyframe = self._draw(numbers)
-            grid = self._choose_grid(keyframe) if self._is_noisy else ALL_PIXELS
+            grid = self._choose_grid(keyframe) if self._is_noisy else self._choose_size(keyframe, done)
             self._step(keyframe, (rate_factor, pose_factor), grid, step == 0 and self._is_identity_due(keyframe))
-            if grid.is_whole:
+            if not self._is_noisy or grid.is_whole:
                 break
         self._count_iteration()
+
+    def _choose_size(self, keyframe: Keyframe, done: float) -> PixelGrid:
+        """The picture of a step of the final refinement; the recording's own if a loss needs it."""
+        if self.extra_loss is not None or self._is_identity_dense:
+            return ALL_PIXELS
+        return picture_of_turn(self.times.iterations, done, keyframe.camera)
 
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         """Every second pixel of every second row of a keyframe, other ones each time; all if a loss needs them all."""
@@ -492,7 +500,7 @@ class Mapper(ABC):
                 done += 1
                 if done > begin:
                     falling = self.settings.refine_decay ** (i / max(1, steps - 1))
-                    self._iterate_wholly(numbers, 1.0 if share else falling, falling)
+                    self._iterate_wholly(numbers, 1.0 if share else falling, falling, i / steps)
                     left = steps - 1 - i
                     if left < share * steps and left % every == 0:
                         self._mean.add(self.map)

@@ -51,6 +51,18 @@ class PixelGrid:
         """The grid's pixels [h, w, ...] of an image [H, W, ...], where they lie in it."""
         return image if self.is_whole else image[self.row :: self.stride, self.column :: self.stride]
 
+    def color_of(self, color: np.ndarray) -> np.ndarray:
+        """What a step is compared with, of a colour image uint8 [H, W, 3]."""
+        return self.of(color)
+
+    def depth_of(self, depth: np.ndarray) -> np.ndarray:
+        """The same of a depth image [H, W], 0 where there is none."""
+        return self.of(depth)
+
+    def valid_of(self, shown: np.ndarray) -> np.ndarray:
+        """The same of which pixels count, bool [H, W]."""
+        return self.of(shown)
+
     def camera(self, camera: Camera) -> Camera:
         """The camera whose whole image has the grid's pixels of `camera`'s, through the same rays."""
         n = self.stride

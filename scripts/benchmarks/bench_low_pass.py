@@ -7,7 +7,7 @@
 Held-out frames and keyframes are rendered at half, once and twice the size that the run was trained at and compared
 with the recording read at that size, over pixels with measured depth. Twice the size needs a run at `--scale 0.5` or
 less. Which rules: see `LOW_PASS` in ggslam/rendering/types.py and `as_3dgs` of `CpuRasterizer.forward`. --low-pass adds
-a column with ours but for another filter. --zoom widens the map for a larger window, as `ggslam export --zoom` does.
+a column with ours but for another filter. --zoom fits the map to a window of another size, as `ggslam export --zoom`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from held_out import held_out_poses
 from ggslam.evaluation.images import psnr, unit_range
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import LOW_PASS
-from ggslam.rendering.zoom import ZoomWidening
+from ggslam.rendering.zoom import ZoomFit
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.frame import Frame
@@ -112,7 +112,7 @@ def main() -> None:
     parser.add_argument("--recording", type=Path, help="the recording, if it is not where it was")
     parser.add_argument("--every", type=int, default=1, help="render every n-th frame of each set")
     parser.add_argument("--low-pass", type=float, help="another filter, px^2")
-    parser.add_argument("--zoom", type=float, default=1.0, help="widen the map first, as `ggslam export --zoom`")
+    parser.add_argument("--zoom", type=float, default=1.0, help="fit the map first, as `ggslam export --zoom`")
     options = parser.parse_args()
     other = options.low_pass
     drawings = (OURS, THREE_DGS, *([] if other is None else [Drawing(f"{other:g} px^2", low_pass=other)]))
@@ -121,7 +121,7 @@ def main() -> None:
         folder = RunFolder.open(run)
         gaussians, record = folder.gaussians(), folder.keyframes()
         poses, numbers = record.poses(), record.keyframe_numbers()
-        ZoomWidening(folder.sequence().camera, [poses[i] for i in poses if i in numbers], options.zoom)(gaussians)
+        ZoomFit(folder.sequence().camera, [poses[i] for i in poses if i in numbers], options.zoom)(gaussians)
         found = psnr_at_sizes(folder, gaussians, drawings, options.every, options.recording)
         print_rows(run.name, found, drawings)
 

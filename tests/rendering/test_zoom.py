@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussians that are widened for a renderer with smaller pixels than the map was trained with."""
+"""Gaussians that are fitted to renderers with smaller or larger pixels than the map was trained with."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from ggslam.errors import ConfigError
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import LOW_PASS
-from ggslam.rendering.zoom import ZoomWidening
+from ggslam.rendering.zoom import ZoomFit
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -46,7 +46,7 @@ def test_widened_gaussians_look_in_large_as_they_did_in_small(zoom: int) -> None
     gaussians = wall(spacing=2.0 / 60)  # a splat a pixel, as maps have them
     small = drawn(gaussians, 1)
     before = np.abs(drawn(gaussians, zoom) - small).mean()
-    ZoomWidening(CAMERA, [np.eye(4)], zoom)(gaussians)
+    ZoomFit(CAMERA, [np.eye(4)], zoom)(gaussians)
     after = np.abs(drawn(gaussians, zoom) - small).mean()
     assert after < 0.25 * before and before > 0.05
 
@@ -57,7 +57,7 @@ def test_what_is_added_is_the_low_pass_that_a_larger_image_lacks() -> None:
     nearer = np.eye(4)
     nearer[2, 3] = 1.0
     away = np.diag([-1.0, 1.0, -1.0, 1.0])  # looks the other way: nothing in its image
-    widening = ZoomWidening(CAMERA, [np.eye(4), nearer, away], 2)
+    widening = ZoomFit(CAMERA, [np.eye(4), nearer, away], 2)
     widening(gaussians)
     added = (torch.exp(2 * gaussians.log_scales) - before).numpy()
     seen = np.abs(gaussians.means.numpy()[:, 0]) < 0.9  # in the image of the nearer view
@@ -67,17 +67,61 @@ def test_what_is_added_is_the_low_pass_that_a_larger_image_lacks() -> None:
 
 
 def test_points_in_no_image_take_the_distance_of_the_nearest_camera() -> None:
-    widening = ZoomWidening(CAMERA, [np.eye(4)], 2)
-    np.testing.assert_allclose(widening.closest_depths(np.array([[0, 0, -3.0], [0, 0, 5.0]])), [3, 5])
+    widening = ZoomFit(CAMERA, [np.eye(4)], 2)
+    np.testing.assert_allclose(widening.depths(np.array([[0, 0, -3.0], [0, 0, 5.0]])), [[3, 5], [3, 5]])
 
 
 def test_zoom_one_adds_nothing_and_others_are_refused() -> None:
     gaussians = wall(0.2)
     before = gaussians.log_scales.clone()
-    ZoomWidening(CAMERA, [np.eye(4)], 1)(gaussians)
+    ZoomFit(CAMERA, [np.eye(4)], 1)(gaussians)
     torch.testing.assert_close(gaussians.log_scales, before)
-    for zoom in (0.5, float("nan"), 1e6):
+    for zoom in (0.04, -1.0, float("nan"), 1e6):
         with pytest.raises(ConfigError, match="zoom"):
-            ZoomWidening(CAMERA, [np.eye(4)], zoom)
+            ZoomFit(CAMERA, [np.eye(4)], zoom)
     with pytest.raises(ConfigError, match="keyframes"):
-        ZoomWidening(CAMERA, [], 2)
+        ZoomFit(CAMERA, [], 2)
+
+
+def test_the_usual_depth_is_the_geometric_mean_over_the_views_that_see_a_point() -> None:
+    nearer, away = np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])
+    nearer[2, 3] = 1.0
+    closest, usual = ZoomFit(CAMERA, [np.eye(4), nearer, away], 0.5).depths(np.array([[0, 0, 5.0], [1.9, 0, 4.0]]))
+    np.testing.assert_allclose(closest, [4, 4])
+    np.testing.assert_allclose(usual, [np.sqrt(20), 4])
+
+
+def smaller(size: int) -> Camera:
+    """CAMERA at 1 / `size` of its size."""
+    c = CAMERA
+    return Camera(
+        c.width // size,
+        c.height // size,
+        c.fx / size,
+        c.fy / size,
+        (c.cx + 0.5) / size - 0.5,
+        (c.cy + 0.5) / size - 0.5,
+    )
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_fitted_gaussians_look_in_small_as_they_did_in_large(size: int) -> None:
+    """Specks on a wall: what is smaller than the filter is not to grow with it."""
+    gaussians, specks = wall(spacing=5.0 / 60), wall(spacing=13.0 / 60, depth=1.99)
+    for part, log_scale in ((gaussians, np.log(3.0 / 60)), (specks, np.log(0.01 / 60))):
+        part.log_scales[:] = float(log_scale)
+    specks.sh[:] = (1 - 0.5) / 0.28209479
+    gaussians.insert(
+        specks.means, specks.quaternions, specks.log_scales, specks.opacity_logits, torch.ones(len(specks), 3)
+    )
+    large = CpuRasterizer(1).forward(gaussians, CAMERA, np.eye(4), features=False).image.numpy()
+    c = smaller(size)
+    wanted = large.reshape(3, c.height, size, c.width, size).mean((2, 4))
+
+    def error() -> float:
+        shown = CpuRasterizer(1).forward(gaussians, c, np.eye(4), features=False, as_3dgs=True).image.numpy()
+        return float(np.abs(shown - wanted).mean())
+
+    before = error()
+    ZoomFit(CAMERA, [np.eye(4)], 1 / size)(gaussians)
+    assert error() < 0.4 * before and before > 0.02

@@ -18,7 +18,7 @@ from ggslam.jobs.export.splats import SplatRequest, in_turn, splats_of, splats_o
 from ggslam.jobs.export.views import posed_views
 from ggslam.jobs.progress import Observer
 from ggslam.jobs.submaps.stores import is_store
-from ggslam.rendering.zoom import ZoomWidening
+from ggslam.rendering.zoom import ZoomFit
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_file import open_map
 from ggslam.system.atomic import make_folder
@@ -70,8 +70,8 @@ def export_run(
         recording: where the recording is now, if it was moved (colmap, nerfstudio, mesh).
         rendered: mesh: from depth rendered from the map, even if the recording is there.
         zoom: formats of Gaussians: how many times larger than the training views they will be drawn (of a map trained
-            at 320x240, 4 for a window of 1280x960). Widens them as far as renderers will then widen them less: seen at
-            that size they are sharper and without seams, at the training views' size softer.
+            at 320x240, 4 for a window of 1280x960; below 1: smaller). Makes up for what renderers, whose pixels stay
+            the same, then widen them less or more: seen at that size they look as trained, at others softer or fainter.
         frame: mesh: "map", or "floor" (z up, 0 on the floor; floor.yaml beside it tells where that is in the map).
         up: formats of Gaussians: "y", "-y" or "z": turn the map so that this axis of the file points up, away from the
             map's floor. SPZ, glTF and OpenUSD have y upwards.
@@ -102,9 +102,9 @@ def export_run(
     if writer.takes in _OF_A_RUN:
         _with_poses(folder, f"format {writer.name}")
     images = None if recording is None else Path(recording)
-    widen = None if zoom == 1 else _widen_for(_with_poses(folder, "`zoom`"), zoom)
+    fit = None if zoom == 1 else _fit_for(_with_poses(folder, "`zoom`"), zoom)
     turn = None if up is None else upward_turn(folder, up, writer)
-    splats = SplatRequest(objects, min_opacity, plain, in_turn(widen, turn))
+    splats = SplatRequest(objects, min_opacity, plain, in_turn(fit, turn))
     mesh = MeshRequest(voxel, objects, rendered, images, wanted)
     wish = _Wish(writer, place, splats, mesh, voxel, discs, keyframes, images)
     with output_lock(place):
@@ -167,12 +167,12 @@ def _with_poses(folder: RunFolder, what: str) -> RunFolder:
     return folder
 
 
-def _widen_for(folder: RunFolder, zoom: float) -> ZoomWidening:
+def _fit_for(folder: RunFolder, zoom: float) -> ZoomFit:
     record = folder.keyframes()
     poses, numbers = record.poses(), record.keyframe_numbers()
     chosen, recording = [i for i in sorted(poses) if i in numbers], folder.sequence()
     cameras = [recording.camera_of(i) for i in chosen]
-    return ZoomWidening(recording.camera, [poses[i] for i in chosen], zoom, cameras)
+    return ZoomFit(recording.camera, [poses[i] for i in chosen], zoom, cameras)
 
 
 def _refuse_beside_movers(place: Path, *others: object) -> None:

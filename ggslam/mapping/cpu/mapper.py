@@ -227,8 +227,8 @@ class CpuMapper(Mapper):
         valid, compared = self.valid_of(keyframe), self._exposures.usable_pixels(keyframe)
         if compared is not None:
             valid = compared if valid is None else valid & compared
-        color, depth = grid.of(keyframe.color), grid.of(keyframe.depth)
-        shown = None if valid is None else grid.of(valid)
+        color, depth = grid.color_of(keyframe.color), grid.depth_of(keyframe.depth)
+        shown = None if valid is None else grid.valid_of(valid)
         target = LossTarget(color, depth, keyframe.depth_unit, exposure, shown)
         return self._loss.evaluate(view, target, self.settings.loss)
 

@@ -179,15 +179,16 @@ class CudaMapper(Mapper):
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         return ALL_PIXELS
 
+    def _choose_size(self, keyframe: Keyframe, done: float) -> PixelGrid:
+        return ALL_PIXELS
+
     def last_iterations(self, before: int) -> int:
         return round(MapperTuning.all_pixels_end_share * before)
 
     def _render(
         self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
     ) -> RenderBuffers:
-        return self._rasterizer.forward(
-            self.map, keyframe.camera, self._states.pose(keyframe.index), features=features
-        )
+        return self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(keyframe.index), features=features)
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> CudaLossResult:
         assert isinstance(keyframe, CudaKeyframe)
