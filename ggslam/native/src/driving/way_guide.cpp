@@ -5,12 +5,17 @@
 #include <cmath>
 #include <limits>
 
+#include "common/dispatch.hpp"
+
+GGSLAM_DECLARE_KERNEL(void ways_over_places(const float* x, const float* y, const float* z, int count,
+                                            const float* places, int number, float* left))
+
 namespace ggslam::driving {
 namespace {
 
 constexpr float kFar = std::numeric_limits<float>::infinity();
 
-// The places of a patch's cells, and what is left from each to the goal.
+// The places of a patch's cells.
 struct Cells {
   float x[kPatchCells], y[kPatchCells], z[kPatchCells];
 
@@ -20,18 +25,6 @@ struct Cells {
       const Vec3<float> at = low + cast<float>(patches.cell(i));
       x[i] = at[0], y[i] = at[1], z[i] = at[2];
     }
-  }
-  float from(int i, const Vec3<float>& at) const { return steps_between({{x[i], y[i], z[i]}}, at); }
-  // No more than over a place that `value` is left from.
-  void meet(const Vec3<float>& at, float value, float factor, float* left) const {
-    for (int i = 0; i < kPatchCells; ++i) left[i] = std::min(left[i], value + factor * from(i, at));
-  }
-  // As much as ways from a place have that are no shorter than `whole`.
-  void leave(const Vec3<float>& start, float whole, float* left) const {
-    for (int i = 0; i < kPatchCells; ++i) left[i] = std::max(0.0f, whole - from(i, start));
-  }
-  void keep_apart(const Vec3<float>& goal, float* left) const {
-    for (int i = 0; i < kPatchCells; ++i) left[i] = std::max(left[i], from(i, goal));
   }
 };
 
@@ -81,6 +74,7 @@ void WayGuide::step() {
   const Vec3<float> middle = patches_.patch(entry.cell).middle;
   const float factor = patches_.patch(entry.cell).factor;
   for (const int64_t n : around_) {
+    if (node(n).done) continue;
     const Patch& there = patches_.patch(n);
     const float value = entry.value + steps_between(middle, there.middle) * 0.5f * (factor + there.factor);
     if (value < node(n).value) reach(n, value);
@@ -106,27 +100,28 @@ void WayGuide::fill(CellPlace p, int index, int64_t most) {
 // What is left from the cells of a patch; whether that is known, and not only a bound of it.
 bool WayGuide::fill(int64_t patch, int64_t most, float* left) {
   while (!node(patch).done && !queue_.is_empty() && expanded_ < most) step();
-  const Vec3<float> middle = patches_.patch(patch).middle;
-  const float factor = patches_.patch(patch).factor, value = node(patch).value;
-  Cells cells(patches_, patch);
   std::fill_n(left, kPatchCells, kFar);
-  if (node(patch).done) {
-    // What is nearer to the goal and about as far on the way is to be known as well.
-    const float rank = value + steps_between(middle, start_) + static_cast<float>(patches_.side());
-    while (queue_.rank() < rank && !queue_.is_empty()) step();
-    patches_.around(patch, &around_);
-    for (const int64_t n : around_) {
-      if (!(node(n).value <= value)) continue;
-      cells.meet(patches_.patch(n).middle, node(n).value, 0.5f * (factor + patches_.patch(n).factor), left);
-      if (std::count(goal_patches_.begin(), goal_patches_.end(), n) > 0) cells.meet(goal_, 0, factor, left);
-    }
-  } else if (!queue_.is_empty()) {  // it is farther than all that was looked at
-    cells.leave(start_, queue_.rank(), left);
-  } else {
-    return true;
+  if (!node(patch).done && queue_.is_empty()) return true;
+  const Cells cells(patches_, patch);
+  if (!node(patch).done) {  // it is farther than all that was looked at
+    for (int i = 0; i < kPatchCells; ++i)
+      left[i] = std::max(0.0f, queue_.rank() - steps_between({{cells.x[i], cells.y[i], cells.z[i]}}, start_));
+    return false;
   }
-  cells.keep_apart(goal_, left);
-  return node(patch).done;
+  const float factor = patches_.patch(patch).factor, value = node(patch).value;
+  places_.clear();
+  const auto add = [&](const Vec3<float>& at, float value_there, float factor_there) {
+    places_.insert(places_.end(), {at[0], at[1], at[2], value_there, factor_there});
+  };
+  patches_.around(patch, &around_);
+  for (const int64_t n : around_) {
+    if (!(node(n).value <= value)) continue;
+    add(patches_.patch(n).middle, node(n).value, 0.5f * (factor + patches_.patch(n).factor));
+    if (std::count(goal_patches_.begin(), goal_patches_.end(), n) > 0) add(goal_, 0, factor);
+  }
+  static const auto over = GGSLAM_DISPATCH(best_isa(), ways_over_places);
+  over(cells.x, cells.y, cells.z, kPatchCells, places_.data(), static_cast<int>(places_.size() / 5), left);
+  return true;
 }
 
 }  // namespace ggslam::driving

@@ -61,6 +61,7 @@ class WayGuide {
   std::vector<int64_t> goal_patches_, around_;
   CostQueue queue_;
   std::vector<Node> nodes_;
+  std::vector<float> places_;  // five numbers each, see `ways_over_places`
   uint32_t version_ = 0;
   int64_t expanded_ = 0;
 };

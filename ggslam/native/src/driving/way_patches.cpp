@@ -19,7 +19,7 @@ int power3(int axis) { return axis == 0 ? 1 : axis == 1 ? 3 : 9; }
 
 WayPatches::WayPatches(const WayGrid& grid)
     : grid_(grid), side_bits_(grid.dimensions == 2 ? 3 : 2), per_side_bits_(grid.bits[0] - side_bits_),
-      count_(1 << (per_side_bits_ * grid.dimensions)) {
+      count_bits_(per_side_bits_ * grid.dimensions), count_(1 << count_bits_) {
   const int n = grid.dimensions, per_side = 1 << per_side_bits_;
   index_.resize(static_cast<std::size_t>(grid.cells));
   for (int i = 0; i < grid.cells; ++i) {
@@ -54,8 +54,8 @@ void WayPatches::begin(const WayCost& cost) {
 }
 
 Vec3i WayPatches::low(int64_t number) const {
-  const BlockCoordinates b = blocks_[static_cast<std::size_t>(number / count_)].at;
-  const int index = static_cast<int>(number % count_), mask = (1 << per_side_bits_) - 1;
+  const BlockCoordinates b = blocks_[static_cast<std::size_t>(number >> count_bits_)].at;
+  const int index = static_cast<int>(number & (count_ - 1)), mask = (1 << per_side_bits_) - 1;
   Vec3i out{{b.x << grid_.bits[0], b.y << grid_.bits[1], b.z << grid_.bits[2]}};
   for (int a = 0; a < grid_.dimensions; ++a) out[a] += (index >> (per_side_bits_ * a) & mask) << side_bits_;
   return out;
@@ -64,8 +64,9 @@ Vec3i WayPatches::low(int64_t number) const {
 int32_t WayPatches::add_block(BlockCoordinates at) {
   if (patches_.size() + static_cast<std::size_t>(count_) >= kMostPatches) refuse("grid: too many cells");
   const int32_t row = static_cast<int32_t>(blocks_.size());
-  blocks_.push_back({at, search_ - 1, ~0u, -1, {}});
-  std::fill_n(blocks_.back().around, kAround, kUnknown);
+  blocks_.push_back({at, search_ - 1, search_ - 1, ~0u, -1, {}});
+  for (int n = 0; n < kAround; ++n)
+    blocks_.back().around[n] = grid_.dimensions == 2 && n / 9 != 1 ? -1 : kUnknown;
   patches_.resize(patches_.size() + static_cast<std::size_t>(count_), {0, {{0, 0, 0}}, 1});
   return row;
 }
@@ -156,29 +157,31 @@ int64_t WayPatches::number(const Vec3i& cell) {
   return found;
 }
 
-// The block, and the place in it, of the patches beside one; -1: there are none.
-int32_t WayPatches::row_beside(int64_t number, int n, int* index) {
-  const std::size_t row = static_cast<std::size_t>(number / count_);
-  const uint16_t there = beside_[static_cast<std::size_t>(number % count_) * kAround + static_cast<std::size_t>(n)];
-  const int beyond = there >> 8;
-  *index = there & 255;
-  int32_t other = blocks_[row].around[beyond];
-  if (other == -1) return -1;
-  if (other == kUnknown || blocks_[static_cast<std::size_t>(other)].seen != search_) {
-    const BlockCoordinates at = blocks_[row].at;
-    other = block({at.x + beyond % 3 - 1, at.y + beyond / 3 % 3 - 1, at.z + beyond / 9 - 1});
-    blocks_[row].around[beyond] = other;
+// Finds all blocks around one.
+void WayPatches::look_around(int32_t row) {
+  const BlockCoordinates at = blocks_[static_cast<std::size_t>(row)].at;
+  for (int n = 0; n < kAround; ++n) {
+    const int32_t known = blocks_[static_cast<std::size_t>(row)].around[n];
+    if (known == -1 || (known >= 0 && blocks_[static_cast<std::size_t>(known)].seen == search_)) continue;
+    const int32_t other = block({at.x + n % 3 - 1, at.y + n / 3 % 3 - 1, at.z + n / 9 - 1});
+    blocks_[static_cast<std::size_t>(row)].around[n] = other;
   }
-  return other;
+  blocks_[static_cast<std::size_t>(row)].looked = search_;
 }
 
 void WayPatches::around(int64_t number, std::vector<int64_t>* found) {
   // Faces first, then edges, then corners: each is reached over one that comes before it.
   static constexpr int kOrder[26] = {4,  10, 12, 14, 16, 22, 1,  3,  5,  7,  9,  11, 15,
                                      17, 19, 21, 23, 25, 0,  2,  6,  8,  18, 20, 24, 26};
+  const std::size_t row = static_cast<std::size_t>(number >> count_bits_);
+  if (blocks_[row].looked != search_) look_around(static_cast<int32_t>(row));
+  const int32_t* rows = blocks_[row].around;
+  const uint16_t* beside = beside_.data() + static_cast<std::size_t>(number & (count_ - 1)) * kAround;
   uint64_t open[kAround] = {};
   found->assign(1, number), open[kHere] = patch(number).open;
   for (const int n : kOrder) {
+    const int32_t first = rows[beside[n] >> 8];
+    if (first < 0) continue;
     const int step[3] = {n % 3 - 1, n / 3 % 3 - 1, n / 9 - 1};
     uint64_t from[3];
     bool any = false;
@@ -186,10 +189,9 @@ void WayPatches::around(int64_t number, std::vector<int64_t>* found) {
       from[a] = step[a] == 0 ? 0 : open[n - step[a] * power3(a)] & (step[a] > 0 ? face_[a] << beyond_[a] : face_[a]);
       any |= from[a] != 0;
     }
-    if (!any || (grid_.dimensions == 2 && step[2] != 0)) continue;
-    int index = 0;
-    for (int32_t row = row_beside(number, n, &index); row >= 0; row = blocks_[static_cast<std::size_t>(row)].next) {
-      const int64_t there = static_cast<int64_t>(row) * count_ + index;
+    if (!any) continue;
+    for (int32_t to = first; to >= 0; to = blocks_[static_cast<std::size_t>(to)].next) {
+      const int64_t there = static_cast<int64_t>(to) * count_ + (beside[n] & 255);
       const uint64_t own = patch(there).open;
       bool is_joined = false;
       for (int a = 0; a < 3; ++a)

@@ -49,7 +49,8 @@ class WayPatches {
  private:
   struct Block {
     BlockCoordinates at;
-    uint32_t seen, version;   // in which search, and which state of the grid's block
+    uint32_t seen, looked;    // in which search, and when all around was
+    uint32_t version;         // of the grid's block
     int32_t next;             // holds further patches of the same cells; -1: there are none
     int32_t around[kAround];  // -1: nothing, kUnknown
   };
@@ -59,9 +60,9 @@ class WayPatches {
   void look(int32_t row, int index, const float* clearance);
   uint64_t part(uint64_t open) const;
   Patch patch_of(const Vec3i& low, uint64_t open, float best) const;
-  int32_t row_beside(int64_t number, int n, int* index);
+  void look_around(int32_t row);
   const WayGrid& grid_;
-  const int side_bits_, per_side_bits_, count_;
+  const int side_bits_, per_side_bits_, count_bits_, count_;
   std::vector<uint8_t> index_;
   std::vector<uint16_t> beside_;  // of each patch of a block: number of the block around, patch in it
   uint64_t face_[3];              // cells of a patch's lower face

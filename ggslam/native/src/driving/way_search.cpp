@@ -16,8 +16,9 @@ struct Haste {
   float greed, spared;  // what is told to be left counts times this, but for so many cells
 };
 constexpr Haste kFirst{1.08f, 2}, kThen{1, 4};  // the guide tells up to 4 cells too much
-constexpr int64_t kMostBettering = 10000;       // cells
-constexpr int64_t kPatches = 32768;  // that the guide looks at before it is no more work than the search itself
+constexpr int64_t kMostBettering = 6000;        // cells
+// Patches that the guide looks at before it is no more work than the search; of what is not read there is no end.
+constexpr int64_t kPatches = 32768, kPatchesOfPages = 4096;
 constexpr float kWorthwhile = 0.005f;  // part of a step's length that a way has to be cheaper by to be taken instead
 
 // The 26 cells around one, of which a grid of two dimensions has the 8 in the middle.
@@ -63,7 +64,8 @@ void WaySearch::begin(const WayQuery& query) {
 float WaySearch::estimate(CellPlace p) {
   const Haste& haste = is_found_ ? kThen : kFirst;
   const float straight = steps_between(cast<float>(grid_.cell_at(p)), near_goal_);
-  const float guided = haste.greed * (guide_.left(p, kPatches + expanded_ - guided_) - haste.spared);
+  const int64_t most = (grid_.page == 0 ? kPatches : kPatchesOfPages) + expanded_ - guided_;
+  const float guided = haste.greed * (guide_.left(p, most) - haste.spared);
   return std::max(std::max(straight, guided), grid_.ahead(p));
 }
 
