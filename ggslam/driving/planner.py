@@ -107,7 +107,7 @@ class Planner:
         """Pages of the map that were read."""
         self._reading, self._goal = 0.0, np.zeros(3)
         self._reach_cells = int(np.ceil((self.costs.radius + self.costs.margin) / plan_map.cell)) + 1
-        self._context = NativeContext()
+        self._context = NativeContext(1)  # waking a thread takes longer than an obstacle
         self._obstacles: list[np.ndarray] = []
         if not self.grid.page:
             self._read_page((0, 0, 0))

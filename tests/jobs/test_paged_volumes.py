@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from command_line import ggslam, refuse, succeed
@@ -13,12 +14,21 @@ from ggslam.formats.triangle_mesh import read_mesh
 
 NEAR = ("--set", "volumes.tsdf.max_depth=1.8", "--set", "volumes.esdf.max_distance=0.3")
 WORDS = ("--voxel", 0.03, "--esdf", "--no-objects", "--set", "volumes.esdf_every=6", *NEAR)
+ROBOTS = ("--robot", "low:0.3,0.12", "--robot", "tall:1.2,0.2", "--inflation", "0.6,5")
 
 
 @pytest.fixture(scope="module")
 def whole(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole") / "out"
-    succeed("volumes", room, "--out", out, *WORDS)
+    succeed("volumes", room, "--out", out, *WORDS, *ROBOTS)
+    return out
+
+
+@pytest.fixture(scope="module")
+def paged(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("paged") / "out"
+    said = succeed("volumes", room, "--out", out, *WORDS, *ROBOTS, "--set", "volumes.budget_mb=1")
+    assert "went to disk" in said and " 0 went to disk" not in said
     return out
 
 
@@ -28,14 +38,22 @@ def triangles(path: Path) -> list[bytes]:
     return sorted(row.tobytes() for row in mesh.vertices[mesh.triangles])
 
 
-def test_files_are_those_of_everything_in_memory(room: Path, whole: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    said = succeed("volumes", room, "--out", out, *WORDS, "--set", "volumes.budget_mb=1")
-    assert "went to disk" in said and " 0 went to disk" not in said
+def test_files_are_those_of_everything_in_memory(whole: Path, paged: Path) -> None:
     for name in ("tsdf.npz", "map.pgm", "map.yaml", "floor.yaml"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
-    assert triangles(out / "mesh.ply") == triangles(whole / "mesh.ply")
-    assert not [path for path in out.iterdir() if path.name.startswith(".")]  # no cells are left
+        assert (paged / name).read_bytes() == (whole / name).read_bytes(), name
+    assert triangles(paged / "mesh.ply") == triangles(whole / "mesh.ply")
+    assert not [path for path in paged.iterdir() if path.name.startswith(".")]  # no cells are left
+
+
+def test_bands_of_robots_are_those_of_everything_in_memory(whole: Path, paged: Path) -> None:
+    """Maps and costmaps of two robots, of a volume whose cells went to disk and came back."""
+    costs = {}
+    for name in ("low", "tall"):
+        costs[name] = cv2.imread(str(paged / f"costmap_{name}.png"), cv2.IMREAD_UNCHANGED)
+        assert len(np.unique(costs[name])) > 20, "a costmap with all its levels"
+        for file in (f"map_{name}.pgm", f"map_{name}.yaml", f"costmap_{name}.png", f"costmap_{name}.yaml"):
+            assert (paged / file).read_bytes() == (whole / file).read_bytes(), file
+    assert (costs["low"] != costs["tall"]).any()
 
 
 def test_files_are_made_of_what_is_on_disk(room: Path, tmp_path: Path) -> None:

@@ -54,6 +54,7 @@ int32_t WayGrid::make(BlockCoordinates at) {
   if ((blocks_.size() + 1) * static_cast<std::size_t>(cells) >= kMostCells) refuse("grid: too many cells");
   const int32_t row = static_cast<int32_t>(table_.insert(at));
   blocks_.emplace_back();
+  ++layout_;
   WayBlock& made = blocks_.back();
   made.around[kHere] = row;
   made.clearance.reset(new float[static_cast<std::size_t>(cells)]);
@@ -80,6 +81,7 @@ void WayGrid::write(const Vec3i& low, const Vec3i& shape, const float* clearance
         int32_t row = table_.find(block_of(c));
         if (row < 0 && std::any_of(line + x, line + x + run, entered)) row = make(block_of(c));
         if (row >= 0) {
+          ++block(row).version;
           float* to = block(row).clearance.get() + index_of(c);
           for (int i = 0; i < run; ++i) to[i] = line[x + i] * scale;
         }
@@ -98,7 +100,7 @@ void WayGrid::read(const Vec3i& low, const Vec3i& shape, float* clearance) const
 
 std::size_t WayGrid::bytes() const {
   std::size_t sum = table_.bytes() + blocks_.capacity() * sizeof(WayBlock);
-  for (const WayBlock& b : blocks_) sum += static_cast<std::size_t>(cells) * (4 + (b.nodes ? sizeof(WayNode) : 0) + (b.ahead ? 4 : 0));
+  for (const WayBlock& b : blocks_) sum += static_cast<std::size_t>(cells) * (4 + (b.nodes ? sizeof(WayNode) : 0) + (b.ahead ? 4 : 0) + (b.guide ? 4 : 0));
   return sum;
 }
 

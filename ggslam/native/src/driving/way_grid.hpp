@@ -35,6 +35,9 @@ struct WayBlock {
   uint32_t search = 0;  // which search the nodes are of
   std::unique_ptr<float[]> ahead;  // what the way to the goal costs at least, as earlier searches know
   uint32_t goal = 0;               // which goal that is
+  uint32_t version = 0;            // of the clearances
+  std::unique_ptr<float[]> guide;  // see WayGuide
+  uint32_t guided[16] = {};        // by patch: of which guide
 };
 
 // Where a cell is.
@@ -70,7 +73,9 @@ class WayGrid {
 
   void write(const Vec3i& low, const Vec3i& shape, const float* clearance);
   void read(const Vec3i& low, const Vec3i& shape, float* clearance) const;
-  void finish_page(BlockCoordinates at) { finished_.insert(at); }
+  void finish_page(BlockCoordinates at) { finished_.insert(at), ++layout_; }
+  // Another number whenever blocks or pages have come.
+  std::size_t layout() const { return layout_; }
   std::size_t bytes() const;
 
   // Whether a block that is not there may still come.
@@ -80,6 +85,7 @@ class WayGrid {
   std::size_t size() const { return blocks_.size(); }
   WayBlock& block(int32_t row) { return blocks_[static_cast<std::size_t>(row)]; }
   const WayBlock& block(int32_t row) const { return blocks_[static_cast<std::size_t>(row)]; }
+  int32_t row(BlockCoordinates at) const { return table_.find(at); }  // -1: not there
   BlockCoordinates at(int32_t row) const { return table_.at(static_cast<std::size_t>(row)); }
 
   BlockCoordinates block_of(const Vec3i& c) const { return {c[0] >> bits[0], c[1] >> bits[1], c[2] >> bits[2]}; }
@@ -128,6 +134,7 @@ class WayGrid {
   std::unordered_set<BlockCoordinates, PageHash, SamePage> finished_;
   uint32_t search_ = 0, goal_ = 0, first_ = 0;  // numbers of the search, of its goal, of the first search for that
   bool forgotten_ = false;
+  std::size_t layout_ = 1;
   std::vector<float> costs_;  // of the ways that the searches from `first_` on found; negative: nothing is known
 };
 

@@ -11,7 +11,14 @@ namespace ggslam::driving {
 namespace {
 
 constexpr float kFar = std::numeric_limits<float>::infinity();
-constexpr float kDiagonal = 0.41421356f, kSpaceDiagonal = 0.73205081f;  // how much longer than a straight step
+// A search goes for the goal first, and betters what it found as long as that is not much work.
+struct Haste {
+  float greed, spared;  // what is told to be left counts times this, but for so many cells
+};
+constexpr Haste kFirst{1.08f, 2}, kThen{1, 4};  // the guide tells up to 4 cells too much
+constexpr int64_t kMostBettering = 6000;        // cells
+// Patches that the guide looks at before it is no more work than the search; of what is not read there is no end.
+constexpr int64_t kPatches = 32768, kPatchesOfPages = 4096;
 constexpr float kWorthwhile = 0.005f;  // part of a step's length that a way has to be cheaper by to be taken instead
 
 // The 26 cells around one, of which a grid of two dimensions has the 8 in the middle.
@@ -37,31 +44,11 @@ const Steps& steps() {
 
 }  // namespace
 
-void CostQueue::clear() {
-  for (std::vector<Entry>& bucket : buckets_) bucket.clear();
-  current_ = count_ = 0;
-}
-
-void CostQueue::push(float rank, Entry entry) {
-  const std::size_t bucket = static_cast<std::size_t>(std::max(rank, 0.0f) / kStep);
-  if (bucket >= buckets_.size()) buckets_.resize(bucket + bucket / 2 + 64);
-  buckets_[bucket].push_back(entry);
-  current_ = count_++ == 0 ? bucket : std::min(current_, bucket);
-}
-
-bool CostQueue::pop(Entry* entry) {
-  if (count_ == 0) return false;
-  while (buckets_[current_].empty()) ++current_;
-  *entry = buckets_[current_].back();
-  buckets_[current_].pop_back();
-  --count_;
-  return true;
-}
-
 void WaySearch::begin(const WayQuery& query) {
   const auto same_place = [](const double* a, const double* b) { return std::equal(a, a + 3, b); };
-  const bool same_goal = same_place(query.goal, query_.goal) && query.radius == query_.radius &&
-                         query.margin == query_.margin && query.weight == query_.weight && !query.widest && !query_.widest;
+  const bool same_cost =
+      query.radius == query_.radius && query.margin == query_.margin && query.weight == query_.weight;
+  const bool same_goal = same_place(query.goal, query_.goal) && same_cost && !query.widest && !query_.widest;
   query_ = query;
   const float scale = static_cast<float>(1 / grid_.cell);
   cost_ = {query.radius * scale, query.margin * scale, query.weight};
@@ -69,16 +56,27 @@ void WaySearch::begin(const WayQuery& query) {
   near_goal_ = cast<float>(goal_);
   queue_.clear(), widest_ = {}, goals_.clear(), points_.clear();
   grid_.begin_search(same_goal);
-  seeded_ = false, state_ = kSearching, best_ = query.widest ? -1 : kFar, expanded_ = 0;
+  seeded_ = is_found_ = false, state_ = kSearching, best_ = query.widest ? -1 : kFar;
+  expanded_ = guided_ = 0, most_ = std::numeric_limits<int64_t>::max();
   last_ = nearest_cell_ = {-1, 0}, nearest_ = kFar;
 }
 
-float WaySearch::distance_left(const Vec3i& cell) const {
-  const float x = std::fabs(static_cast<float>(cell[0]) - near_goal_[0]);
-  const float y = std::fabs(static_cast<float>(cell[1]) - near_goal_[1]);
-  const float z = std::fabs(static_cast<float>(cell[2]) - near_goal_[2]);
-  const float most = std::max(std::max(x, y), z), least = std::min(std::min(x, y), z), sum = x + y + z;
-  return most + kDiagonal * (sum - most - least) + (kSpaceDiagonal - kDiagonal) * least;
+float WaySearch::estimate(CellPlace p) {
+  const Haste& haste = is_found_ ? kThen : kFirst;
+  const float straight = steps_between(cast<float>(grid_.cell_at(p)), near_goal_);
+  const int64_t most = (grid_.page == 0 ? kPatches : kPatchesOfPages) + expanded_ - guided_;
+  const float guided = haste.greed * (guide_.left(p, most) - haste.spared);
+  return std::max(std::max(straight, guided), grid_.ahead(p));
+}
+
+// Ranks what is left of a search that found a way by what may better it.
+void WaySearch::better() {
+  is_found_ = true, most_ = expanded_ + kMostBettering;
+  queue_.sort([this](const CostQueue::Entry& entry) {
+    if (entry.value > grid_.node(place(entry.cell), kFar).value) return kFar;
+    const float whole = entry.value + estimate(place(entry.cell));
+    return whole < best_ ? whole : kFar;
+  });
 }
 
 bool WaySearch::needs_page(const Vec3i& cell) {
@@ -118,17 +116,21 @@ SearchState WaySearch::seed() {
   seeded_ = true;
   goals_ = ends(goal_);
   if (goals_.empty()) return kNoWay;
+  if (!query_.widest) {
+    guide_.begin(cost_, cast<float>(start_), near_goal_);
+    for (const End& end : goals_) guide_.add_goal(grid_.cell_at(end.place));
+  }
   for (const End& end : ends(start_)) reach(end.place, grid_.cell_at(end.place), end.cost, kHere);
   return kSearching;
 }
 
 void WaySearch::reach(CellPlace p, const Vec3i& cell, float value, uint8_t step) {
   WayNode& node = grid_.node(p, query_.widest ? -1 : kFar);
-  const float left = distance_left(cell);
   node.value = value, node.step = step;
+  const float left = steps_between(cast<float>(cell), near_goal_);
   if (left < nearest_) nearest_ = left, nearest_cell_ = p;
   if (query_.widest) widest_.push({value, number(p)});
-  else if (const float whole = value + std::max(left, grid_.ahead(p)); whole < kFar) queue_.push(whole, {number(p), value});
+  else if (const float whole = value + estimate(p); whole < kFar) queue_.push(whole, {number(p), value});
 }
 
 bool WaySearch::look_around(CellPlace p, float* clearance, CellPlace* places) {
@@ -194,7 +196,12 @@ SearchState WaySearch::expand(uint32_t cell, float value) {
 }
 
 SearchState WaySearch::go_on(int64_t most) {
-  if (state_ == kNeedsPages) state_ = kSearching;
+  if (state_ == kNeedsPages) {
+    state_ = kSearching;
+    // Pages that came show the guide more; it begins again when that is no more work than was done since.
+    if (seeded_ && !query_.widest && expanded_ - guided_ >= guide_.expanded())
+      guide_.begin_again(), guided_ = expanded_;
+  }
   if (!seeded_ && state_ == kSearching) state_ = seed();
   for (int64_t i = 0; i < most && state_ == kSearching; ++i) {
     CostQueue::Entry entry{0, 0};
@@ -205,16 +212,26 @@ SearchState WaySearch::go_on(int64_t most) {
       }
       entry = {widest_.top().second, widest_.top().first};
       widest_.pop();
-    } else if (queue_.rank() >= best_ || !queue_.pop(&entry)) {
-      finish();
-      break;
+    } else {
+      if (queue_.rank() >= best_ && !is_found_) better();
+      if (queue_.rank() >= best_ || expanded_ >= most_ || !queue_.pop(&entry)) {
+        finish();
+        break;
+      }
     }
     const float known = grid_.node(place(entry.cell), query_.widest ? -1 : kFar).value;
     if (query_.widest ? entry.value < known : entry.value > known) continue;  // reached in a better way since
+    if (!query_.widest && guide_.is_old(place(entry.cell))) {
+      const float whole = entry.value + estimate(place(entry.cell));
+      if (whole > queue_.rank() + 1) {  // it is worth less than was known when it was reached
+        if (whole < kFar) queue_.push(whole, entry);
+        continue;
+      }
+    }
     state_ = expand(entry.cell, entry.value);
     if (state_ != kNeedsPages) continue;
     if (query_.widest) widest_.push({entry.value, entry.cell});
-    else queue_.push(entry.value + estimate(place(entry.cell), grid_.cell_at(place(entry.cell))), entry);
+    else queue_.push(entry.value + estimate(place(entry.cell)), entry);
   }
   return state_;
 }

@@ -1,37 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
-// Searches on a grid: A* for the cheapest way of a ball, and the way with the largest least clearance.
+// Searches on a grid: A* for the cheapest way of a ball, guided by a search over patches of cells, and the way with the
+// largest least clearance.
 #pragma once
 #include <algorithm>
 #include <queue>
 #include <vector>
 
 #include "abi/core/planning.hpp"
+#include "driving/cost_queue.hpp"
 #include "driving/way_cost.hpp"
 #include "driving/way_grid.hpp"
+#include "driving/way_guide.hpp"
 
 namespace ggslam::driving {
 
-// Cells of which a search goes on with those of the least cost, to a part of a cell.
-class CostQueue {
- public:
-  struct Entry {
-    uint32_t cell;
-    float value;
-  };
-  void clear();
-  void push(float rank, Entry entry);
-  bool pop(Entry* entry);
-  float rank() const { return static_cast<float>(current_) * kStep; }  // of the next, or a little less
-
- private:
-  static constexpr float kStep = 0.03125f;
-  std::vector<std::vector<Entry>> buckets_;
-  std::size_t current_ = 0, count_ = 0;
-};
-
 class WaySearch {
  public:
-  explicit WaySearch(WayGrid& grid) : grid_(grid) {}
+  explicit WaySearch(WayGrid& grid) : grid_(grid), guide_(grid) {}
 
   void begin(const WayQuery& query);
   SearchState go_on(int64_t most);
@@ -52,8 +37,8 @@ class WaySearch {
   // Clearances of the cells around one; whether none of them is on a page that is not there.
   bool look_around(CellPlace p, float* clearance, CellPlace* places);
   void reach(CellPlace p, const Vec3i& cell, float value, uint8_t step);
-  float distance_left(const Vec3i& cell) const;
-  float estimate(CellPlace p, const Vec3i& cell) const { return std::max(distance_left(cell), grid_.ahead(p)); }
+  float estimate(CellPlace p);
+  void better();
   void finish();
   uint32_t number(CellPlace p) const {
     return static_cast<uint32_t>(p.row) * static_cast<uint32_t>(grid_.cells) + static_cast<uint32_t>(p.index);
@@ -64,12 +49,14 @@ class WaySearch {
   }
 
   WayGrid& grid_;
+  WayGuide guide_;
   WayQuery query_{};
   WayCost cost_{};
   Vec3<double> start_{}, goal_{};
   Vec3<float> near_goal_{};  // rounded
   SearchState state_ = kNoWay;
-  bool seeded_ = false;
+  bool seeded_ = false, is_found_ = false;
+  int64_t most_ = 0, guided_ = 0;  // cells that are looked at at most, and were when the guide began
   CostQueue queue_;
   std::priority_queue<std::pair<float, uint32_t>> widest_;
   std::vector<End> goals_;
