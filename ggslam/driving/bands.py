@@ -14,14 +14,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ggslam.abi.core import BEHIND_BIT, SEEN_BIT
+from ggslam.driving.band_sources import band_source
 from ggslam.driving.robot import Robot
 from ggslam.errors import InputError
 from ggslam.scene.poses import inverse
 from ggslam.system.tuning import Tuning
-from ggslam.volumes.cell_grid import CellGrid, SlicePlane
-from ggslam.volumes.columns import seen_above
+from ggslam.volumes.cell_field import AnyField
+from ggslam.volumes.cell_grid import CellGrid, GridWindow, SlicePlane
 from ggslam.volumes.esdf import DistanceField
-from ggslam.volumes.seen_surface import SeenSurface, unseen_surface
+from ggslam.volumes.seen_surface import unseen_surface
 from ggslam.volumes.tsdf import SIDE
 
 
@@ -31,10 +32,8 @@ class BandTuning(Tuning):
     reach_voxels = 0.75
     """Distance from a surface point in voxels up to which a cell is occupied: with less, walls have holes where cells
     are smaller than voxels, for the points are up to 1.4 voxels apart."""
-    most_layer_bytes = 256 << 20
-    """Most memory for what was seen at the heights of a volume; of large maps each band looks again."""
-    same_place = 1 / 16
-    """Surface points above one another count as one if they are this share of a cell apart."""
+    cells_at_once = 1 << 20
+    """Cells whose distances are computed together."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ class HeightLayers:
     volume as it is when the object is made.
 
     Args:
-        field: up to date.
+        field: up to date; cells on disk are read a few at a time.
         plane: of the floor, its normal up.
         resolution: edge of a cell, metres.
         floor_seen: whether the plane is a floor, and no guess: what is free below it is then no floor.
@@ -94,11 +93,11 @@ class HeightLayers:
         InputError: a resolution that is not positive, or more than 50 million cells.
     """
 
-    def __init__(self, field: DistanceField, plane: SlicePlane, resolution: float, floor_seen: bool = True) -> None:
+    def __init__(self, field: AnyField, plane: SlicePlane, resolution: float, floor_seen: bool = True) -> None:
         self.grid = CellGrid.over(plane, resolution)
         self._field, self._floor_seen = field, floor_seen
-        self._surface = SeenSurface(field, self.grid.plane)
-        self._layers: dict[int, np.ndarray] = {}
+        self._source = band_source(field, self.grid)
+        self._drops: dict[float, np.ndarray] = {}
         edge = SIDE * field.voxel
         middles = (field.coordinates() + 0.5) * edge + field.origin
         heights = plane.coordinates(middles)[:, 2]
@@ -122,8 +121,10 @@ class HeightLayers:
             return np.zeros(self.grid.shape, bool)
         # Half a voxel more: the voxel around a place that low reaches half its edge up.
         layer = np.floor(-step / self._field.voxel - 0.5 + 1e-6) * self._field.voxel
-        seen = self._see(layer, layer)
-        return ((seen & SEEN_BIT) > 0) & ((seen & BEHIND_BIT) == 0)
+        if layer not in self._drops:
+            seen = self._source.seen(layer, layer)
+            self._drops[layer] = ((seen & SEEN_BIT) > 0) & ((seen & BEHIND_BIT) == 0)
+        return self._drops[layer]
 
     def between(self, low: float, high: float) -> BandMap:
         """What there is between two heights above the floor, metres; a robot that meets all of it.
@@ -137,38 +138,17 @@ class HeightLayers:
         if not low <= high:
             raise InputError(f"expected two heights, the lower first, found {low} and {high}")
         low, high = max(low, min(self._reach[0], high)), min(high, max(self._reach[1], low))
-        seen = self._see(low, high)
+        seen = self._source.seen(low, high)
         known, behind = (seen & SEEN_BIT) > 0, (seen & BEHIND_BIT) > 0
-        near = self._surface.near_points(self.grid, low, high, on_floor)
-        sites = self._surface.sites(low, high)
+        near, measured, sites = self._source.surface(low, high, on_floor)
         sited = self.grid.mark(sites)
         sites = self._outside(sites, unseen_surface(sited, near))
-        measured = self._surface.with_points(self.grid, low, high)
-        points = self._thin_out(np.concatenate([sites, self.grid.centres()[measured & ~self.grid.mark(sites)]]))
+        points = np.concatenate([sites, self.grid.centres_of(measured & ~self.grid.mark(sites))])
         distance = self._distance(points)
         reached = distance <= max(self.grid.resolution / 2, BandTuning.reach_voxels * self._field.voxel)
         unseen = unseen_surface(sited | reached, near)
         occupied = ((sited | reached) & ~unseen) | measured
         return BandMap(self.grid, (low, high), occupied, known, behind | unseen | near, distance, points)
-
-    def _see(self, low: float, high: float) -> np.ndarray:
-        """What the voxels of a band are, together, uint8 [H, W]: layers a voxel apart, or the one at its middle."""
-        spacing = self._field.voxel
-        first, last = int(np.ceil(low / spacing - 1e-6)), int(np.floor(high / spacing + 1e-6))
-        if first > last:
-            first = last = int(np.rint((low + high) / 2 / spacing))
-        most = max(1, BandTuning.most_layer_bytes // max(1, self.grid.shape[0] * self.grid.shape[1]))
-        found = np.zeros(self.grid.shape, np.uint8)
-        for start in range(first, last + 1, most):
-            count = min(most, last + 1 - start)
-            if any(number not in self._layers for number in range(start, start + count)):
-                new = seen_above(self._field.tsdf, self.grid, start * spacing, spacing, count)
-                if len(self._layers) + count > most:
-                    self._layers = {}
-                self._layers |= {start + k: layer for k, layer in enumerate(new)}
-            for number in range(start, start + count):
-                found |= self._layers[number]
-        return found
 
     def _outside(self, places: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """Those of places [N, 2] that lie in none of some cells, bool [H, W]."""
@@ -177,19 +157,16 @@ class HeightLayers:
         left_out[inside] = cells[row[inside], column[inside]]
         return places[~left_out]
 
-    def _thin_out(self, points: np.ndarray) -> np.ndarray:
-        step = self.grid.resolution * BandTuning.same_place
-        at = np.floor((points - self.grid.plane.low) / step).astype(np.int64)
-        _, first = np.unique((at[:, 0] << 32) + at[:, 1], return_index=True)
-        return points[first]
-
     def _distance(self, points: np.ndarray) -> np.ndarray:
+        found = np.full(self.grid.shape, np.inf, np.float32)
         if not len(points):
-            return np.full(self.grid.shape, np.inf, np.float32)
-        found = cKDTree(points, compact_nodes=False, balanced_tree=False).query(
-            self.grid.centres().reshape(-1, 2), workers=2
-        )[0]
-        return found.astype(np.float32).reshape(self.grid.shape)
+            return found
+        tree, (height, width) = cKDTree(points, compact_nodes=False, balanced_tree=False), self.grid.shape
+        rows = max(1, BandTuning.cells_at_once // width)
+        for first in range(0, height, rows):
+            part = GridWindow(first, 0, (min(rows, height - first), width))
+            found[part.slices] = tree.query(self.grid.centres(part).reshape(-1, 2), workers=2)[0].reshape(part.shape)
+        return found
 
 
 def floor_plane(field: DistanceField, T_floor_map: np.ndarray) -> SlicePlane:

@@ -49,6 +49,26 @@ class SlicePlane:
 
 
 @dataclass(frozen=True)
+class GridWindow:
+    """Some rows and columns of a grid, which are next to each other.
+
+    Attributes:
+        first_row, first_column: of the grid.
+        shape: rows and columns (h, w); zero where nothing of the grid lies in it.
+    """
+
+    first_row: int
+    first_column: int
+    shape: tuple[int, int]
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Of arrays of the grid, [H, W]."""
+        rows, columns = self.shape
+        return (slice(self.first_row, self.first_row + rows), slice(self.first_column, self.first_column + columns))
+
+
+@dataclass(frozen=True)
 class CellGrid:
     """The cells of a rectangle.
 
@@ -77,16 +97,40 @@ class CellGrid:
         top_right = (plane.low[0] + width * resolution, plane.low[1] + height * resolution)
         return CellGrid(replace(plane, high=top_right), resolution, (height, width))
 
-    def centres(self) -> np.ndarray:
-        """Where the cells' centres are on the plane, (x, y) in metres, float64 [H, W, 2]."""
-        x = self.plane.low[0] + (np.arange(self.shape[1]) + 0.5) * self.resolution
-        y = self.plane.low[1] + (np.arange(self.shape[0])[::-1] + 0.5) * self.resolution
-        return np.stack(np.broadcast_arrays(x, y[:, None]), -1)
+    @property
+    def whole(self) -> GridWindow:
+        """All rows and columns."""
+        return GridWindow(0, 0, self.shape)
 
-    def places(self) -> np.ndarray:
-        """The same in space, float64 [H, W, 3]."""
-        centres = self.centres()
-        return np.asarray(self.plane.origin + centres @ np.stack([self.plane.x_axis, self.plane.y_axis]))
+    def window(self, low: np.ndarray, high: np.ndarray) -> GridWindow:
+        """The cells that have a part between the corners `low` and `high` (x, y) on the plane, metres."""
+        ends = [np.floor((np.asarray(corner) - self.plane.low) / self.resolution).astype(int) for corner in (low, high)]
+        top, bottom = (int(self.shape[0] - 1 - end[1]) for end in (ends[1], ends[0]))
+        first_row, first_column = max(0, top), max(0, int(ends[0][0]))
+        rows = min(self.shape[0] - 1, bottom) + 1 - first_row
+        columns = min(self.shape[1] - 1, int(ends[1][0])) + 1 - first_column
+        return GridWindow(first_row, first_column, (max(0, rows), max(0, columns)))
+
+    def centres(self, window: GridWindow | None = None) -> np.ndarray:
+        """Where the cells' centres are on the plane, (x, y) in metres, float64 [H, W, 2]; of a window, if one is given:
+        the same, bit for bit."""
+        of = window or self.whole
+        rows, columns = of.first_row + np.arange(of.shape[0]), of.first_column + np.arange(of.shape[1])
+        return np.stack(np.broadcast_arrays(*self._centres(rows[:, None], columns)), -1)
+
+    def centres_of(self, cells: np.ndarray) -> np.ndarray:
+        """The centres of some cells, bool [H, W], on the plane, float64 [N, 2]."""
+        return np.stack(self._centres(*np.nonzero(cells)), -1)
+
+    def _centres(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = self.plane.low[0] + (columns + 0.5) * self.resolution
+        return x, self.plane.low[1] + (self.shape[0] - 1 - rows + 0.5) * self.resolution
+
+    def places(self, window: GridWindow | None = None) -> np.ndarray:
+        """The same as `centres` in space, float64 [H, W, 3]."""
+        x, y = np.moveaxis(self.centres(window), -1, 0)
+        # Not as a product of matrices, whose roundings depend on how many rows they have.
+        return np.asarray(self.plane.origin + (x[..., None] * self.plane.x_axis + y[..., None] * self.plane.y_axis))
 
     def cells_of(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows and columns of the cells that places (x, y) [N, 2] on the plane lie in, int64 [N] each, and whether they
@@ -102,17 +146,21 @@ class CellGrid:
         inner = np.logical_and.reduce([around[r : r + self.shape[0], c : c + self.shape[1]] for r in range(3)
                                        for c in range(3)])  # fmt: skip
         steps = (np.stack(np.meshgrid(*2 * [(-0.5, 0.0, 0.5)]), -1) * self.resolution).reshape(-1, 2)
-        return (self.centres()[cells & ~inner][:, None] + steps).reshape(-1, 2)
+        return (self.centres_of(cells & ~inner)[:, None] + steps).reshape(-1, 2)
 
-    def mark(self, places: np.ndarray, reach: Sequence[float] | np.ndarray = (0.0, 0.0)) -> np.ndarray:
-        """Cells, bool [H, W], that rectangles around places [N, 2] on the plane overlap; they reach so far from these
-        along x and y, metres."""
-        marked = np.zeros(self.shape, bool)
+    def mark(
+        self, places: np.ndarray, reach: Sequence[float] | np.ndarray = (0.0, 0.0), window: GridWindow | None = None
+    ) -> np.ndarray:
+        """Cells, bool [H, W], of the grid or a window, that rectangles around places [N, 2] on the plane overlap; they
+        reach so far from these along x and y, metres."""
+        of = window or self.whole
+        marked = np.zeros(of.shape, bool)
         ends = [np.floor((places[:, :2] + side * np.array(reach) - self.plane.low) / self.resolution).astype(int)
                 for side in (-1, 1)]  # fmt: skip
         steps = (ends[1] - ends[0]).max(axis=0, initial=0)
         for step in np.ndindex(*(steps + 1)):
             column, from_bottom = np.minimum(ends[0] + step, ends[1]).T
-            inside = (column >= 0) & (column < self.shape[1]) & (from_bottom >= 0) & (from_bottom < self.shape[0])
-            marked[self.shape[0] - 1 - from_bottom[inside], column[inside]] = True
+            row, column = self.shape[0] - 1 - from_bottom - of.first_row, column - of.first_column
+            inside = (column >= 0) & (column < of.shape[1]) & (row >= 0) & (row < of.shape[0])
+            marked[row[inside], column[inside]] = True
         return marked

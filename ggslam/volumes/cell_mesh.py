@@ -18,12 +18,12 @@ import numpy as np
 from ggslam.scene.arrays import arrays_to_bytes, read_arrays
 from ggslam.system.atomic import write_bytes
 from ggslam.system.tuning import Tuning
-from ggslam.volumes.block_arrays import put_blocks
+from ggslam.volumes.cell_boxes import boxes_of, in_memory
 from ggslam.volumes.cell_pager import CellPager
 from ggslam.volumes.mesh import Mesh, extract_mesh, pieces_of
 from ggslam.volumes.mesh_parts import MeshPart, MeshParts
 from ggslam.volumes.tsdf import SIDE, TsdfMap
-from ggslam.volumes.volume_cells import CellKey, as_keys, with_neighbours
+from ggslam.volumes.volume_cells import CellKey, with_neighbours
 
 _CONTENT = "part of a mesh"
 _MESH = ("vertices", "normals", "colors", "labels", "triangles")
@@ -47,33 +47,14 @@ def mesh_cells(pager: CellPager, min_weight: float | None, min_triangles: int) -
     """
     folder = Path(mkdtemp(prefix="mesh-", dir=pager.folder))
     numbering = _Numbering()
-    for box, own in _boxes(pager):
-        part = _in_memory(pager, with_neighbours(own, 1) & pager.keys())
+    for box, own in boxes_of(pager.keys(), CellMeshTuning.side):
+        part = in_memory(pager, with_neighbours(own, 1) & pager.keys())
         mesh, shared = _triangles_of(part, own, pager, min_weight)
         _write(folder, numbering.boxes, *numbering.add(box, mesh, shared))
     return _without_specks(folder, numbering, max(min_triangles, 1))
 
 
-# --- boxes -----------------------------------------------------------------------------------------------------------
-
-
-def _boxes(pager: CellPager) -> Iterator[tuple[CellKey, set[CellKey]]]:
-    """All cells, in boxes. These are named by their places along the axes, of which that with the most boxes comes
-    first, and are in the order of their names: the fewest are between one and its neighbours."""
-    keys = np.array(sorted(pager.keys())).reshape(-1, 3)
-    boxes = np.floor_divide(keys, CellMeshTuning.side)
-    axes = np.argsort(boxes.min(0) - boxes.max(0), kind="stable")
-    names, box_of = np.unique(boxes[:, axes], axis=0, return_inverse=True)
-    for number, (first, second, third) in enumerate(names.tolist()):
-        yield (first, second, third), as_keys(keys[box_of.ravel() == number])
-
-
-def _in_memory(pager: CellPager, keys: set[CellKey]) -> TsdfMap:
-    like = pager.tsdf
-    part = TsdfMap(like.settings, like.context, like.origin, like.points)
-    for key in sorted(keys):
-        put_blocks(part, pager.arrays(key))
-    return part
+# --- triangles --------------------------------------------------------------------------------------------------------
 
 
 def _triangles_of(

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays
+from ggslam.scene.arrays import arrays_to_bytes, read_all_arrays, read_arrays
 from ggslam.system.atomic import write_bytes
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.block_arrays import decay_blocks, put_blocks, take_blocks
@@ -126,6 +126,11 @@ class CellPager:
         sizes = [[len(self.arrays(key)[name]) for name in ("dense", "free")] for key in self._away]
         dense, free = np.sum(sizes, axis=0).tolist() if sizes else (0, 0)
         return dense + free, dense
+
+    def coordinates(self) -> np.ndarray:
+        """Of all blocks on disk, as they were written, int32 [B, 3]."""
+        parts = [read_arrays(self._path(key), _CONTENT, "dense", "free") for key in sorted(self._away)]
+        return np.concatenate([np.zeros((0, 3), np.int32), *(blocks for part in parts for blocks in part)])
 
     def keys(self) -> set[CellKey]:
         """Cells on disk."""

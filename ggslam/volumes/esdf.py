@@ -80,7 +80,8 @@ class FieldValues:
         gradient: float32 [N, 3], unit vectors in which the distance grows; zero where not known, and where the nearest
             surface is beyond the largest distance.
         known: bool [N], whether the voxel that the point is in was seen.
-        stale: bool [N], whether it is known as it was before the last update, which had no time for it.
+        stale: bool [N], whether it, or a voxel around that it is interpolated from, is known as it was before the last
+            update, which had no time for it.
     """
 
     distance: np.ndarray

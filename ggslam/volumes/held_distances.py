@@ -33,10 +33,10 @@ class HeldValues(FieldValues):
     """Answers of `VolumeMaps.query`.
 
     Attributes:
-        exact: bool [N], whether the distance is the whole map's (within 1/8 voxel, see `DistanceField.update`). Where
-            `stale` is set, it is that of an earlier update.
+        exact: bool [N], whether the distance is the whole map's (within 1/8 voxel, see `DistanceField.update`); not
+            where `stale` is set.
         at_least: float32 [N], metres: the whole map's distance is no shorter (behind a surface: no farther behind); NaN
-            where not known.
+            where not known or stale: a surface may have come.
     """
 
     exact: np.ndarray
@@ -54,7 +54,8 @@ def held_values(values: FieldValues, border: np.ndarray, voxel: float) -> HeldVa
     sure = np.maximum(border - HeldDistanceTuning.margin_voxels * voxel, 0.0)
     far = np.abs(values.distance)
     at_least = np.copysign(np.minimum(far, sure), values.distance).astype(np.float32)
-    exact = values.known & (far <= sure)
+    at_least[values.stale] = np.nan
+    exact = values.known & ~values.stale & (far <= sure)
     return HeldValues(values.distance, values.gradient, values.known, values.stale, exact, at_least)
 
 

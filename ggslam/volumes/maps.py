@@ -21,6 +21,7 @@ from ggslam.errors import ConfigError, InputError
 from ggslam.scene.frame import Frame
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.cell_export import save_cells
+from ggslam.volumes.cell_field import AnyField, CellField
 from ggslam.volumes.cell_mesh import mesh_cells
 from ggslam.volumes.cell_pager import CellPager
 from ggslam.volumes.cell_rebuild import StoredView
@@ -126,6 +127,8 @@ class VolumeMaps:
         self.tsdf = TsdfMap(settings.tsdf, points=esdf) if onto is None else onto
         self.context = self.tsdf.context
         self.field = DistanceField(self.tsdf, settings.esdf) if esdf else None
+        self.cell_field: CellField | None = None
+        """Takes the place of `field` when all is done and cells are on disk."""
         self.occupancy = None if occupancy is None else self._occupancy(occupancy)
         self.times = VolumeTimes()
         self.points = 0
@@ -150,20 +153,27 @@ class VolumeMaps:
 
     def query(self, points: np.ndarray) -> HeldValues:
         """Distances and gradients at points [N, 3] in metres, see `DistanceField.query`, and what they are worth while
-        cells are on disk: all in view of the last instant are those of the whole map.
+        cells are on disk: all in view of the last instant are those of the whole map, and when all is finished, all
+        are.
 
         Raises:
             InputError: there is no distance field.
         """
         if self.field is None:
             raise InputError("query: expected volumes with a distance field (`esdf`), found none")
-        values, voxel = self.field.query(points), self.field.voxel
-        if self.pager is None:
+        field = self.field if self.cell_field is None else self.cell_field
+        values, voxel = field.query(points), self.field.voxel
+        if self.pager is None or self.cell_field is not None:
             border = np.full(len(values.distance), np.inf)
         else:
             margin = HeldDistanceTuning.margin_voxels * voxel
             border = self.pager.border(np.asarray(points, np.float64), self.settings.esdf.max_distance + margin)
         return held_values(values, border, voxel)
+
+    @property
+    def finished_field(self) -> AnyField | None:
+        """The distance field of the finished maps."""
+        return self.field if self.cell_field is None else self.cell_field
 
     def mesh(self, min_triangles: int = 0) -> Mesh:
         """The surface of the TSDF in memory; see `volumes.mesh.extract_mesh`."""
@@ -252,6 +262,7 @@ class VolumeMaps:
     def _bring(self, paging: Paging, images: Sequence[PosedView]) -> float:
         """Brings what is on disk of what images may tell of; returns the seconds that took."""
         start = time.perf_counter()
+        self.cell_field = None
         if self.pager is None:
             distances = 0.0 if self.field is None else self.settings.esdf.max_distance
             self.pager = CellPager(self.tsdf, paging.folder, paging.allowed, distances)
@@ -269,6 +280,7 @@ class VolumeMaps:
         """Begins anew from keyframes where they are now, for after a loop was closed. With paging, cells are fused
         again when they are needed."""
         start = time.perf_counter()
+        self.cell_field = None
         self.tsdf.clear()
         if self._on_device is not None:
             self._on_device = TorchTsdf(self.settings.tsdf, self._on_device.device, self._on_device.points)
@@ -287,10 +299,14 @@ class VolumeMaps:
         self.times.rebuilds.append(time.perf_counter() - start)
 
     def finish(self) -> None:
-        """Brings the TSDF from its device, and the distance field up to date. A field takes the whole TSDF into memory;
-        without one, what went to disk stays there."""
+        """Brings the TSDF from its device, and the distance field up to date. If some cells are on disk, all go there:
+        what is made of the maps takes a few of them at a time."""
         if self.pager is not None:
-            self.pager.write_all() if self.field is None else self.pager.bring_all()
+            self.pager.write_all()
+            if self.field is not None and len(self.pager):
+                self.field.clear()
+                self.cell_field = CellField(self.pager, self.settings.esdf)
+                return
         if self._on_device is not None:
             self.tsdf = self._on_device.to_native(self.context)
             self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)

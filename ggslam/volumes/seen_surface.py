@@ -4,13 +4,14 @@ points beside them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from ggslam.system.tuning import Tuning
-from ggslam.volumes.cell_grid import CellGrid, SlicePlane
+from ggslam.volumes.cell_grid import CellGrid, GridWindow, SlicePlane
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.measured_points import measured_octants
 
@@ -32,7 +33,9 @@ class _Layered:
     def __init__(self, points: np.ndarray, plane: SlicePlane) -> None:
         self._points, self._plane = points, plane
         normal = plane.normal.astype(points.dtype)
-        self._heights = (points @ normal - np.float32(plane.origin @ plane.normal)).astype(np.float32)
+        # Not as a product of matrices, whose roundings depend on where a point stands among the others.
+        along = points[:, 0] * normal[0] + points[:, 1] * normal[1] + points[:, 2] * normal[2]
+        self._heights = (along - np.float32(plane.origin @ plane.normal)).astype(np.float32)
 
     def between(self, low: float, high: float, which: np.ndarray | None = None) -> np.ndarray:
         """x and y on the plane, float64 [m, 2], metres; `which` bool [n]: of these only."""
@@ -46,12 +49,18 @@ class SeenSurface:
     Args:
         field: which, with its TSDF, has them.
         plane: its normal is up.
+        owns: tells of points [N, 3] from the field's origin, metres, which count; None: all do.
     """
 
-    def __init__(self, field: DistanceField, plane: SlicePlane) -> None:
+    def __init__(
+        self, field: DistanceField, plane: SlicePlane, owns: Callable[[np.ndarray], np.ndarray] | None = None
+    ) -> None:
         points, normals = field.surface()
         # Seen from the field's origin, so that a map far from zero gives the same bits.
         sites, octants = (points - field.origin).astype(np.float32), measured_octants(field.tsdf)
+        if owns is not None:
+            own = owns(sites)
+            sites, normals, octants = sites[own], normals[own], octants[owns(octants)]
         plane = replace(plane, origin=plane.origin - field.origin)
         lone = (normals[:, 0] == 0) & (normals[:, 1] == 0) & (normals[:, 2] == 0)
         self._sites, self._octants = _Layered(sites, plane), _Layered(octants, plane)
@@ -63,20 +72,24 @@ class SeenSurface:
         """The surface points between two heights: x and y, float64 [n, 2], metres."""
         return self._sites.between(low, high)
 
-    def near_points(self, grid: CellGrid, low: float, high: float, on_floor: bool = False) -> np.ndarray:
-        """Cells, bool [H, W], that may have a measured point in them between two heights: none of them is free.
+    def near_points(
+        self, grid: CellGrid, low: float, high: float, on_floor: bool = False, window: GridWindow | None = None
+    ) -> np.ndarray:
+        """Cells, bool [H, W], of a grid or its window, that may have a measured point in them between two heights: none
+        of them is free.
 
         `on_floor`: the plane is a floor. Eighths of voxels that it lies in are full of its own points; of coarse voxels
         they reach up to the lower height and would leave no cell free."""
         reach = self._reach[2]
         lowest = max(low - reach, min(SeenSurfaceTuning.floor_reach * reach, low)) if on_floor else low - reach
-        return grid.mark(self._octants.between(lowest, high + reach), self._reach[:2])
+        return grid.mark(self._octants.between(lowest, high + reach), self._reach[:2], window)
 
-    def with_points(self, grid: CellGrid, low: float, high: float) -> np.ndarray:
+    def with_points(self, grid: CellGrid, low: float, high: float, window: GridWindow | None = None) -> np.ndarray:
         """Cells, bool [H, W], that have one: the middle of an eighth lies in them, or any part of one of a thin
         thing."""
         thin = self._octants.between(low - self._reach[2], high + self._reach[2], self._thin)
-        return grid.mark(self._octants.between(low, high)) | grid.mark(thin, self._reach[:2])
+        own = grid.mark(self._octants.between(low, high), window=window)
+        return own | grid.mark(thin, self._reach[:2], window)
 
 
 def unseen_surface(surface: np.ndarray, near_points: np.ndarray) -> np.ndarray:

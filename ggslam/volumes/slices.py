@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from ggslam.volumes.cell_field import AnyField, CellField
 from ggslam.volumes.cell_grid import CellGrid, SlicePlane
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import level_axes
@@ -46,7 +47,7 @@ class FieldSlice:
         return self.known & ~self.occupied & ~self.behind
 
 
-def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> SlicePlane:
+def plane_at_height(field: AnyField, up: np.ndarray, height: float) -> SlicePlane:
     """The plane at a height, as large as the field's blocks.
 
     Args:
@@ -58,16 +59,19 @@ def plane_at_height(field: DistanceField, up: np.ndarray, height: float) -> Slic
         Seen from above, with the axes of `level_axes`.
     """
     x, y, z = level_axes(up)
-    edge = SIDE * field.voxel
-    corners = np.concatenate([field.coordinates() + shift for shift in np.ndindex(2, 2, 2)]) * edge
-    if not len(corners):
-        corners = np.zeros((1, 3))
-    on_plane = corners @ np.stack([x, y], 1)
-    low, high = on_plane.min(axis=0), on_plane.max(axis=0)
-    return SlicePlane(field.origin + height * z, x, y, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+    edge, blocks = SIDE * field.voxel, field.coordinates()
+    if not len(blocks):
+        return SlicePlane(field.origin + height * z, x, y, (0.0, 0.0), (0.0, 0.0))
+    ends = []
+    for axis in (x, y):
+        along = blocks[:, 0] * axis[0] + blocks[:, 1] * axis[1] + blocks[:, 2] * axis[2]
+        beyond = [float(np.dot(corner, axis)) for corner in np.ndindex(2, 2, 2)]
+        ends.append((edge * (float(along.min()) + min(beyond)), edge * (float(along.max()) + max(beyond))))
+    (x0, x1), (y0, y1) = ends
+    return SlicePlane(field.origin + height * z, x, y, (x0, y0), (x1, y1))
 
 
-def slice_field(field: DistanceField, plane: SlicePlane, resolution: float) -> FieldSlice:
+def slice_field(field: AnyField, plane: SlicePlane, resolution: float) -> FieldSlice:
     """Slices the field.
 
     A cell is occupied if its centre is from half a cell before a surface (or half a voxel, if that is more) to a cell
@@ -76,20 +80,40 @@ def slice_field(field: DistanceField, plane: SlicePlane, resolution: float) -> F
     heights, `driving.bands` tells.
 
     Args:
-        field: to slice.
+        field: to slice; cells on disk are read a few at a time.
         plane: where.
         resolution: edge of a cell, metres.
 
     Raises:
         InputError: a resolution that is not positive, or more than 50 million cells.
     """
-    grid, surface, cell = CellGrid.over(plane, resolution), SeenSurface(field, plane), max(resolution, field.voxel)
-    distance = field.query(grid.places().reshape(-1, 3)).distance.reshape(grid.shape)
+    grid, cell = CellGrid.over(plane, resolution), max(resolution, field.voxel)
+    distance, near, points = _of_cells(field, grid) if isinstance(field, CellField) else _of_all(field, grid)
     occupied = (distance <= cell / 2) & (distance >= -cell)
-    near, points = surface.near_points(grid, 0.0, 0.0), surface.with_points(grid, 0.0, 0.0)
     unseen = unseen_surface(occupied, near)
     occupied, behind = (occupied & ~unseen) | points, (distance < 0) | unseen | near
     return FieldSlice(grid.plane, resolution, distance, ~np.isnan(distance), occupied, behind)
+
+
+def _of_all(field: DistanceField, grid: CellGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances [H, W]; which cells may have measured points, and which have, bool [H, W]."""
+    surface = SeenSurface(field, grid.plane)
+    distance = field.query(grid.places().reshape(-1, 3)).distance.reshape(grid.shape)
+    return distance, surface.near_points(grid, 0.0, 0.0), surface.with_points(grid, 0.0, 0.0)
+
+
+def _of_cells(field: CellField, grid: CellGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of cells on disk."""
+    distance = np.full(grid.shape, np.nan, np.float32)
+    near, points = np.zeros(grid.shape, bool), np.zeros(grid.shape, bool)
+    for part in field.parts(grid.plane, 0.0, 0.0, field.settings.max_distance):
+        window, surface = part.window(grid), SeenSurface(part.field, grid.plane, part.owns)
+        places = grid.places(window).reshape(-1, 3)
+        own = part.owns(places - field.origin)
+        distance[window.slices][own.reshape(window.shape)] = part.field.query(places[own]).distance
+        near[window.slices] |= surface.near_points(grid, 0.0, 0.0, window=window)
+        points[window.slices] |= surface.with_points(grid, 0.0, 0.0, window=window)
+    return distance, near, points
 
 
 def slice_picture(cut: FieldSlice, full_scale: float, smallest_side: int = 480) -> np.ndarray:

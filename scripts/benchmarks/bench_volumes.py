@@ -15,6 +15,8 @@ All parts use the recordings' true poses. Parts:
     corridor  a long walk (`ggslam synth DIR --scene corridor --frames 2400`) at 4 and 2 cm with a distance field after
               every frame, with a limit of memory (--limits) and without: time and memory of the first, second, fifth
               and last tenth of the way
+    files     what is made of such a walk after its last frame (slice, maps, mesh): memory of the process for 1, 2, 5
+              and 10 tenths of the way
     accuracy  the distance field of scenes whose distances are known, against `edt` and scipy; needs no recording
 Open3D and edt come with `pip install 'ggslam[bench]'`; without them ours is printed alone. Occupancy has a benchmark of
 its own, bench_occupancy.py.
@@ -34,6 +36,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 if "--peers" in sys.argv[:-1]:  # behind our own packages, before anything looks for Open3D
     sys.path.append(sys.argv[sys.argv.index("--peers") + 1])
 
+from volume_corridor_files import corridor_files_part
 from volume_corridor_runs import corridor_part
 from volume_esdf_runs import accuracy_part, esdf_part, pace_part
 from volume_mesh_runs import compare_meshes
@@ -44,6 +47,9 @@ PARTS: dict[str, Callable[[Path, argparse.Namespace], None]] = {
     "esdf": lambda path, arguments: esdf_part(path, tuple(arguments.esdf_voxels), frames=arguments.frames),
     "pace": lambda path, arguments: pace_part(path, frames=arguments.frames),
     "corridor": lambda path, arguments: corridor_part(
+        path, tuple(arguments.corridor_voxels), tuple(arguments.limits), arguments.frames
+    ),
+    "files": lambda path, arguments: corridor_files_part(
         path, tuple(arguments.corridor_voxels), tuple(arguments.limits), arguments.frames
     ),
 }  # fmt: skip

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from rooms import BOXES, SIZE, room_field, turned, wall_distance
 
-from ggslam.driving.bands import BandMap, BandTuning, HeightLayers, band_map, floor_plane
+from ggslam.driving.band_sources import BandSourceTuning
+from ggslam.driving.bands import BandMap, HeightLayers, band_map, floor_plane
 from ggslam.driving.robot import Robot
 from ggslam.errors import InputError
 from ggslam.system.tuning import overridden
@@ -84,7 +85,7 @@ def test_bands_of_one_volume_are_those_of_each_alone(field: DistanceField, layer
 def test_bands_of_large_maps_are_the_same(field: DistanceField, layers: HeightLayers) -> None:
     """Of which not all heights are held."""
     cells = layers.grid.shape[0] * layers.grid.shape[1]
-    with overridden(BandTuning, most_layer_bytes=5 * cells):
+    with overridden(BandSourceTuning, most_layer_bytes=5 * cells):
         few = HeightLayers(field, floor_plane(field, T_FLOOR_MAP), CELL)
         for robot in (TALL, LOW, TALL):
             assert np.array_equal(few.band(robot).free, layers.band(robot).free)

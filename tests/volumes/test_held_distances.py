@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from distance_scenes import block_range, plane, sphere, union, write_scene
 from paged_corridor import SETTINGS, fuse, views
 
 from ggslam.errors import InputError
@@ -17,7 +18,10 @@ from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.held_distances import HeldValues, distance_to_cells
 from ggslam.volumes.maps import Paging, VolumeMaps
 from ggslam.volumes.posed_view import PosedView
+from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.volume_cells import VolumeCells
+from ggslam.volumes.volume_settings import VolumeSettings
 
 WITH_EACH = replace(SETTINGS, esdf_every=1)
 ROUNDING = SETTINGS.tsdf.voxel / 8 + 1e-6
@@ -135,6 +139,32 @@ def test_without_a_pager_all_that_is_known_is_exact(seen: list[PosedView]) -> No
         maps.query(np.zeros((3, 2)))
     with pytest.raises(InputError, match="esdf"):
         fuse(seen[:1]).query(points)
+
+
+def test_what_an_update_had_no_time_for_is_not_exact() -> None:
+    """A ball comes before the wall; blocks that wait keep the wall's distances, which are too long, and their
+    neighbours are interpolated from them."""
+    tsdf, blocks = TsdfMap(TsdfSettings(voxel=0.05)), block_range((-2, -2, -1.2), (2, 2, 1.2), 0.05)
+    floor = plane((0, 0, -1), (0, 0, 1))
+    write_scene(tsdf, floor, blocks)
+    maps = VolumeMaps(VolumeSettings(), esdf=True, onto=tsdf)
+    assert maps.field is not None
+    maps.field.update()
+    points = np.random.default_rng(2).uniform((-1.9, -1.9, -1.1), (1.9, 1.9, 1.1), (20_000, 3))
+    before = maps.query(points)
+    assert np.array_equal(before.exact, before.known) and not before.stale.any()
+    write_scene(tsdf, union(floor, sphere((0, 0, 0), 0.4)), blocks)
+    stats = maps.field.update(budget_ms=1e-3, near=np.array([2.0, 2, 0]))
+    found = maps.query(points)
+    maps.field.update()
+    off = np.abs(found.distance - maps.query(points).distance)
+    assert stats.stale_blocks and found.stale.any() and not found.stale.all() and found.known[found.stale].all()
+    assert np.array_equal(found.exact, found.known & ~found.stale)
+    assert off[found.stale].max() > 0.3 and off[found.exact].max() <= ROUNDING
+    assert (
+        np.isnan(found.at_least[found.stale]).all()
+        and (found.at_least[found.exact] == found.distance[found.exact]).all()
+    )
 
 
 def test_distances_from_cells_are_those_of_their_boxes() -> None:

@@ -89,10 +89,10 @@ struct SurfaceImages {
 };
 
 // Places [layers, rows, columns]: start + layer * layer_step + row * row_step + column * column_step, in voxels from the
-// map's origin.
+// map's origin. Rows and columns are counted from first_row and first_column: a part of a grid has the grid's own places.
 struct ColumnGrid {
   double start[3], layer_step[3], row_step[3], column_step[3];
-  int32_t layers, rows, columns;
+  int32_t layers, rows, columns, first_row, first_column;
 };
 constexpr int kSeenBit = 1;
 constexpr int kBehindBit = 2;

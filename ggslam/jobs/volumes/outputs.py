@@ -47,7 +47,7 @@ from ggslam.system.plurals import quantity
 from ggslam.system.staging import finish_saving, make_staging, publish
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import is_plain_name
-from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.cell_field import AnyField, CellField
 from ggslam.volumes.floor_frame import FLOOR_FILE, FloorTuning, floor_from_map, floor_height, write_floor_file
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import Mesh
@@ -241,7 +241,7 @@ class _Writer:
         guess = "" if seen else f" (z = 0 is {FloorTuning.below_cameras_m:g} m below the lowest camera)"
         self.tell(f"{lying}{guess}: {command}", frame=frame.value, T_floor_map=self.surface.T_floor_map)
 
-    def field(self, field_: DistanceField, seconds: float) -> None:
+    def field(self, field_: AnyField, seconds: float) -> None:
         """A slice of the distance field, whose last update took `seconds`, and the ROS map."""
         upright = self.surface.upright
         heights, base = self.poses[:, :3, 3] @ upright.up, floor_height(upright, self.poses)
@@ -259,8 +259,11 @@ class _Writer:
         axes = {"origin": plan.plane.origin, "x_axis": plan.plane.x_axis, "y_axis": plan.plane.y_axis}
         held = field_.memory_bytes / 1e6
         ground = "the floor" if upright.floor is not None else "a metre below the camera"
+        taken = f"{held:.0f} MB, last update {1e3 * seconds:.0f} ms"
+        if isinstance(field_, CellField):
+            taken = f"{held:.0f} MB at most, a few cells at a time"
         self.tell(
-            f"distance field: {quantity(len(field_), 'block')}, {held:.0f} MB, last update {1e3 * seconds:.0f} ms; "
+            f"distance field: {quantity(len(field_), 'block')}, {taken}; "
             f"slice {height - base:.2f} m above {ground}",
             esdf={"blocks": len(field_), "memory_mb": held, "last_update_ms": 1e3 * seconds,
                   "slice_height": height - base, "band": plan.heights, "map_frame": axes, "robots": robots},
@@ -314,7 +317,7 @@ def _words(position: np.ndarray) -> str:
     return f"({', '.join(f'{value:g}' for value in position)})"
 
 
-def _slice(field_: DistanceField, up: np.ndarray, height: float) -> FieldSlice:
+def _slice(field_: AnyField, up: np.ndarray, height: float) -> FieldSlice:
     """A slice, coarser than the field's voxels where that would be too many cells."""
     plane = plane_at_height(field_, up, height)
     area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
@@ -386,8 +389,8 @@ def _write_all(writer: _Writer, maps: VolumeMaps, record: dict[str, Any], observ
         if writer.outputs.record["mesh"]["objects"]:
             write_picture(writer.path("objects.png"), mesh_picture(mesh, writer.poses, upright.up, by_object=True))
     observer.advance(2, 4)
-    if maps.field is not None:
-        writer.field(maps.field, maps.times.last_update)
+    if (field_ := maps.finished_field) is not None:
+        writer.field(field_, maps.times.last_update)
     observer.advance(3, 4)
     if maps.occupancy is not None:
         writer.occupancy(maps.occupancy)

@@ -25,9 +25,10 @@ class PointRates:
 
     @staticmethod
     def of(maps: VolumeMaps) -> PointRates:
-        """Of all that was fused; a distance field that is made once at the end counts with that."""
+        """Of all that was fused; a distance field that is made once at the end counts with that, and one that is
+        made cell by cell for files does not."""
         seconds = {name: float(took.sum()) for name, took in maps.times.parts().items() if name in _NAMES}
-        if maps.field is not None and "esdf" not in seconds:
+        if maps.field is not None and "esdf" not in seconds and maps.cell_field is None:
             seconds["esdf"] = maps.times.last_update
         return PointRates(maps.points, seconds)
 

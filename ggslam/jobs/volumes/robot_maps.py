@@ -18,8 +18,8 @@ from ggslam.driving.robot import Robot, parse_robot
 from ggslam.errors import ConfigError
 from ggslam.reporting.pictures import write_picture
 from ggslam.system.tuning import Tuning
+from ggslam.volumes.cell_field import AnyField
 from ggslam.volumes.cell_grid import SlicePlane
-from ggslam.volumes.esdf import DistanceField
 
 
 class FloorMapTuning(Tuning):
@@ -46,7 +46,7 @@ def parse_robots(texts: Sequence[str]) -> list[Robot]:
     return robots
 
 
-def floor_layers(field: DistanceField, floor: SlicePlane, most_cells: int, seen: bool) -> HeightLayers:
+def floor_layers(field: AnyField, floor: SlicePlane, most_cells: int, seen: bool) -> HeightLayers:
     """What a volume has above its floor, `seen` or guessed, in cells that are larger where there would be too many."""
     area = (floor.high[0] - floor.low[0]) * (floor.high[1] - floor.low[1])
     return HeightLayers(field, floor, max(FloorMapTuning.cell_m, field.voxel, math.sqrt(area / most_cells)), seen)

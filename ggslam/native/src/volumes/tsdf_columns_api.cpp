@@ -68,12 +68,14 @@ void read_column(Reader& reader, const double foot[3], const double step[3], int
 }
 
 void check(const ColumnGrid& g) {
-  for (const int32_t count : {g.layers, g.rows, g.columns}) ggslam::check_range("grid", count, 0, 1 << 24);
+  for (const int32_t count : {g.layers, g.rows, g.columns, g.first_row, g.first_column})
+    ggslam::check_range("grid", count, 0, 1 << 24);
   for (const double* part : {g.start, g.layer_step, g.row_step, g.column_step})
     ggslam::check_within("grid", part, 3, 1e9);
   for (int a = 0; a < 3; ++a) {
     const double farthest = std::fabs(g.start[a]) + g.layers * std::fabs(g.layer_step[a]) +
-                            g.rows * std::fabs(g.row_step[a]) + g.columns * std::fabs(g.column_step[a]);
+                            (g.first_row + g.rows) * std::fabs(g.row_step[a]) +
+                            (g.first_column + g.columns) * std::fabs(g.column_step[a]);
     ggslam::check_range("grid", farthest, 0.0, 1e9);
   }
 }
@@ -113,7 +115,8 @@ GGSLAM_EXPORT int ggslam_tsdf_columns(void* handle, void* context, const ColumnG
           for (int column = 0; column < g.columns; ++column) {
             double foot[3];
             for (int a = 0; a < 3; ++a)
-              foot[a] = g.start[a] + static_cast<double>(row) * g.row_step[a] + column * g.column_step[a];
+              foot[a] = g.start[a] + static_cast<double>(g.first_row + row) * g.row_step[a] +
+                        (g.first_column + column) * g.column_step[a];
             read_column(reader, foot, g.layer_step, g.layers, seen + row * g.columns + column, cells);
           }
       });

@@ -23,11 +23,12 @@ struct Reader {
   const QueryInput& in;
   BlockCoordinates at{0, 0, 0};
   const FieldVoxels* block = nullptr;
-  bool valid = false, stale = false;
+  bool valid = false, stale = false, read_stale = false;  // read_stale: of any voxel read
 
   // The distance of a voxel; NaN if it is not known.
   float distance(int x, int y, int z) {
     go_to({x >> 3, y >> 3, z >> 3});
+    read_stale |= stale;
     return block == nullptr ? std::numeric_limits<float>::quiet_NaN() : block->distance[row_of(x, y, z)];
   }
 
@@ -95,8 +96,8 @@ void interpolate(Reader& reader, const double place[3], const int home[3], const
 
 }  // namespace
 
-// Points begin ... end - 1: distance [n] in metres, gradient [n, 3], known [n], stale [n]. A point is known, or stale,
-// if the voxel that it is in is.
+// Points begin ... end - 1: distance [n] in metres, gradient [n, 3], known [n], stale [n]. A point is known if the voxel
+// that it is in is, and stale if one of those is that it is interpolated between.
 void esdf_query(const QueryInput& in, std::size_t begin, std::size_t end, float* distance, float* gradient,
                 uint8_t* known, uint8_t* stale) {
   Reader reader{in};
@@ -111,9 +112,10 @@ void esdf_query(const QueryInput& in, std::size_t begin, std::size_t end, float*
       home[a] = finite ? static_cast<int>(std::floor(place[a] + 0.5)) : 0;
     }
     Sample centre, out{std::numeric_limits<float>::quiet_NaN(), {0, 0, 0}};
+    reader.read_stale = false;
     known[n] = finite && reader.read(home, centre);
-    stale[n] = known[n] && reader.stale;
     if (known[n]) interpolate(reader, place, home, centre, in.voxel, out);
+    stale[n] = known[n] && reader.read_stale;
     distance[n] = out.distance;
     float square = 0;
     for (int a = 0; a < 3; ++a) square += out.gradient[a] * out.gradient[a];
