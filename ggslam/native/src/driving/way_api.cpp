@@ -77,7 +77,7 @@ GGSLAM_EXPORT int ggslam_way_grid_destroy(void* handle) try {
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int64_t ggslam_way_grid_bytes(void* handle) try {
-  return static_cast<int64_t>(planner(handle).grid.bytes());
+  return static_cast<int64_t>(planner(handle).grid.bytes() + planner(handle).search.bytes());
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_way_grid_write(void* handle, const int32_t* low_, const int32_t* shape_,

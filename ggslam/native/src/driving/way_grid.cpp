@@ -54,7 +54,7 @@ int32_t WayGrid::make(BlockCoordinates at) {
   if ((blocks_.size() + 1) * static_cast<std::size_t>(cells) >= kMostCells) refuse("grid: too many cells");
   const int32_t row = static_cast<int32_t>(table_.insert(at));
   blocks_.emplace_back();
-  ++layout_;
+  if (!may_come(at)) ++layout_;
   WayBlock& made = blocks_.back();
   made.around[kHere] = row;
   made.clearance.reset(new float[static_cast<std::size_t>(cells)]);

@@ -73,8 +73,8 @@ class WayGrid {
 
   void write(const Vec3i& low, const Vec3i& shape, const float* clearance);
   void read(const Vec3i& low, const Vec3i& shape, float* clearance) const;
-  void finish_page(BlockCoordinates at) { finished_.insert(at), ++layout_; }
-  // Another number whenever blocks or pages have come.
+  void finish_page(BlockCoordinates at) { finished_.insert(at); }
+  // Another number whenever a block has come that was not to come any more.
   std::size_t layout() const { return layout_; }
   std::size_t bytes() const;
 

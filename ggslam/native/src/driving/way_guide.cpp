@@ -14,6 +14,7 @@ namespace ggslam::driving {
 namespace {
 
 constexpr float kFar = std::numeric_limits<float>::infinity();
+constexpr int64_t kBetterBound = 512;  // patches, after which what is left at least is told anew
 
 // The places of a patch's cells.
 struct Cells {
@@ -39,7 +40,7 @@ void WayGuide::begin(const WayCost& cost, const Vec3<float>& start, const Vec3<f
 void WayGuide::begin_again() {
   patches_.begin(cost_);
   queue_.clear(), goal_patches_.clear(), expanded_ = 0;
-  ++version_;
+  ++version_, ++bound_version_;
   for (const Vec3i& cell : std::vector<Vec3i>(std::move(goals_))) add_goal(cell);
 }
 
@@ -70,6 +71,7 @@ void WayGuide::step() {
   Node& here = node(entry.cell);
   if (here.done || entry.value > here.value) return;
   here.done = true, ++expanded_;
+  if (expanded_ % kBetterBound == 0) ++bound_version_;
   patches_.around(entry.cell, &around_);
   const Vec3<float> middle = patches_.patch(entry.cell).middle;
   const float factor = patches_.patch(entry.cell).factor;
@@ -94,7 +96,7 @@ void WayGuide::fill(CellPlace p, int index, int64_t most) {
       b.guide[static_cast<std::size_t>(grid_.index_of(low + patches_.cell(i)))] = left[i];
     }
   });
-  b.guided[index] = is_known ? version_ : version_ - 1;
+  b.guided[index] = is_known ? version_ : bound_version_;
 }
 
 // What is left from the cells of a patch; whether that is known, and not only a bound of it.

@@ -32,16 +32,18 @@ class WayGuide {
   float left(CellPlace p, int64_t most) {
     const int patch = patches_.index_of(p.index);
     WayBlock& b = grid_.block(p.row);
-    if (!b.guide || b.guided[patch] != version_) fill(p, patch, most);
+    if (!b.guide || (b.guided[patch] != version_ && b.guided[patch] != bound_version_)) fill(p, patch, most);
     return b.guide[static_cast<std::size_t>(p.index)];
   }
   // Whether what was told of a cell's patch may be told better now.
   bool is_old(CellPlace p) const {
     return grid_.block(p.row).guided[patches_.index_of(p.index)] != version_;
   }
+  std::size_t bytes() const { return patches_.bytes() + nodes_.capacity() * sizeof(Node); }
   int64_t expanded() const { return expanded_; }  // patches, since it began
 
  private:
+  static constexpr uint32_t kFirstBound = uint32_t{1} << 31;
   struct Node {
     float value;      // cost to the goal
     uint32_t search;  // of which search this is
@@ -62,7 +64,7 @@ class WayGuide {
   CostQueue queue_;
   std::vector<Node> nodes_;
   std::vector<float> places_;  // five numbers each, see `ways_over_places`
-  uint32_t version_ = 0;
+  uint32_t version_ = 0, bound_version_ = kFirstBound;  // of what is known, and of what is known to be left at least
   int64_t expanded_ = 0;
 };
 

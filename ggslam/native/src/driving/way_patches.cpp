@@ -10,6 +10,7 @@ namespace ggslam::driving {
 namespace {
 
 constexpr int32_t kUnknown = -2;
+constexpr uint32_t kToCome = 0, kNothing = ~0u - 1, kNever = ~0u;  // versions of what is not there
 constexpr float kRounding = 1e-5f;  // cells; more than a line's clearance is off by, so that no way is missed
 constexpr std::size_t kMostPatches = std::size_t{1} << 31;
 
@@ -64,7 +65,7 @@ Vec3i WayPatches::low(int64_t number) const {
 int32_t WayPatches::add_block(BlockCoordinates at) {
   if (patches_.size() + static_cast<std::size_t>(count_) >= kMostPatches) refuse("grid: too many cells");
   const int32_t row = static_cast<int32_t>(blocks_.size());
-  blocks_.push_back({at, search_ - 1, search_ - 1, ~0u, -1, {}});
+  blocks_.push_back({at, search_ - 1, search_ - 1, kNever, -1, {}});
   for (int n = 0; n < kAround; ++n)
     blocks_.back().around[n] = grid_.dimensions == 2 && n / 9 != 1 ? -1 : kUnknown;
   patches_.resize(patches_.size() + static_cast<std::size_t>(count_), {0, {{0, 0, 0}}, 1});
@@ -88,18 +89,19 @@ void WayPatches::look(int32_t row) {
   Block& own = blocks_[static_cast<std::size_t>(row)];
   own.seen = search_;
   const int32_t there = grid_.row(own.at);
-  const uint32_t version = there < 0 ? 0 : grid_.block(there).version;
+  const uint32_t missing = grid_.may_come(own.at) ? kToCome : kNothing;
+  const uint32_t version = there < 0 ? missing : grid_.block(there).version;
   if (version == own.version) return;
   own.version = version;
   const float* clearance = there < 0 ? nullptr : grid_.block(there).clearance.get();
-  for (int i = 0; i < count_; ++i) look(row, i, clearance);
+  for (int i = 0; i < count_; ++i) look(row, i, clearance, version == kToCome);
 }
 
-void WayPatches::look(int32_t row, int index, const float* clearance) {
+void WayPatches::look(int32_t row, int index, const float* clearance, bool may_come) {
   const Vec3i first = low(static_cast<int64_t>(row) * count_ + index);
   const int side = 1 << side_bits_, mask = side - 1;
-  uint64_t open = clearance == nullptr ? ~uint64_t{0} : 0;
-  float best = clearance == nullptr ? cost_.radius + cost_.margin : cost_.radius;
+  uint64_t open = may_come ? ~uint64_t{0} : 0;
+  float best = may_come ? cost_.radius + cost_.margin : cost_.radius;
   for (int line = 0; line < kPatchCells / side && clearance != nullptr; ++line) {
     const Vec3i at{{first[0], first[1] + (line & mask), first[2] + (line >> side_bits_)}};
     const float* from = clearance + grid_.index_of(at);
@@ -137,14 +139,13 @@ uint64_t WayPatches::part(uint64_t open) const {
 }
 
 Patch WayPatches::patch_of(const Vec3i& low, uint64_t open, float best) const {
-  const int mask = (1 << side_bits_) - 1;
+  if (open == 0) return {0, {{0, 0, 0}}, 1};
   Vec3<float> sum{{0, 0, 0}};
-  float n = 0;
-  for (uint64_t left = open; left != 0; left &= left - 1, ++n) {
-    const int i = __builtin_ctzll(left);
-    for (int a = 0; a < grid_.dimensions; ++a) sum[a] += static_cast<float>(i >> (side_bits_ * a) & mask);
-  }
-  return {open, cast<float>(low) + (1 / std::max(1.0f, n)) * sum, cost_.factor(best)};
+  const float n = static_cast<float>(__builtin_popcountll(open));
+  for (int a = 0; a < grid_.dimensions; ++a)
+    for (int k = 1; k < side(); ++k)  // layer by layer
+      sum[a] += static_cast<float>(k * __builtin_popcountll(open >> (k << (side_bits_ * a)) & face_[a]));
+  return {open, cast<float>(low) + (1 / n) * sum, cost_.factor(best)};
 }
 
 int64_t WayPatches::number(const Vec3i& cell) {

@@ -29,6 +29,9 @@ class WayPatches {
   int64_t number(const Vec3i& cell);
   const Patch& patch(int64_t number) const { return patches_[static_cast<std::size_t>(number)]; }
   std::size_t size() const { return patches_.size(); }
+  std::size_t bytes() const {
+    return table_.bytes() + blocks_.capacity() * sizeof(Block) + patches_.capacity() * sizeof(Patch);
+  }
   // The patches around one that can be reached from it within the 27 times 64 cells, with it.
   void around(int64_t number, std::vector<int64_t>* found);
   // Calls do(number) for the patches of 64 cells.
@@ -57,7 +60,7 @@ class WayPatches {
   int32_t block(BlockCoordinates at);
   int32_t add_block(BlockCoordinates at);
   void look(int32_t row);
-  void look(int32_t row, int index, const float* clearance);
+  void look(int32_t row, int index, const float* clearance, bool may_come);
   uint64_t part(uint64_t open) const;
   Patch patch_of(const Vec3i& low, uint64_t open, float best) const;
   void look_around(int32_t row);

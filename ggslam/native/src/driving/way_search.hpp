@@ -21,6 +21,7 @@ class WaySearch {
   void begin(const WayQuery& query);
   SearchState go_on(int64_t most);
   WayStats stats() const;
+  std::size_t bytes() const { return guide_.bytes(); }
   // The way that was found, with start and goal.
   const std::vector<Vec3<double>>& points() const { return points_; }
 
