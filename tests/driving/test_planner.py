@@ -8,6 +8,7 @@ import pytest
 from plan_scenes import (
     Column,
     Room,
+    ShortestWays,
     along,
     exact_clearance,
     random_room,
@@ -210,6 +211,29 @@ def test_what_was_learned_of_a_goal_changes_no_cost() -> None:
         assert again.cost == pytest.approx(first.cost, rel=0.006)  # what a search takes for worthwhile
         looked_at += again.expanded, first.expanded
     assert looked_at[0] < looked_at[1]
+
+
+def test_a_goal_behind_a_wall_is_not_looked_for() -> None:
+    planner = flat_planner(room_with_door(0))
+    way = planner.grid.search(np.array([1.0, 1, 0]), np.array([5.0, 3, 0]), planner.costs, lambda page: None)
+    assert way.points is None and way.expanded == 0
+
+
+def test_a_way_around_is_found_without_looking_everywhere() -> None:
+    """Out of a pocket that opens away from the goal: as short as scipy's way, and few of the cells are looked at."""
+    occupied = np.zeros((300, 300), bool)
+    occupied[[0, -1]] = occupied[:, [0, -1]] = True
+    occupied[50:250, 200] = occupied[50, 40:201] = occupied[249, 40:201] = True
+    planner = flat_planner(occupied)
+    clear = cell_distances(occupied, 0.1, 30, NativeContext(1))
+    start, goal = (150, 190), (150, 260)
+    ends = [np.array([at[1] + 0.5, at[0] + 0.5, 0]) * 0.1 for at in (start, goal)]
+    way = planner.grid.search(ends[0], ends[1], planner.costs, lambda page: None)
+    assert way.points is not None
+    length = float(np.linalg.norm(np.diff(way.points, axis=0), axis=1).sum())
+    shortest = 0.1 * float(ShortestWays(clear >= 0.2).lengths(np.array(start), np.array([goal]))[0])
+    assert length <= 1.03 * shortest
+    assert way.expanded < 0.2 * np.count_nonzero(clear >= 0.2)
 
 
 def test_searches_repeat_bit_for_bit() -> None:
