@@ -31,7 +31,7 @@ class BandSourceTuning(Tuning):
 class BandSource(Protocol):
     """What there is between two heights, metres above the grid's plane."""
 
-    def seen(self, low: float, high: float) -> np.ndarray:
+    def look(self, low: float, high: float) -> np.ndarray:
         """What the voxels are, together, as `seen_above` tells, uint8 [H, W]: layers a voxel apart, or the one at the
         middle."""
 
@@ -51,7 +51,7 @@ class _InMemory:
         self._surface = SeenSurface(field, grid.plane)
         self._layers: dict[int, np.ndarray] = {}
 
-    def seen(self, low: float, high: float) -> np.ndarray:
+    def look(self, low: float, high: float) -> np.ndarray:
         spacing, grid = self._field.voxel, self._grid
         most = _most_layers(grid.shape)
         found = np.zeros(grid.shape, np.uint8)
@@ -75,7 +75,7 @@ class _CellsOnDisk:
     def __init__(self, field: CellField, grid: CellGrid) -> None:
         self._field, self._grid = field, grid
 
-    def seen(self, low: float, high: float) -> np.ndarray:
+    def look(self, low: float, high: float) -> np.ndarray:
         spacing, grid = self._field.voxel, self._grid
         found = np.zeros(grid.shape, np.uint8)
         for part in self._field.parts(grid.plane, low, high):

@@ -122,7 +122,7 @@ class HeightLayers:
         # Half a voxel more: the voxel around a place that low reaches half its edge up.
         layer = np.floor(-step / self._field.voxel - 0.5 + 1e-6) * self._field.voxel
         if layer not in self._drops:
-            seen = self._source.seen(layer, layer)
+            seen = self._source.look(layer, layer)
             self._drops[layer] = ((seen & SEEN_BIT) > 0) & ((seen & BEHIND_BIT) == 0)
         return self._drops[layer]
 
@@ -138,7 +138,7 @@ class HeightLayers:
         if not low <= high:
             raise InputError(f"expected two heights, the lower first, found {low} and {high}")
         low, high = max(low, min(self._reach[0], high)), min(high, max(self._reach[1], low))
-        seen = self._source.seen(low, high)
+        seen = self._source.look(low, high)
         known, behind = (seen & SEEN_BIT) > 0, (seen & BEHIND_BIT) > 0
         near, measured, sites = self._source.surface(low, high, on_floor)
         sited = self.grid.mark(sites)

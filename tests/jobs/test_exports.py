@@ -69,13 +69,13 @@ def test_gaussians_for_a_larger_window_are_wider(run: RunFolder, tmp_path: Path,
         assert (large.log_scales > small.log_scales).all()
 
 
-def test_a_zoom_goes_with_gaussians_and_is_at_least_one(run: RunFolder, tmp_path: Path) -> None:
+def test_a_zoom_goes_with_gaussians_and_has_limits(run: RunFolder, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="`zoom`.*trajectory"):
         export_run(run, tmp_path / "poses.txt", zoom=2.0)
-    with pytest.raises(ConfigError, match=r"`zoom`.* 1 .*1000.* 0\.5"):
-        export_run(run, tmp_path / "map.ply", zoom=0.5)
+    with pytest.raises(ConfigError, match=r"`zoom`.* 0\.05 .*1000.* 0\.04"):
+        export_run(run, tmp_path / "map.ply", zoom=0.04)
     result = CliRunner().invoke(app, ["export", str(run.path), "--out", str(tmp_path / "map.ply"), "--zoom", "0"])
-    assert str(result.exception) == "--zoom: expected 1 to 1000, found 0" and not list(tmp_path.iterdir())
+    assert str(result.exception) == "--zoom: expected 0.05 to 1000, found 0" and not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("kind", ["compressed-ply", "spz", "spz4", "splat"])

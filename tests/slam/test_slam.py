@@ -64,7 +64,7 @@ def test_with_noisy_depth_the_last_iterations_are_two_steps(frames: list[Frame])
 
 def test_the_end_has_more_steps_than_the_frames_had_and_some_for_each_keyframe(frames: list[Frame]) -> None:
     mapper = new_slam(frames).mapper
-    assert mapper.last_iterations(0) == 0 and mapper.last_iterations(1000) == 1200
+    assert mapper.last_iterations(0) == 0 and mapper.last_iterations(1000) == 1300
     earlier = 500 * [Mock(frame_index=FROM_EARLIER_RUN)]
     mapper.keyframes = 200 * [Mock(frame_index=3)] + earlier
     assert mapper.last_iterations(0) == 0 and mapper.last_iterations(1000) == 2000
