@@ -14,6 +14,8 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ggslam.scene.arrays import arrays_to_bytes, read_arrays
 from ggslam.system.atomic import write_bytes
@@ -82,14 +84,14 @@ class _Numbering:
 
     Attributes:
         boxes, vertices: so far.
-        parent: of each piece, the one that it is joined to, or itself.
+        joins: pairs of pieces that go on in each other.
         triangles: of each piece, in its box.
         seams: number and piece of shared vertices by their bits, of boxes that others are still to come around.
     """
 
     boxes: int = 0
     vertices: int = 0
-    parent: list[int] = field(default_factory=list)
+    joins: set[tuple[int, int]] = field(default_factory=set)
     triangles: list[int] = field(default_factory=list)
     seams: dict[CellKey, dict[bytes, tuple[int, int]]] = field(default_factory=dict)
 
@@ -102,8 +104,7 @@ class _Numbering:
             shared: which of its vertices other boxes have, bool [V].
         """
         count, of_vertex = pieces_of(mesh)
-        pieces = len(self.parent) + of_vertex
-        self.parent += range(len(self.parent), len(self.parent) + count)
+        pieces = len(self.triangles) + of_vertex
         numbers, first = np.empty(len(mesh.vertices), np.int64), np.ones(len(mesh.vertices), bool)
         rows = np.flatnonzero(shared)
         names = [row.tobytes() for row in mesh.vertices[rows] + 0.0]  # + 0: -0 and 0 are the same
@@ -111,7 +112,7 @@ class _Numbering:
         for row, name in zip(rows.tolist(), names, strict=True):
             if name in around:
                 numbers[row], first[row] = around[name][0], False
-                self._join(int(pieces[row]), around[name][1])
+                self.joins.add((int(pieces[row]), around[name][1]))
         numbers[first] = self.vertices + np.arange(np.count_nonzero(first))
         self.vertices += int(np.count_nonzero(first))
         self.seams[box] = {
@@ -129,19 +130,14 @@ class _Numbering:
             del self.seams[other]
         return [other for other in self.seams if all(abs(a - b) <= 1 for a, b in zip(other, box, strict=True))]
 
-    def _root(self, piece: int) -> int:
-        while self.parent[piece] != piece:
-            self.parent[piece] = self.parent[self.parent[piece]]
-            piece = self.parent[piece]
-        return piece
-
-    def _join(self, piece: int, other: int) -> None:
-        self.parent[self._root(piece)] = self._root(other)
-
     def large(self, min_triangles: int) -> np.ndarray:
         """Whether each of the pieces belongs to one of so many triangles in all, bool [pieces]."""
-        roots = np.array([self._root(piece) for piece in range(len(self.parent))], np.int64)
-        return np.bincount(roots, self.triangles, len(roots))[roots] >= min_triangles
+        if not self.triangles:
+            return np.zeros(0, bool)
+        rows, columns = np.array(sorted(self.joins), np.int64).reshape(-1, 2).T
+        links = coo_array((np.ones(len(rows), bool), (rows, columns)), (len(self.triangles),) * 2)
+        whole = connected_components(links, directed=False)[1]
+        return np.bincount(whole, self.triangles)[whole] >= min_triangles
 
 
 # --- files -----------------------------------------------------------------------------------------------------------

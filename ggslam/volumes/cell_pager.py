@@ -97,13 +97,6 @@ class CellPager:
         self.read += len(coming)
         self._load(coming)
 
-    def bring_all(self) -> None:
-        """Brings all cells, whatever memory that takes."""
-        if self._stale is not None:
-            self._stale.build_all(self.tsdf, self._decays, lambda: None)
-            self._stale = None
-        self._load(set(self._away))
-
     def write_all(self) -> None:
         """Has all cells on disk, and none in memory, if some are there or are to be fused again; else none is."""
         if self._stale is not None:

@@ -53,7 +53,7 @@ def test_what_was_on_disk_is_as_if_it_had_stayed(
     assert triangles(paged.mesh(20)) == triangles(whole.mesh(20))
     assert len(paged.tsdf) == 0 and pager.most_bytes <= budget  # files are made of what is on disk
     assert not esdf or (paged.field is not None and len(paged.field) == 0)
-    pager.bring_all()
+    pager._load(pager.keys())
     assert len(pager) == 0 and tsdf_to_bytes(paged.tsdf) == tsdf_to_bytes(whole.tsdf)
     if esdf:
         assert paged.field is not None and whole.field is not None
