@@ -310,15 +310,18 @@ class Mapper(ABC):
 
     def _choose_size(self, keyframe: Keyframe, done: float) -> PixelGrid:
         """The picture of a step of the final refinement; the recording's own if a loss needs it."""
-        if self.extra_loss is not None or self._is_identity_dense:
-            return ALL_PIXELS
-        return picture_of_turn(self.times.iterations, done, keyframe.camera)
+        return ALL_PIXELS if self._needs_all_pixels else picture_of_turn(self.times.iterations, done, keyframe.camera)
 
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         """Every second pixel of every second row of a keyframe, other ones each time; all if a loss needs them all."""
-        if self.extra_loss is not None or self._is_identity_dense:
+        if self._needs_all_pixels:
             return ALL_PIXELS
         return grid_of_turn(keyframe.iterations + keyframe.index, keyframe.camera)
+
+    @property
+    def _needs_all_pixels(self) -> bool:
+        """Whether a loss is of whole pictures of the recording's size."""
+        return self.extra_loss is not None or self._is_identity_dense
 
     @property
     def _is_noisy(self) -> bool:

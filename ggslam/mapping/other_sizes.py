@@ -14,7 +14,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
+from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, is_divisible
 from ggslam.scene.camera import Camera
 from ggslam.system.tuning import Tuning
 
@@ -25,8 +25,6 @@ class OtherSizeTuning(Tuning):
     share = 0.5
     """Part of the final refinement, its first one, of which half of the steps are on other sizes. The later ones
     sharpen the map at its own size."""
-    min_size = 32
-    """Fewest pixels of a picture at half the size along each side. Smaller ones are not trained on."""
     alike = 1.02
     """Depths that differ by this factor are not averaged: they are of different surfaces."""
 
@@ -78,7 +76,7 @@ _TURNS: Final = (ALL_PIXELS, HalfSize(), TwiceTheSize(), ALL_PIXELS)
 
 def picture_of_turn(turn: int, done: float, camera: Camera) -> PixelGrid:
     """What the `turn`-th step of the final refinement looks at, of which `done`, 0 to 1, is over."""
-    if done >= OtherSizeTuning.share or min(camera.width, camera.height) < 2 * OtherSizeTuning.min_size:
+    if done >= OtherSizeTuning.share or not is_divisible(camera):
         return ALL_PIXELS
     return _TURNS[turn % len(_TURNS)]
 

@@ -22,7 +22,7 @@ class PixelGridTuning(Tuning):
     """Training on a part of the pixels."""
 
     min_size = 32
-    """Fewest pixels of a grid along each side. Smaller images use all pixels."""
+    """Fewest pixels of a grid, or of a picture of half the size, along each side. Smaller images use all pixels."""
 
 
 _ORDER: Final = ((0, 0), (1, 1), (0, 1), (1, 0))
@@ -79,9 +79,14 @@ class PixelGrid:
 ALL_PIXELS = PixelGrid()
 
 
+def is_divisible(camera: Camera) -> bool:
+    """Whether images are large enough to be trained on at half of their rows and columns."""
+    return min(camera.width, camera.height) >= 2 * PixelGridTuning.min_size
+
+
 def grid_of_turn(turn: int, camera: Camera) -> PixelGrid:
     """The grid of a view's next step, of which `turn` counts those before: every second pixel. In four turns each
     pixel comes once."""
-    if min(camera.width, camera.height) < 2 * PixelGridTuning.min_size:
+    if not is_divisible(camera):
         return ALL_PIXELS
     return PixelGrid(2, *_ORDER[turn % 4])
