@@ -157,6 +157,8 @@ class Mapper(ABC):
         """Metres that a pixel of the images is wide at the scene's median depth; 0: not known."""
         self.is_live = False
         """Whether frames come at a camera's pace: keyframes do not wait then while one looks for what surfaces hide."""
+        self.fits_view_colors = False
+        """Whether the final refinement ends with colours that depend on the view; see `mapping.cpu.view_colors`."""
         self.residency: Residency | None = None
         """Keeps a part of the map on disk; None: all of it is in memory."""
         self.left_out = set()
@@ -511,6 +513,11 @@ class Mapper(ABC):
                     progress(done, iterations)
             self._mean.move_into(self.map)
             self._bound_values()
+        if self.fits_view_colors and self.residency is None:
+            self._fit_view_colors()
+
+    def _fit_view_colors(self) -> None:  # noqa: B027
+        """Gives Gaussians colours that depend on the view where keyframes ask for them; on the CPU."""
 
     def end_refinement(self) -> None:
         """Of a refinement that was cut off the map becomes the mean over what it has made of the last steps."""

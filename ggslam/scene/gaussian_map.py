@@ -278,6 +278,18 @@ class GaussianMap:
         self.version += 1
         return place
 
+    def raise_degree(self, degree: int) -> None:
+        """Makes colours of at least `degree`, 0 to 3: the new coefficients and all moments of colours are 0."""
+        if degree <= self.sh_degree:
+            return
+        old, self.sh_degree = self.sh, degree
+        names = [name for name in self._names if name.partition(".")[0] == "sh"]
+        for name in names:  # moments are not copied: memory of zeros that nobody writes to is not taken up
+            self._storage[name] = torch.zeros((self.capacity, *self._shape(name)), device=self.device)
+        self._storage["sh"][: self.count, : old.shape[1]] = old
+        self._views.pop("sh", None)
+        self.allocations += 1
+
     # --- changes -----------------------------------------------------------------------------------------------------
 
     def insert(

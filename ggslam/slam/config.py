@@ -80,8 +80,10 @@ class Config:
     device: Literal["auto", "cpu", "cuda"] = setting("cpu", basic=True)
     """Where the map and its keyframes are stored, trained and tracked. cuda: an NVIDIA GPU (nvcc compiles the kernels
     on first use); auto: the GPU if there is one and `memory_limit_mb` is 0, else the CPU."""
-    sh_degree: int = setting(0, 0, 3, basic=True)
-    """Degree of the spherical harmonics that describe a Gaussian's colour; 0: one colour from all sides."""
+    sh_degree: int = setting(-1, -1, 3, basic=True)
+    """Degree of the spherical harmonics that describe a Gaussian's colour. -1: 0 while it is trained; after the final
+    refinement (CPU, without a memory limit) 2 where views ask for it. 0: one colour from all sides; 1 to 3: trained
+    from the start."""
     tracker: Literal["gicp", "edges_planes"] = setting("gicp", basic=True)
     """How frames are located. gicp: G-ICP against the points of the keyframes; edges_planes: edges and planes within a
     time budget per frame, and G-ICP where they fail."""

@@ -132,16 +132,18 @@ def make_mapper(
         compact: whether identity vectors may have compact moments: they are never trained with everything else.
     """
     learns = learns and config.identity.enabled
-    channels = IDENTITY_CHANNELS if learns else 0
+    channels, degree = IDENTITY_CHANNELS if learns else 0, max(0, config.sh_degree)
     if library is None:
         learner = CpuIdentityLearner(config.identity, config.seed) if learns else None
         compact = compact and learns and config.identity.schedule != "dense"
-        gaussians = GaussianMap(config.sh_degree, channels, compact_features=compact)
-        return CpuMapper(gaussians, config.mapping, context, config.seed, learner)
+        gaussians = GaussianMap(degree, channels, compact_features=compact)
+        mapper = CpuMapper(gaussians, config.mapping, context, config.seed, learner)
+        mapper.fits_view_colors = config.sh_degree < 0
+        return mapper
     device = library.whole_device(None)
     device_learner = CudaIdentityLearner(config.identity, config.seed, device, library) if learns else None
     return CudaMapper(
-        GaussianMap(config.sh_degree, channels, device), config.mapping, library, config.seed, device_learner
+        GaussianMap(degree, channels, device), config.mapping, library, config.seed, device_learner
     )
 
 

@@ -72,6 +72,22 @@ struct CrossEntropyOfPixels {
   double loss;  // result: mean over the pixels that count; 0 without any
 };
 
+// What one view tells of the colours of Gaussians, as linear equations for `count` coefficients of spherical harmonics from
+// degree 1 on: 3, 8 or 15. Of each Gaussian they are the lower triangle, row by row, then [count, 3] right sides.
+struct ViewColorsOfView {
+  const float* means;      // [N, 3]
+  // Gradients by the constant coefficient, rows `stride` apart: of the sum of the image, and of the sum of what the view
+  // shows minus the image. Their quotient is what a Gaussian's pixels miss on average.
+  const float* weights;
+  const float* residuals;
+  float* equations;        // [N, count (count + 1) / 2 + 3 count], which the view's are added to
+  int64_t gaussians;       // N
+  int32_t stride, count;
+  float centre[3];         // of the camera
+  float least_weight, most_weight;  // pixels; fewer say nothing, more do not say more
+  float usual_residual;    // of a colour; larger ones weigh less, as by an L1 norm
+};
+
 }  // namespace ggslam
 
 GGSLAM_EXPORT void* ggslam_image_loss_create();
@@ -87,3 +103,10 @@ GGSLAM_EXPORT int ggslam_insertion_shape(void* context, const ggslam::InsertionJ
 
 // The result is the same, bit for bit, for any number of threads.
 GGSLAM_EXPORT int ggslam_cross_entropy_of_pixels(void* context, ggslam::CrossEntropyOfPixels* job);
+
+// Adds a view to the equations.
+GGSLAM_EXPORT int ggslam_view_colors_add(void* context, const ggslam::ViewColorsOfView* job);
+// Replaces right sides by the solutions, `ridge` being added to every diagonal; gains [gaussians]: by how much each lessens
+// the weighted sum of squares, less what the ridge costs. Triangles stay.
+GGSLAM_EXPORT int ggslam_view_colors_solve(void* context, float* equations, int64_t gaussians, int count, float ridge,
+                                           float* gains);

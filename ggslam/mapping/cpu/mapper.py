@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -15,6 +15,7 @@ from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
 from ggslam.mapping.cpu.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
+from ggslam.mapping.cpu.view_colors import ShownColors, ViewColorTuning, fit_view_colors
 from ggslam.mapping.identity import IdentityTuning
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
@@ -45,7 +46,7 @@ class HiddenGaussianTuning(Tuning):
     """Contributions that are read in one batch, of eight bytes each."""
 
 
-@savable(not_saved="settings residency extra_loss _rasterizer _loss _adam_of_pixel", check="check")
+@savable(not_saved="settings residency extra_loss fits_view_colors _rasterizer _loss _adam_of_pixel", check="check")
 class CpuMapper(Mapper):
     """See `Mapper`. With the same seed, frames and iteration counts a run on one machine repeats bit for bit, for any
     number of threads.
@@ -223,14 +224,48 @@ class CpuMapper(Mapper):
         )
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> CpuLossResult:
-        exposure = keyframe.exposure if self._exposures.is_exposed(keyframe) else None
-        valid, compared = self.valid_of(keyframe), self._exposures.usable_pixels(keyframe)
-        if compared is not None:
-            valid = compared if valid is None else valid & compared
+        shown = self._comparable(keyframe)
         color, depth = grid.color_of(keyframe.color), grid.depth_of(keyframe.depth)
-        shown = None if valid is None else grid.valid_of(valid)
-        target = LossTarget(color, depth, keyframe.depth_unit, exposure, shown)
+        shown = None if shown is None else grid.valid_of(shown)
+        target = LossTarget(color, depth, keyframe.depth_unit, self._exposure_of(keyframe), shown)
         return self._loss.evaluate(view, target, self.settings.loss)
+
+    def _comparable(self, keyframe: Keyframe) -> np.ndarray | None:
+        """Where a keyframe's colours are compared with the map's, bool [H, W]; None: everywhere."""
+        valid, compared = self.valid_of(keyframe), self._exposures.usable_pixels(keyframe)
+        if valid is None or compared is None:
+            return compared if valid is None else valid
+        return valid & compared
+
+    def _exposure_of(self, keyframe: Keyframe) -> np.ndarray | None:
+        return keyframe.exposure if self._exposures.is_exposed(keyframe) else None
+
+    def _fit_view_colors(self) -> None:
+        ridge = ViewColorTuning.noisy_ridge if self._is_noisy else ViewColorTuning.ridge
+        fit_view_colors(self.map, self._shown_colors, ridge, self._rasterizer.context)
+
+    def _shown_colors(self) -> Iterator[ShownColors]:
+        """What the keyframes show of the Gaussians where they have measured depth: elsewhere places are guesses."""
+        for keyframe in (self.keyframes[number] for number in self._trainable()):
+            if keyframe.frame_index == FROM_EARLIER_RUN:
+                continue
+            image = self._render(keyframe, features=False).image
+            missing = self._colors_of_map(keyframe) - image
+            shown = keyframe.depth > 0
+            compared = self._comparable(keyframe)
+            usable = torch.from_numpy(shown if compared is None else shown & compared).float()
+            residuals = self._rasterizer.backward(missing * usable).sh
+            self._render(keyframe, features=False)
+            weights = self._rasterizer.backward(usable.expand(3, -1, -1).contiguous()).sh
+            yield ShownColors(keyframe.T_world_camera[:3, 3], weights, residuals)
+
+    def _colors_of_map(self, keyframe: Keyframe) -> torch.Tensor:
+        """A keyframe's colours [3, H, W] as the map's exposure shows them."""
+        colors, exposure = keyframe.color.transpose(2, 0, 1) / np.float32(255), self._exposure_of(keyframe)
+        if exposure is not None:
+            gain, offset = exposure.astype(np.float32).T[:, :, None, None]
+            colors = (colors - offset) / gain
+        return torch.from_numpy(np.ascontiguousarray(colors))
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
         if pose_rate:
