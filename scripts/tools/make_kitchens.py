@@ -51,6 +51,12 @@ CUPBOARDS = (
     ((-1.82, 0, 1.75), (0.17, 1.6, 0.35), (0.35, 0.25, 0.2)),
 )
 """Centre, half size and colour of each box."""
+KITCHEN_LIGHT = -0.1, -0.06, -1.0
+"""Where the room's distant light shines. LIBERO's shines straight down, along every upright face: rounding then decides
+frame by frame whether a face is lit and gets the light's specular share, and whole faces flicker. Leaned like this it
+lights fronts that the lamp above the island lights anyway."""
+PATHS = {"first": (0.0, 0.0, 0.0), "other": (np.radians(20), 0.15, 0.3)}
+"""What each path adds to the camera's angle about the island, radians, to its distance and to its height, metres."""
 
 
 def read_room(assets: Path, top: str) -> mujoco.MjSpec:
@@ -73,6 +79,7 @@ def read_room(assets: Path, top: str) -> mujoco.MjSpec:
             geom.size = [*ISLAND, TOP / 2]
         elif geom.name.startswith("table_leg"):
             geom.pos = [0, 0, -TOP / 4]
+    spec.light("light_kitchen").dir = KITCHEN_LIGHT
     for number, (centre, size, color) in enumerate(CUPBOARDS):
         spec.worldbody.add_geom(
             name=f"cupboard{number}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=list(centre), size=list(size),
@@ -108,9 +115,20 @@ def place_things(spec: mujoco.MjSpec, assets: Path, rng: np.random.Generator, st
         frame = spec.worldbody.add_frame(pos=[x, y, TOP], quat=[np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
         thing = mujoco.MjSpec.from_file(file)
         thing.modelname = name
+        drop_doubles(thing)
         spec.attach(thing, frame=frame, prefix=f"{name}/")
         names[name] = model.rsplit("/", 1)[-1]
     return names
+
+
+def drop_doubles(thing: mujoco.MjSpec) -> None:
+    """Takes away meshes that a model draws a second time at the same place, so that no two seen surfaces coincide."""
+    seen = set()
+    for geom in list(thing.geoms):
+        kind = geom.parent.name, geom.group, geom.meshname, *geom.pos, *geom.quat
+        if geom.type == mujoco.mjtGeom.mjGEOM_MESH and kind in seen:
+            thing.delete(geom)
+        seen.add(kind)
 
 
 def name_geoms(model: mujoco.MjModel) -> list[str]:
@@ -153,11 +171,11 @@ def _corners(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarra
     return local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
 
 
-def camera_pose(turn: float, start: float) -> np.ndarray:
+def camera_pose(turn: float, start: float, path: str) -> np.ndarray:
     """T_world_camera [4, 4] (x right, y down, z ahead) of a hand-held walk about the island; a turn is 200 frames."""
-    u = 2 * np.pi * turn
-    angle = start + 1.3 * np.sin(0.9 * u) + 0.3 * np.sin(2.3 * u)
-    radius, height = 1.15 + 0.25 * np.sin(1.3 * u + 1), 1.35 + 0.2 * np.sin(1.7 * u)
+    u, (further, farther, higher) = 2 * np.pi * turn, PATHS[path]
+    angle = start + 1.3 * np.sin(0.9 * u) + 0.3 * np.sin(2.3 * u) + further
+    radius, height = 1.15 + 0.25 * np.sin(1.3 * u + 1) + farther, 1.35 + 0.2 * np.sin(1.7 * u) + higher
     place = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
     ahead = np.array([0.15 * np.sin(1.1 * u) - 0.3, 0.2 * np.sin(1.9 * u), 0.85]) - place
     ahead /= np.linalg.norm(ahead)
@@ -168,7 +186,7 @@ def camera_pose(turn: float, start: float) -> np.ndarray:
     return pose
 
 
-def make_kitchen(assets: Path, seed: int, out: Path, frames: int) -> None:
+def make_kitchen(assets: Path, seed: int, out: Path, frames: int, path: str = "first") -> None:
     """Writes a recording in Replica's layout."""
     rng = np.random.default_rng(seed)
     spec = read_room(assets, WOOD_AND_STONE[seed % len(WOOD_AND_STONE)])
@@ -191,7 +209,7 @@ def make_kitchen(assets: Path, seed: int, out: Path, frames: int) -> None:
     start, poses, camera = rng.uniform(-0.6, 0.6), [], model.camera("camera").id
     with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
         for frame in range(frames):
-            pose = camera_pose(frame / 199, start)
+            pose = camera_pose(frame / 199, start, path)
             turned = np.zeros(4)
             mujoco.mju_mat2Quat(turned, (pose[:3, :3] @ np.diag([1.0, -1, -1])).ravel())
             model.cam_pos[camera], model.cam_quat[camera] = pose[:3, 3], turned
@@ -225,12 +243,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder; each kitchen becomes a recording in it")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 10, 11, 12, 13, 20, 21, 22, 23])
     parser.add_argument("--frames", type=int, default=120)
+    parser.add_argument("--path", choices=PATHS, default="first", help="other: the same kitchens seen from elsewhere")
     arguments = parser.parse_args()
     if not (arguments.assets / "scenes").is_dir():
         parser.error(f"{arguments.assets}: no folder scenes: expected LIBERO's assets")
     for seed in arguments.seeds:
-        make_kitchen(arguments.assets.resolve(), seed, arguments.out / f"kitchen{seed}", arguments.frames)
-        print(f"wrote {arguments.out / f'kitchen{seed}'}")
+        out = arguments.out / f"kitchen{seed}"
+        make_kitchen(arguments.assets.resolve(), seed, out, arguments.frames, arguments.path)
+        print(f"wrote {out}")
 
 
 if __name__ == "__main__":
