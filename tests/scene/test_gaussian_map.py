@@ -186,3 +186,21 @@ def test_colours_and_activations() -> None:
         GaussianMap(sh_degree=4)
     with pytest.raises(AttributeError):
         _ = out.no_such_array
+
+
+def test_a_higher_degree_keeps_what_is_there_and_starts_moments_anew() -> None:
+    gaussians = GaussianMap(0, 2)
+    gaussians.insert(torch.rand(5, 3), torch.eye(1, 4).expand(5, 4), torch.zeros(5, 3), 0.0, torch.rand(5, 3))
+    first, second = gaussians.moments["sh"]
+    first[:], second[:] = 1.0, 2.0
+    means, colors, allocations = gaussians.means.clone(), gaussians.sh.clone(), gaussians.allocations
+    gaussians.raise_degree(2)
+    assert gaussians.sh_degree == 2 and gaussians.allocations > allocations
+    assert torch.equal(gaussians.sh[:, :1], colors) and not gaussians.sh[:, 1:].any()
+    assert torch.equal(gaussians.means, means)
+    assert [tuple(m.shape) for m in gaussians.moments["sh"]] == [(5, 9, 3)] * 2 and not gaussians.moments["sh"][0].any()
+    gaussians.raise_degree(1)
+    assert gaussians.sh_degree == 2
+    many = 30000
+    gaussians.insert(torch.rand(many, 3), torch.eye(1, 4).expand(many, 4), torch.zeros(many, 3), 0.0, torch.rand(many, 3))
+    assert gaussians.sh.shape == (30005, 9, 3) and torch.equal(gaussians.sh[:5, :1], colors)

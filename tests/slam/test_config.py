@@ -104,7 +104,7 @@ def test_the_presets_are_told_of() -> None:
         ("seed=many", ["seed", "many"]),
         ("mapping=3", ["mapping", "3"]),
         ("mapping.seed.x=3", ["mapping.seed"]),
-        ("sh_degree=5", ["sh_degree", "0 to 3", "5"]),
+        ("sh_degree=5", ["sh_degree", "-1 to 3", "5"]),
         ("mapping.loss.dssim_weight=2", ["dssim_weight", "2"]),
         ("mapping.iterations_per_frame=-1", ["iterations_per_frame", "-1"]),
         ("seed", ["name=value"]),
