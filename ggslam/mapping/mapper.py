@@ -567,6 +567,8 @@ class Mapper(ABC):
         rates = {name: rate_factor * getattr(r, name) * (young if name in _YOUNG else 1) for name in trained}
         if self.pixel_m > 0:
             rates["means"] = min(rates["means"], rate_factor * r.means_px * self.pixel_m)
+        if self.fits_view_colors:
+            rates["sh_rest"] = 0.0
         if self.identity is not None:
             rates["features"] = self.identity.settings.rate
         return AdamSettings(

@@ -76,6 +76,10 @@ CAPABILITIES = (
         "averaging the map over the last steps", {Mode.GPU: _OUT}, "mapping.average_last",
         lambda c: c.mapping.average_last > 0,
     ),
+    Capability(
+        "colours that depend on the view, fitted after training", {Mode.GPU: _OUT, Mode.PAGED: _OUT}, "sh_degree",
+        lambda c: c.sh_degree < 0,
+    ),
     Capability("pruning hidden Gaussians where depth is noisy", {Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END}),
     Capability("checkpoints and `resume`", {Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}),
     Capability("repeating bit for bit", {Mode.GPU: _OUT, Mode.REALTIME: _OUT}),

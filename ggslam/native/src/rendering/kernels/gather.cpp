@@ -49,7 +49,8 @@ void sh_rows(const GaussianArrays& arrays, const Float basis[16], const Float co
   }
 }
 
-void differentiate_group(const Rasterizer& r, const ViewConstants& c, const Group& group, GroupGradients& out,
+// `sh`: whether gradients of coefficients from degree 1 on are asked for.
+void differentiate_group(const Rasterizer& r, const ViewConstants& c, const Group& group, bool sh, GroupGradients& out,
                          double* twist) {
   const GaussianArrays& arrays = r.gaussians;
   const RawGaussian raw = load_gaussians(arrays, group.rows);
@@ -60,7 +61,7 @@ void differentiate_group(const Rasterizer& r, const ViewConstants& c, const Grou
   differentiate_view_colour(arrays, c, group.rows, p.position, g.colour, basis, direction_gradient);
   out.parameters = differentiate_projection(c, raw, p, g, direction_gradient);
   for (int channel = 0; channel < 3; ++channel) out.sh_constant[channel] = basis[0] * g.colour[channel];
-  if (arrays.sh_coefficients > 1) sh_rows(arrays, basis, g.colour, out.sh);
+  if (sh) sh_rows(arrays, basis, g.colour, out.sh);
   for (int k = 0; k < 6; ++k) {
     Float in_use = out.parameters.twist[k];
     for (int lane = group.rows.n; lane < kLanes; ++lane) in_use[lane] = 0.0f;
@@ -87,6 +88,11 @@ void write_gradients(const Rasterizer& r, const Rows& rows, const GroupGradients
     write_rows(out.features, r.gaussians.feature_channels, rows, features, r.padded_features);
 }
 
+// Coefficients that are fitted and not trained have a rate of 0.
+bool trains_harmonics(const Rasterizer& r, const AdamArguments& adam) {
+  return r.gaussians.sh_coefficients > 1 && adam.schedule[kShRest] != 0;
+}
+
 void apply_adam(const Rasterizer& r, const Rows& rows, const GroupGradients& in, const float* features,
                 const AdamArguments& adam) {
   AdamRows updated;
@@ -97,7 +103,7 @@ void apply_adam(const Rasterizer& r, const Rows& rows, const GroupGradients& in,
   adam_single(adam, adam.opacity_logits, updated, kOpacityLogits, in.parameters.opacity_logit);
   const int columns = 3 * r.gaussians.sh_coefficients;
   adam_narrow<3>(adam, adam.sh, columns, updated, kShConstant, in.sh_constant);
-  if (columns > 3) adam_wide(adam, adam.sh, columns, 3, columns, updated, kShRest, in.sh, columns);
+  if (trains_harmonics(r, adam)) adam_wide(adam, adam.sh, columns, 3, columns, updated, kShRest, in.sh, columns);
   if (r.padded_features > 0)
     adam_wide(adam, adam.features, r.gaussians.feature_channels, 0, r.gaussians.feature_channels, updated, kFeatures,
               features, r.padded_features);
@@ -158,13 +164,15 @@ void gather_block(Rasterizer& r, int block, const GaussianGradients& gradients, 
   Group group;
   group.rows.count = r.gaussians.count;
   GroupGradients found;
+  const bool harmonics = (r.gaussians.sh_coefficients > 1 && gradients.means != nullptr) ||
+                         (adam != nullptr && trains_harmonics(r, *adam));
   float* features = scratch.gaussian_features.data();  // [kLanes][padded_features]
   const auto flush = [&] {
     for (int lane = group.rows.n; lane < kLanes; ++lane) {
       group.rows.numbers[lane] = group.rows.numbers[0];
       for (float& value : group.sums[lane]) value = 0.0f;
     }
-    differentiate_group(r, c, group, found, twist);
+    differentiate_group(r, c, group, harmonics, found, twist);
     if (adam != nullptr) apply_adam(r, group.rows, found, features, *adam);
     if (gradients.means != nullptr) write_gradients(r, group.rows, found, features, gradients);
     group.rows.n = 0;
