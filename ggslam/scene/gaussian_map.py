@@ -284,8 +284,9 @@ class GaussianMap:
             return
         old, self.sh_degree = self.sh, degree
         names = [name for name in self._names if name.partition(".")[0] == "sh"]
-        for name in names:  # moments are not copied: memory of zeros that nobody writes to is not taken up
-            self._storage[name] = torch.zeros((self.capacity, *self._shape(name)), device=self.device)
+        for name in names:  # moments are not copied, for numpy's zeros take up memory only where something is written
+            zeros = np.zeros((self.capacity, *self._shape(name)), np.float32)
+            self._storage[name] = torch.from_numpy(zeros).to(self.device)
         self._storage["sh"][: self.count, : old.shape[1]] = old
         self._views.pop("sh", None)
         self.allocations += 1
