@@ -513,7 +513,7 @@ class Mapper(ABC):
                     progress(done, iterations)
             self._mean.move_into(self.map)
             self._bound_values()
-        if self.fits_view_colors and self.residency is None:
+        if self.fits_view_colors and (self.residency is None or self.residency.is_whole):
             self._fit_view_colors()
 
     def _fit_view_colors(self) -> None:  # noqa: B027

@@ -12,6 +12,10 @@ import numpy as np
 class Residency(Protocol):
     """Knows which keyframes see nothing but Gaussians that are in memory."""
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether all Gaussians are in memory."""
+
     def trainable(self) -> Sequence[int]:
         """Numbers of these keyframes, rising; at least one if there are any."""
 

@@ -82,7 +82,7 @@ class Config:
     on first use); auto: the GPU if there is one and `memory_limit_mb` is 0, else the CPU."""
     sh_degree: int = setting(-1, -1, 3, basic=True)
     """Degree of the spherical harmonics that describe a Gaussian's colour. -1: 0 while it is trained; after the final
-    refinement (CPU, without a memory limit) 2 where views ask for it. 0: one colour from all sides; 1 to 3: trained
+    refinement (CPU, all of the map in memory) 2 where views ask for it. 0: one colour from all sides; 1 to 3: trained
     from the start."""
     tracker: Literal["gicp", "edges_planes"] = setting("gicp", basic=True)
     """How frames are located. gicp: G-ICP against the points of the keyframes; edges_planes: edges and planes within a

@@ -132,6 +132,11 @@ class MapPager:
                 self._gaussians.mapper.identity.keep_pools(self._trainable)
         return self._trainable
 
+    @property
+    def is_whole(self) -> bool:
+        """See `Residency`."""
+        return not self._gaussians.is_split
+
     def stages(self) -> Iterator[Sequence[int]]:
         """See `Residency`: along the way, as many keyframes at a time as there is room for."""
         left = list(range(len(self._visibility.keyframes)))

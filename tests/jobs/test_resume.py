@@ -205,7 +205,7 @@ def test_what_would_change_the_result_is_refused(cut: Path, tmp_path: Path) -> N
         refuse(ggslam("run", "--resume", cut, *words), "--resume", f"{words[0]} cannot be changed")
     refuse(ggslam("run", "--resume", tmp_path / "nowhere"), "nowhere: no such folder")
     start = (cut / checkpoints.FOLDER / "start.json").read_text()
-    (cut / checkpoints.FOLDER / "start.json").write_text(start.replace('"sh_degree": 0', '"sh_degree": 1'))
+    (cut / checkpoints.FOLDER / "start.json").write_text(start.replace('"sh_degree": -1', '"sh_degree": 1'))
     refuse(ggslam("run", "--resume", cut), "start.json: the settings are not those that the run was begun with")
     (cut / checkpoints.FOLDER / "start.json").write_text(start.replace('"ggslam": "', '"ggslam": "0.', 1))
     refuse(ggslam("run", "--resume", cut), "was begun with ggslam 0.")
