@@ -12,7 +12,7 @@ import torch
 
 from ggslam.abi import core as structures
 from ggslam.abi.arrays import address
-from ggslam.errors import RenderError
+from ggslam.errors import CoreInputError, RenderError
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.arguments import (
@@ -192,6 +192,24 @@ class CpuRasterizer:
             )
         )
         return terms
+
+    def mark_shown(self, shown: np.ndarray, min_weight: float) -> None:
+        """Marks the Gaussians that the last `forward` shows.
+
+        Args:
+            shown: bool [N], one for each of its Gaussians; becomes True for those that have the weight `min_weight` in
+                any pixel.
+
+        Raises:
+            RenderError: nothing was rendered, `shown` of another type or shape.
+        """
+        self._require_last()
+        if shown.dtype != np.bool_ or shown.ndim != 1 or not shown.flags.c_contiguous:
+            raise RenderError(f"mark_shown: expected bool [N], found {shown.dtype} {list(shown.shape)}")
+        try:
+            self._library.ggslam_rasterizer_shown(self._handle, min_weight, len(shown), address(shown))
+        except CoreInputError as error:
+            raise RenderError(f"mark_shown: {error}") from error
 
     # --- backward --------------------------------------------------------------------------------------------------
 

@@ -53,6 +53,27 @@ def test_capacity_keeps_the_front_and_light_terms_are_left_out() -> None:
     assert heavy.weights[used].min() >= 0.1 and heavy.counts.sum() < everything.counts.sum()
 
 
+@pytest.mark.parametrize("close_below", [0.0, 0.2])
+@pytest.mark.parametrize("isa", available_instruction_sets())
+def test_shown_are_those_with_a_heavy_term(isa: str, close_below: float) -> None:
+    gaussians, rasterizer = make_map(), CpuRasterizer(2, isa)
+    with pytest.raises(RenderError):
+        rasterizer.mark_shown(np.zeros(300, bool), 0.1)
+    rasterizer.forward(gaussians, CAMERA, POSE, features=False, close_below=close_below)
+    for least in (0.0, 0.05, 0.4):
+        shown, expected = np.zeros(300, bool), np.zeros(300, bool)
+        rasterizer.mark_shown(shown, least)
+        terms = rasterizer.pixel_terms(ALL, 300, least)
+        expected[terms.rows()] = True
+        assert np.array_equal(shown, expected) and 0 < shown.sum() < 300
+    kept = np.ones(300, bool)
+    rasterizer.mark_shown(kept, 2.0)
+    assert kept.all()
+    for wrong in (np.zeros(299, bool), np.zeros(300, np.uint8), np.zeros(600, bool)[::2]):
+        with pytest.raises(RenderError, match="mark_shown"):
+            rasterizer.mark_shown(wrong, 0.1)
+
+
 def test_the_step_is_adam_on_the_summed_gradient() -> None:
     gaussians, rasterizer = make_map(), CpuRasterizer()
     rasterizer.forward(gaussians, CAMERA, POSE, features=False)

@@ -129,6 +129,11 @@ GGSLAM_EXPORT int ggslam_rasterizer_statistics(void* rasterizer, std::int64_t* o
 GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int32_t* pixels, float min_weight,
                                                 const ggslam::PixelTerms* out);
 
+// Sets `shown` [gaussians] to 1 for those that make up a share of min_weight of any pixel of the last forward, which was
+// of so many; leaves the others.
+GGSLAM_EXPORT int ggslam_rasterizer_shown(void* rasterizer, float min_weight, std::int64_t gaussians,
+                                          std::uint8_t* shown);
+
 // out [P, channels] = sum of weight times feature [gaussians, channels]. Returns 0.
 GGSLAM_EXPORT int ggslam_terms_blend(void* context, const ggslam::PixelTerms* terms, const float* features,
                                      std::int64_t gaussians, int channels, float* out);

@@ -40,10 +40,6 @@ class HiddenGaussianTuning(Tuning):
 
     few_keyframes = 8
     """Keyframes below which each looks with all its pixels. With more, each looks with a quarter of them by turns."""
-    max_terms = 256
-    """Most contributions to a pixel that are read."""
-    terms_at_once = 1 << 22
-    """Contributions that are read in one batch, of eight bytes each."""
 
 
 @savable(not_saved="settings residency extra_loss fits_view_colors _rasterizer _loss _adam_of_pixel", check="check")
@@ -207,11 +203,8 @@ class CpuMapper(Mapper):
                 if len(own) < HiddenGaussianTuning.few_keyframes
                 else grid_of_turn(keyframe.index, keyframe.camera)
             )
-            view = self._render(keyframe, features=False, grid=grid)
-            terms = min(int(1 / least) + 1, HiddenGaussianTuning.max_terms)  # a pixel has no more of such a share
-            pixels, some = np.arange(view.alpha.numel(), dtype=np.int32), HiddenGaussianTuning.terms_at_once // terms
-            for begin in range(0, len(pixels), some):
-                stays[self._rasterizer.pixel_terms(pixels[begin : begin + some], terms, least).rows()] = True
+            self._render(keyframe, features=False, grid=grid)
+            self._rasterizer.mark_shown(stays, least)
         self.map.keep(torch.from_numpy(stays))
 
     def _render(

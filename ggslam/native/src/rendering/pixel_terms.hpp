@@ -4,6 +4,7 @@
 // without compositing whole images of them.
 //
 //   collect_terms     walks the lists of the last rendering for some pixels                          pixel_terms.cpp
+//   mark_shown        the same for all pixels of a tile, for who only asks which Gaussians show         pixel_terms.cpp
 //   blend_terms       terms x features -> features at the pixels                                     term_features.cpp
 //   step_term_rows    gradients at the pixels -> gradients of the Gaussians' features -> Adam        term_features.cpp
 //
@@ -33,6 +34,7 @@ constexpr int kMaxTermChannels = 64;
 
 GGSLAM_DECLARE_KERNEL(void collect_terms(const Rasterizer& r, int tile, const TermPixel* pixels, int count,
                                          float min_weight, const PixelTerms& out))
+GGSLAM_DECLARE_KERNEL(void mark_shown(const Rasterizer& r, int tile, float min_weight, std::uint8_t* shown))
 GGSLAM_DECLARE_KERNEL(void blend_terms(const PixelTerms& terms, const float* features, int channels,
                                        std::int64_t begin, std::int64_t end, float* out))
 GGSLAM_DECLARE_KERNEL(void step_term_rows(const TermsByGaussian& terms, const float* gradient, const FeatureAdam& adam,

@@ -197,6 +197,20 @@ GGSLAM_EXPORT int ggslam_rasterizer_pixel_terms(void* rasterizer, const std::int
   return 0;
 } GGSLAM_CATCH_ALL
 
+GGSLAM_EXPORT int ggslam_rasterizer_shown(void* rasterizer, float min_weight, std::int64_t gaussians,
+                                          std::uint8_t* shown) try {
+  const Rasterizer& r = object_of<Rasterizer>(rasterizer);
+  if (!r.ready) refuse("rasterizer: there is no picture yet");
+  if (gaussians != r.gaussians.count)
+    refuse("gaussians: expected the %lld of the last picture, found %lld", static_cast<long long>(r.gaussians.count), static_cast<long long>(gaussians));
+  check_array("shown", shown, gaussians);
+  const auto mark = GGSLAM_DISPATCH(r.context.isa, mark_shown);
+  r.context.pool.parallel_for(r.tiles(), 1, [&](std::size_t tile, std::size_t, int) {
+    mark(r, static_cast<int>(tile), min_weight, shown);
+  });
+  return 0;
+} GGSLAM_CATCH_ALL
+
 GGSLAM_EXPORT int ggslam_terms_blend(void* context, const PixelTerms* terms, const float* features,
                                      std::int64_t gaussians, int channels, float* out) try {
   Context& c = object_of<Context>(context);
