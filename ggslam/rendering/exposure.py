@@ -94,8 +94,13 @@ class SeenAgain:
 
 def is_lit(color: np.ndarray) -> bool:
     """Whether an image uint8 [H, W, 3] shows colours: it is neither nearly black nor saturated nearly everywhere."""
-    grey = color[_SOME].astype(np.float32).mean(2) / 255
-    return bool(((grey > ExposureTuning.dark) & (grey < ExposureTuning.bright)).mean() >= ExposureTuning.min_lit_share)
+    red, green, blue = (color[_SOME][..., k] for k in range(3))
+    sums = red.astype(np.uint16)
+    sums += green
+    sums += blue
+    grey = np.arange(3 * 255 + 1, dtype=np.float32) / np.float32(3) / 255  # of each sum: quicker than of each pixel
+    lit = (grey > ExposureTuning.dark) & (grey < ExposureTuning.bright)
+    return bool(lit[sums].mean() >= ExposureTuning.min_lit_share)
 
 
 def shows_otherwise(color: np.ndarray, seen: SeenAgain) -> bool:

@@ -11,6 +11,7 @@ from ggslam.mapping.color_changes import scale_colors, take_colors
 from ggslam.mapping.keyframe import make_keyframe
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.exposure import (
+    ExposureTuning,
     SeenAgain,
     frame_weights,
     identity_exposure,
@@ -104,6 +105,14 @@ def test_what_is_black_in_the_scene_is_no_dark_frame() -> None:
         assert shows_otherwise(image, seen(texture))
     assert not shows_otherwise(black, seen(0.05 * texture))
     assert not shows_otherwise(bright, seen(0.95 + 0.05 * texture))
+
+
+def test_images_are_lit_from_the_same_grey_value_on() -> None:
+    colors = np.array([(min(s, 255), min(max(s - 255, 0), 255), max(s - 510, 0)) for s in range(766)], np.uint8)
+    grey = colors.astype(np.float32).mean(1) / 255
+    expected = (grey > ExposureTuning.dark) & (grey < ExposureTuning.bright)
+    found = [is_lit(np.full((4, 6, 3), color, np.uint8)) for color in colors]
+    assert found == expected.tolist() and 0 < expected.sum() < 766
 
 
 def test_sharpness_is_that_of_the_map_whatever_the_exposure() -> None:

@@ -94,10 +94,9 @@ def fill_gaussians(
         color: uint8 [H, W, 3]; depth: [H, W], metres, 0 = none; alpha: rendered alpha [H, W].
     """
     stride = s.fill_stride
-    unknown = (depth <= 0) & (alpha < 0.5)
-    on_grid = np.zeros(depth.shape, bool)
-    on_grid[stride // 2 :: stride, stride // 2 :: stride] = True
-    pixels = np.flatnonzero(unknown & on_grid)
+    grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    rows, columns = np.nonzero((depth[grid] <= 0) & (alpha[grid] < 0.5))
+    pixels = (rows * stride + stride // 2) * depth.shape[1] + columns * stride + stride // 2
     if not len(pixels) or not (depth > 0).any():
         pixels = pixels[:0]
         z = np.zeros(0, np.float32)
