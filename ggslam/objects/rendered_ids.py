@@ -15,5 +15,5 @@ def object_ids(rasterizer: CpuRasterizer, view: RenderBuffers, segmented: Segmen
     """Object ids uint16 [H, W] of the view that was rendered last: by the classifier, or where it has no classes by the
     weights of the Gaussians' own ids."""
     if len(segmented.classifier) and view.features is not None:
-        return label_image(view.features, view.alpha, segmented.classifier)[0]
+        return label_image(view.features, view.alpha, segmented.classifier, only_ids=True)[0]
     return vote_label_image(rasterizer, view, segmented.gaussians.object_id.numpy().astype(np.uint16))

@@ -56,6 +56,8 @@ def test_pixels_get_the_most_probable_class() -> None:
             ids, confidence = label_image(features, torch.from_numpy(alpha), classifier)
         assert ids.dtype == np.uint16 and (ids == np.where(alpha >= 0.5, expected, 0)).all()
         assert np.allclose(confidence, np.where(alpha >= 0.5, probability, 0), atol=1e-5)
+        alone, nothing = label_image(features, alpha, classifier, only_ids=True)
+        assert np.array_equal(alone, ids) and not nothing.any()
     assert (label_image(features, alpha, classifier, min_alpha=0.9)[0] > 0).sum() == (alpha >= 0.9).sum()
 
 
