@@ -129,9 +129,9 @@ def measure_exposure(
         alpha, rendered_depth: of the rendering [H, W].
     """
     known = SeenAgain(image, alpha, rendered_depth, depth).common_pixels()
-    seen, exposure = color[_SOME][known], identity_exposure()
+    exposure = identity_exposure()
     for channel in range(3):
-        x, y = image[channel][_SOME][known], seen[:, channel].astype(np.float32) / 255
+        x, y = image[channel][_SOME][known], color[_SOME][..., channel][known].astype(np.float32) / 255
         used = (x > ExposureTuning.dark) & (x < ExposureTuning.bright) & (y < ExposureTuning.bright)
         if used.sum() < ExposureTuning.min_share * known.size:
             return None

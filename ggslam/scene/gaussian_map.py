@@ -316,7 +316,8 @@ class GaussianMap:
         """
         added = means.shape[0]
         rows = slice(self.count, self.count + added)
-        self.reserve(self.count + added)
+        first = not self.capacity  # others will follow: rows without use take no memory on the host
+        self.reserve(self.count + added + (int(added * self.growth) if first else 0))
         given = {"means": means, "quaternions": quaternions, "log_scales": log_scales, "opacity_logits": opacity_logits}
         for name, value in given.items():
             self._storage[name][rows] = value
