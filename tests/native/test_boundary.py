@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,8 @@ from ggslam.abi.core import (
     RahtSettings,
 )
 from ggslam.errors import CoreInputError, CoreMemoryError, GgslamError, NativeCoreError
+from ggslam.mapping.cpu.insertion import new_gaussians
+from ggslam.mapping.settings import InsertionSettings
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.volumes.esdf import DistanceField, FieldSettings
@@ -176,6 +179,23 @@ def test_threads_hand_on_what_they_throw() -> None:
         occupancy.insert(far, np.zeros(3))
     assert occupancy.summary().blocks == 0
     assert occupancy.insert(far, np.zeros(3), max_range=0.2).free > 0
+
+
+def test_threads_share_a_pool() -> None:
+    """Jobs of several threads take turns, the shortest too: each gets what it would get alone."""
+    context = NativeContext(threads=4)
+    images = [np.random.default_rng(k).integers(0, 255, (40 + k, 37, 3)).astype(np.uint8) for k in range(3)]
+
+    def places(image: np.ndarray, context: NativeContext) -> list[bytes]:
+        height, width = image.shape[:2]
+        depth, camera = image[..., 0] / np.float32(100), Camera(width, height, 30.0, 30.0, width / 2, height / 2)
+        new = new_gaussians(image, depth, camera, np.eye(4), None, InsertionSettings(), context)
+        return [array.tobytes() for array in (new.means, new.log_scales, new.rgb, new.pixels)]
+
+    with ThreadPoolExecutor(len(images)) as beside:
+        found = list(beside.map(lambda k: places(images[k % 3], context), range(600)))
+    alone = [places(image, NativeContext(threads=1)) for image in images]
+    assert all(result == alone[k % 3] for k, result in enumerate(found))
 
 
 # --- numbers that cannot be ------------------------------------------------------------------------------------------

@@ -16,12 +16,13 @@ inline void cpu_relax() {
 // Kernels follow one another within microseconds, so a short spin saves a wake-up; it must stay short, because on
 // a busy machine a spinning thread takes the core from the one it waits for.
 constexpr int kSpins = 2000;
+constexpr int kClosed = 1 << 30;  // a bit of inside_
 }  // namespace
 
-ThreadPool::ThreadPool(int size) : size_(std::max(1, size)) {
+ThreadPool::ThreadPool(int size) : size_(std::max(1, size)), inside_(kClosed) {
   threads_.reserve(size_);
   try {
-    for (int t = 1; t < size_; ++t) threads_.emplace_back([this, t] { worker(t); });
+    for (int t = 1; t < size_; ++t) threads_.emplace_back([this] { worker(); });
   } catch (...) {  // there are no more threads to be had
     stop();
     throw;
@@ -40,16 +41,26 @@ void ThreadPool::stop() noexcept {
   for (auto& thread : threads_) thread.join();
 }
 
-void ThreadPool::work(const std::function<void(int)>& job, int index) noexcept {
-  try {
-    job(index);
-  } catch (...) {
-    std::lock_guard<std::mutex> lock(failure_mutex_);
-    if (!failure_) failure_ = std::current_exception();
+void ThreadPool::work() noexcept {
+  for (int t; (t = ticket_.fetch_add(1)) < count_;) {
+    try {
+      (*job_)(t);
+    } catch (...) {
+      std::lock_guard<std::mutex> lock(failure_mutex_);
+      if (!failure_) failure_ = std::current_exception();
+    }
   }
 }
 
-void ThreadPool::worker(int index) {
+// Whether there is a job to help with; it stays until this worker has left it.
+bool ThreadPool::enter() {
+  int inside = inside_.load();
+  while (!(inside & kClosed))
+    if (inside_.compare_exchange_weak(inside, inside + 1)) return true;
+  return false;
+}
+
+void ThreadPool::worker() {
   int seen = 0;
   for (;;) {
     for (int spin = 0; spin < kSpins && generation_.load(std::memory_order_acquire) == seen; ++spin) cpu_relax();
@@ -59,26 +70,30 @@ void ThreadPool::worker(int index) {
     }
     seen = generation_.load(std::memory_order_acquire);
     if (stop_) return;
-    work(*job_, index);
-    pending_.fetch_sub(1, std::memory_order_acq_rel);
+    if (!enter()) continue;
+    work();
+    inside_.fetch_sub(1);
   }
 }
 
-void ThreadPool::run(const std::function<void(int)>& job) {
+void ThreadPool::run(const Job& job, int count) {
   std::lock_guard<std::mutex> serial(run_mutex_);
-  if (size_ == 1) {
+  if (count == 1) {
     job(0);
     return;
   }
+  job_ = &job;
+  count_ = count;
+  ticket_.store(0);
+  inside_.store(0);
   {
     std::lock_guard<std::mutex> lock(mutex_);
-    job_ = &job;
-    pending_.store(size_ - 1);
     generation_.fetch_add(1);
   }
   wake_.notify_all();
-  work(job, 0);
-  for (int spin = 0; pending_.load(std::memory_order_acquire) > 0; ++spin) {
+  work();
+  inside_.fetch_or(kClosed);
+  for (int spin = 0; inside_.load() != kClosed; ++spin) {
     if (spin > kSpins) std::this_thread::yield();
     cpu_relax();
   }
@@ -88,7 +103,8 @@ void ThreadPool::run(const std::function<void(int)>& job) {
 void ThreadPool::parallel_for(std::size_t count, std::size_t chunk,
                               const std::function<void(std::size_t, std::size_t, int)>& f) {
   std::atomic<std::size_t> next{0};
-  run([&](int thread) {
+  const std::size_t chunks = (count + chunk - 1) / chunk;
+  const Job all = [&](int thread) {
     for (;;) {
       const std::size_t begin = next.fetch_add(chunk);
       if (begin >= count) break;
@@ -99,7 +115,8 @@ void ThreadPool::parallel_for(std::size_t count, std::size_t chunk,
         throw;
       }
     }
-  });
+  };
+  if (chunks) run(all, static_cast<int>(std::min<std::size_t>(size_, chunks)));
 }
 
 }  // namespace ggslam

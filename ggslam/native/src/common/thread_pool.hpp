@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// A small pool of threads. run(f) calls f(t) once for each t in [0, size): the caller's thread is t = 0.
-// Several host threads may share a pool: calls of run() are serialised by a lock. What f throws reaches the caller once
-// all threads are done; of several exceptions, one.
+// A small pool of threads. Several host threads may share it: jobs are serialised by a lock. The caller works, too, and
+// waits for those threads only that have begun: on a busy machine one may wake when all is done. What a job throws
+// reaches the caller once all threads are done; of several exceptions, one.
 #pragma once
 #include <atomic>
 #include <condition_variable>
@@ -22,26 +22,32 @@ class ThreadPool {
   ThreadPool& operator=(const ThreadPool&) = delete;
 
   int size() const { return size_; }
-  void run(const std::function<void(int)>& job);
 
-  // Hands out [0, count) in chunks; f(begin, end, thread). Which thread gets which chunk is not fixed, so f must
-  // write only to places that belong to its chunk: results are then the same for any number of threads.
+  // Hands out [0, count) in chunks; f(begin, end, thread), where `thread`, from 0 to size - 1, is another
+  // one for each that runs at the same time. Which thread gets which chunk is not fixed, so f must write only to places
+  // that belong to its chunk: results are then the same for any number of threads.
   void parallel_for(std::size_t count, std::size_t chunk,
                     const std::function<void(std::size_t, std::size_t, int)>& f);
 
  private:
-  void worker(int index);
-  void work(const std::function<void(int)>& job, int index) noexcept;
+  using Job = std::function<void(int)>;
+  void run(const Job& job, int count);
+  void worker();
+  void work() noexcept;
+  bool enter();
   void stop() noexcept;
   int size_;
   std::vector<std::thread> threads_;
   std::mutex run_mutex_, mutex_;
   std::condition_variable wake_;
-  const std::function<void(int)>* job_ = nullptr;
-  std::atomic<int> generation_{0}, pending_{0};
+  const Job* job_ = nullptr;  // what runs: job_(t) once for each t in [0, count_)
+  int count_ = 0;
+  std::atomic<int> generation_{0};
+  std::atomic<int> ticket_{0};  // the next t
+  std::atomic<int> inside_;     // workers in the job, and whether others may come in
   std::mutex failure_mutex_;
   std::exception_ptr failure_;  // of the job that runs
-  bool stop_ = false;
+  std::atomic<bool> stop_{false};
 };
 
 }  // namespace ggslam
