@@ -201,6 +201,6 @@ def test_a_higher_degree_keeps_what_is_there_and_starts_moments_anew() -> None:
     assert [tuple(m.shape) for m in gaussians.moments["sh"]] == [(5, 9, 3)] * 2 and not gaussians.moments["sh"][0].any()
     gaussians.raise_degree(1)
     assert gaussians.sh_degree == 2
-    many = 30000
-    gaussians.insert(torch.rand(many, 3), torch.eye(1, 4).expand(many, 4), torch.zeros(many, 3), 0.0, torch.rand(many, 3))
+    places = torch.rand(30000, 3)
+    gaussians.insert(places, torch.eye(1, 4).expand(30000, 4), torch.zeros(30000, 3), 0.0, torch.rand(30000, 3))
     assert gaussians.sh.shape == (30005, 9, 3) and torch.equal(gaussians.sh[:5, :1], colors)
