@@ -58,6 +58,11 @@ class MapperTuning(Tuning):
     """Most steps between two maps that enter the average."""
     averaged_maps = 8
     """Fewest maps that enter the average, if there are as many steps."""
+    settling_means = 0.2
+    """Steps of means in a final refinement that averages, as a share of those before. Longer ones shake small Gaussians
+    about the edges that they draw, by up to a third of a pixel at 640x480."""
+    settling_scales = 0.4
+    """The same of standard deviations."""
     final_identity_decay = 0.2
     """Share of their length to which the last identity steps shrink."""
     final_steps_per_view = 4
@@ -168,7 +173,7 @@ class Mapper(ABC):
         """A loss of the user's own, added to the mapper's; on the CPU only."""
         self._rasterizer: TrainingRasterizer
         self._mean = MeanMap()
-        self._adam_of_pixel: tuple[float, AdamSettings] | None = None
+        self._adam_of_pixel: tuple[float, bool, AdamSettings] | None = None
         self._sampler = KeyframeSampler(float(np.random.default_rng(seed).random()))
 
     @property
@@ -297,15 +302,17 @@ class Mapper(ABC):
             self._count_iteration()
 
     def _iterate_wholly(
-        self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0, done: float = 1.0
-    ) -> None:
+        self, numbers: Sequence[int], rate_factor: float = 1.0, pose_factor: float = 1.0, done: float = 1.0,
+        settles: bool = False,
+    ) -> None:  # fmt: skip
         """One iteration of the final refinement, of which `done`, 0 to 1, is over, on some keyframes: a step on all
         pixels of one or, where depth is noisy, several on every second pixel of as many. It is the same whether
-        identities are trained, too, or not."""
+        identities are trained, too, or not. `settles` as of `_adam`."""
         for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
             keyframe = self._draw(numbers)
             grid = self._choose_grid(keyframe) if self._is_noisy else self._choose_size(keyframe, done)
-            self._step(keyframe, (rate_factor, pose_factor), grid, step == 0 and self._is_identity_due(keyframe))
+            learns = step == 0 and self._is_identity_due(keyframe)
+            self._step(keyframe, (rate_factor, pose_factor), grid, learns, settles)
             if not self._is_noisy or grid.is_whole:
                 break
         self._count_iteration()
@@ -392,7 +399,9 @@ class Mapper(ABC):
         self._step(keyframe, (rate_factor, rate_factor), ALL_PIXELS, self._is_identity_due(keyframe))
         self._count_iteration()
 
-    def _step(self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool) -> None:
+    def _step(
+        self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
+    ) -> None:
         """One optimisation step: forward, loss, identity, backward with the optimizer fused in.
 
         Args:
@@ -400,6 +409,7 @@ class Mapper(ABC):
             factors: multiply the learning rates of the Gaussians, and of poses.
             grid: its pixels that count.
             learns: whether identities are trained, too.
+            settles: as of `_adam`.
         """
         times, watch, identity = self.times, _Stopwatch(), self.identity
         rate_factor, pose_factor = factors
@@ -419,7 +429,7 @@ class Mapper(ABC):
             times.loss += watch.lap()
         step = self._rasterizer.backward_step(
             self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,
-            optimizer=self._standard_adam() if rate_factor == 1 else self._adam(rate_factor),
+            optimizer=self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles),
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
         share = 1 if grid.is_whole else 1 / MapperTuning.noisy_steps  # fewer pixels tell less of where the camera was
@@ -496,9 +506,9 @@ class Mapper(ABC):
         from before."""
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
-        """Final refinement, for each part of a map that is in memory by turns: the map becomes the mean over the last
-        steps, see `MapperSettings.average_last`, or learning rates fall exponentially. The first `begin` steps were
-        made before; between steps `progress` is told how many of how many are."""
+        """Final refinement, for each part of a map that is in memory by turns: steps are short and the map becomes the
+        mean over the last ones, see `MapperSettings.average_last`, or learning rates fall exponentially. The first
+        `begin` steps were made before; between steps `progress` is told how many of how many are."""
         share, done = self._averaged_share, 0
         for numbers, steps in self._stages(iterations):
             every = max(1, min(MapperTuning.average_every, int(share * steps) // MapperTuning.averaged_maps))
@@ -506,7 +516,7 @@ class Mapper(ABC):
                 done += 1
                 if done > begin:
                     falling = self.settings.refine_decay ** (i / max(1, steps - 1))
-                    self._iterate_wholly(numbers, 1.0 if share else falling, falling, i / steps)
+                    self._iterate_wholly(numbers, 1.0 if share else falling, falling, i / steps, share > 0)
                     left = steps - 1 - i
                     if left < share * steps and left % every == 0:
                         self._mean.add(self.map)
@@ -554,13 +564,15 @@ class Mapper(ABC):
         for _ in range(steps):
             self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
 
-    def _standard_adam(self) -> AdamSettings:
+    def _standard_adam(self, settles: bool = False) -> AdamSettings:
         """Made once: every step asks for it."""
-        if self._adam_of_pixel is None or self._adam_of_pixel[0] != self.pixel_m:
-            self._adam_of_pixel = self.pixel_m, self._adam(1.0)
-        return self._adam_of_pixel[1]
+        if self._adam_of_pixel is None or self._adam_of_pixel[:2] != (self.pixel_m, settles):
+            self._adam_of_pixel = self.pixel_m, settles, self._adam(1.0, settles)
+        return self._adam_of_pixel[2]
 
-    def _adam(self, rate_factor: float) -> AdamSettings:
+    def _adam(self, rate_factor: float, settles: bool = False) -> AdamSettings:
+        """Rates of all groups times `rate_factor`; `settles`: Gaussians are about where they belong, and those of means
+        and standard deviations are shorter."""
         r = self.settings.rates
         young = r.young_factor
         decay = (1 / young) ** (1 / max(1, r.young_updates)) if young > 1 else 1.0
@@ -570,6 +582,9 @@ class Mapper(ABC):
             rates["means"] = min(rates["means"], rate_factor * r.means_px * self.pixel_m)
         if self.fits_view_colors:
             rates["sh_rest"] = 0.0
+        if settles:
+            rates["means"] *= MapperTuning.settling_means
+            rates["log_scales"] *= MapperTuning.settling_scales
         if self.identity is not None:
             rates["features"] = self.identity.settings.rate
         return AdamSettings(

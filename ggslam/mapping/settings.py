@@ -251,7 +251,7 @@ class MapperSettings(MapperTuning):
     takes 0.57 of the time of a full step."""
     first_frame_iterations: int = setting(10, 0, 10**5)
     """Training steps on the first keyframe before the second frame is read."""
-    average_last: float = setting(0.5, 0, 1)
+    average_last: float = setting(0.3, 0, 1)
     """Share of the final refinement's steps over which the map is averaged (CPU); 0: learning rates decay instead."""
     insertion: InsertionSettings = field(default_factory=InsertionSettings)
     rates: LearningRates = field(default_factory=LearningRates)

@@ -10,7 +10,7 @@ import torch
 from ggslam.mapping.cpu.insertion import fill_gaussians
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, PoseAdam, make_keyframe
-from ggslam.mapping.mapper import Mapper
+from ggslam.mapping.mapper import Mapper, MapperTuning
 from ggslam.mapping.mean_map import AVERAGED
 from ggslam.mapping.pixel_grid import PixelGrid
 from ggslam.mapping.pruning import is_look_due, prune
@@ -20,6 +20,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import se3_exp, se3_log
+from ggslam.system.tuning import overridden
 
 CAMERA = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
 
@@ -160,7 +161,8 @@ def test_the_map_becomes_the_mean_over_the_last_steps(steps: int, counted: range
     for mapper in (averaged, left):
         mapper.add_keyframe(wall(), np.eye(4))
         mapper.run(8)
-    averaged.refine(steps)
+    with overridden(MapperTuning, settling_means=1.0, settling_scales=1.0):  # as where nothing is averaged
+        averaged.refine(steps)
     parts = []
     for step in range(1, steps + 1):
         left.refine(1)
@@ -331,6 +333,7 @@ def test_steps_of_means_are_no_longer_than_half_a_pixel() -> None:
     mapper = make_mapper()
     rates = mapper.settings.rates
     assert mapper._standard_adam().learning_rates["means"] == rates.means
+    assert mapper._standard_adam(settles=True).learning_rates["means"] == MapperTuning.settling_means * rates.means
     for pixel_m, wanted in ((0.008, rates.means), (0.001, 0.0005), (0.0002, 0.0001)):
         mapper.pixel_m = pixel_m
         assert mapper._standard_adam().learning_rates["means"] == pytest.approx(wanted)
