@@ -58,9 +58,12 @@ class MapperTuning(Tuning):
     """Most steps between two maps that enter the average."""
     averaged_maps = 8
     """Fewest maps that enter the average, if there are as many steps."""
+    settling_from = 0.5
+    """First share of a final refinement that averages in which steps are as before: Gaussians find their places for all
+    sizes of pictures."""
     settling_means = 0.2
-    """Steps of means in a final refinement that averages, as a share of those before. Longer ones shake small Gaussians
-    about the edges that they draw, by up to a third of a pixel at 640x480."""
+    """Steps of means in its later part, as a share of those before. Longer ones shake small Gaussians about the edges
+    that they draw, by up to a third of a pixel at 640x480."""
     settling_scales = 0.4
     """The same of standard deviations."""
     final_identity_decay = 0.2
@@ -516,7 +519,8 @@ class Mapper(ABC):
                 done += 1
                 if done > begin:
                     falling = self.settings.refine_decay ** (i / max(1, steps - 1))
-                    self._iterate_wholly(numbers, 1.0 if share else falling, falling, i / steps, share > 0)
+                    settles = share > 0 and i >= MapperTuning.settling_from * steps
+                    self._iterate_wholly(numbers, 1.0 if share else falling, falling, i / steps, settles)
                     left = steps - 1 - i
                     if left < share * steps and left % every == 0:
                         self._mean.add(self.map)

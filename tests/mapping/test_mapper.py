@@ -176,7 +176,7 @@ def test_the_map_becomes_the_mean_over_the_last_steps(steps: int, counted: range
 
 
 def test_a_refinement_that_is_cut_off_leaves_the_mean_of_what_it_made() -> None:
-    mapper = make_mapper()
+    mapper = make_mapper(average_last=0.5)
     mapper.add_keyframe(wall(), np.eye(4))
     mapper.run(8)
 
