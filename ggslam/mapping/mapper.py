@@ -205,16 +205,23 @@ class Mapper(ABC):
 
     # --- growth ------------------------------------------------------------------------------------------------------
 
-    def add_keyframe(self, frame: Frame, T_world_camera: np.ndarray, labeller: Labeller | None = None) -> Keyframe:
+    def add_keyframe(
+        self,
+        frame: Frame,
+        T_world_camera: np.ndarray,
+        labeller: Labeller | None = None,
+        begin_others: Callable[[], None] = lambda: None,
+    ) -> Keyframe:
         """Makes a keyframe of `frame` seen from `T_world_camera` [4, 4] and inserts what the map lacks there.
 
         Args:
             labeller: tells the keyframe's object mask, if objects are learned.
+            begin_others: starts what other threads do meanwhile; called as soon as this needs one thread only.
         """
         start = time.perf_counter()
         self.note_valid(frame)
         keyframe = self._new_keyframe(frame, T_world_camera)
-        self._insert(keyframe, T_world_camera, labeller)
+        self._insert(keyframe, T_world_camera, labeller, begin_others)
         self.keyframes.append(keyframe)
         self.use_typical_exposure()
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
@@ -274,7 +281,10 @@ class Mapper(ABC):
         """The next keyframe, with what its training needs besides."""
 
     @abstractmethod
-    def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
+    def _insert(
+        self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None,
+        begin_others: Callable[[], None],
+    ) -> None:  # fmt: skip
         """Inserts Gaussians for what the map lacks at a keyframe seen from `T_world_camera`, and takes its labels."""
 
     def _take_labels(self, keyframe: Keyframe, labels: KeyframeLabels) -> None:

@@ -123,17 +123,20 @@ class Slam(RunState):
         frame, tracking = new.frame, self.corrections.follow(new.tracking, new.moves_followed)
         chain = self.chains[frame.camera_number]
 
+        def begin_others() -> None:
+            if self.loops is not None:
+                self.loops.begin(frame)
+            if train is None:
+                self.corrections.begin_points(tracking)
+
         # 4. Insert Gaussians where the map lacks what the keyframe shows, after removing what it looks through. Its
         #    place and its points are prepared meanwhile, in other threads.
         chain.before_insertion(self.removal, frame, tracking)
-        if self.loops is not None:
-            self.loops.begin(frame)
-        if train is None:
-            self.corrections.begin_points(tracking)
         if self.pager is not None:
             self.pager.prepare(tracking.T_world_camera, frame.depth)
         before = self.map.count
-        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, partial(self.masks.labels, frame))
+        labeller = partial(self.masks.labels, frame)
+        keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, labeller, begin_others)
         added = self.map.count - before
 
         # 5. Add its points to the measured surface that the next frames are aligned to.

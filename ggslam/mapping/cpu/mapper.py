@@ -108,7 +108,10 @@ class CpuMapper(Mapper):
         self._exposures.add()
         return make_keyframe(len(self.keyframes), frame, T_world_camera)
 
-    def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
+    def _insert(
+        self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None,
+        begin_others: Callable[[], None],
+    ) -> None:  # fmt: skip
         depth, s = keyframe.depth_m(), self.settings.insertion
         where, alpha = None, np.zeros(depth.shape, np.float32)
         show: Callable[[], MapLabels] | None = None
@@ -119,6 +122,7 @@ class CpuMapper(Mapper):
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
             seen = SeenAgain(view.image.numpy(), alpha, rendered, depth)
+        begin_others()
         color = self._colors(keyframe, seen)
         valid = self.valid_of(keyframe)
         if valid is not None:

@@ -129,7 +129,11 @@ class CudaMapper(Mapper):
         keyframe = make_keyframe(len(self.keyframes), frame, T_world_camera)
         return CudaKeyframe(keyframe, self._states, self._images)
 
-    def _insert(self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None) -> None:
+    def _insert(
+        self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None,
+        begin_others: Callable[[], None],
+    ) -> None:  # fmt: skip
+        begin_others()
         assert isinstance(keyframe, CudaKeyframe)
         look = _Look(self, keyframe, T_world_camera)
         if self.identity is not None and labeller is not None:
