@@ -63,5 +63,5 @@ class IdentitySettings(IdentityTuning):
     """How identities are learned. sampled: on sampled pixels of views rendered for colour anyway; dense: on all pixels
     of rendered identity images, as published; votes: by counting, without training."""
     final_passes: int = setting(4, 0, 10**4)
-    """Passes over all keyframes after the last frame that train identities only."""
+    """Passes over all keyframes with masks after the last frame that train identities only."""
     neighbours: NeighbourSettings = field(default_factory=NeighbourSettings)

@@ -25,7 +25,7 @@ from ggslam.mapping.other_sizes import picture_of_turn
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.pruning import is_look_due, prune
 from ggslam.mapping.residency import Residency
-from ggslam.mapping.sampling import KeyframeSampler
+from ggslam.mapping.sampling import KeyframeSampler, last_visits
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
@@ -559,17 +559,24 @@ class Mapper(ABC):
         if self.identity is None:
             return
         start, settings = time.perf_counter(), self.identity.settings
-        total = settings.final_passes * len(self._all_numbers) if settings.schedule == "sampled" else 0
-        for numbers, steps in self._stages(total) if total else ():
-            for i in range(0, steps, MapperTuning.final_steps_per_view):
-                keyframe = self._draw(numbers)
-                if keyframe.mask is None:
-                    continue
-                self._train_identity(
-                    keyframe, MapperTuning.final_steps_per_view, MapperTuning.final_identity_decay ** (i / steps)
-                )
+        passes = settings.final_passes if settings.schedule == "sampled" else 0
+        for numbers in self.stages() if passes else ():
+            shown = {number: self._objects_of(self.keyframes[number]) for number in numbers}
+            visits = list(last_visits(shown, passes, MapperTuning.final_steps_per_view))
+            for i, (number, steps) in enumerate(visits):
+                falling = MapperTuning.final_identity_decay ** (i / len(visits))
+                self._train_identity(self.keyframes[number], steps, falling)
         self.identity.label(self.map)
         self.times.identity_finish += time.perf_counter() - start
+
+    def _objects_of(self, keyframe: Keyframe) -> np.ndarray:
+        """Ids of the objects in a keyframe's mask, as they are called by now."""
+        assert self.identity is not None
+        mask = keyframe.mask
+        if mask is None:
+            return np.zeros(0, np.int64)
+        ids = np.unique(self.identity.current(np.flatnonzero(np.bincount(mask.reshape(-1)))))
+        return ids[ids > 0].astype(np.int64)
 
     def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:
         """Identity steps on one rendering of a keyframe that has a mask."""

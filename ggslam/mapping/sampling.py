@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Final
+
+import numpy as np
 
 from ggslam.system.savable import savable
 
@@ -38,3 +41,22 @@ class KeyframeSampler:
             raise IndexError("no keyframe to draw")
         self._draws += 1
         return int((self._offset + self._draws * GOLDEN_RATIO) % 1.0 * count)
+
+
+def last_visits(objects: Mapping[int, np.ndarray], steps: int, at_once: int) -> Iterator[tuple[int, int]]:
+    """Keyframes to learn objects from at the end, and how many steps to make there: `steps` on each, in rounds of at
+    most `at_once`. Before them come the keyframes that alone show an object: nothing else teaches it, and what steps
+    become shorter for is that many keyframes agree.
+
+    Args:
+        objects: by number of each keyframe the objects that it shows, distinct ids above 0; without any it is left out.
+        steps: of each keyframe.
+        at_once: most steps of one visit.
+    """
+    order = sorted((number for number, ids in objects.items() if len(ids)), key=lambda n: n * GOLDEN_RATIO % 1.0)
+    ids, views = np.unique(np.concatenate([np.zeros(0, int), *objects.values()]), return_counts=True)
+    single = ids[views == 1]
+    if steps > 0:
+        yield from ((number, min(steps, at_once)) for number in order if np.isin(objects[number], single).any())
+    for done in range(0, steps, at_once):
+        yield from ((number, min(at_once, steps - done)) for number in order)
