@@ -61,10 +61,10 @@ class MapperTuning(Tuning):
     settling_from = 0.5
     """First share of a final refinement that averages in which steps are as before: Gaussians find their places for all
     sizes of pictures."""
-    settling_means = 0.2
+    settling_means = 0.4
     """Steps of means in its later part, as a share of those before. Longer ones shake small Gaussians about the edges
     that they draw, by up to a third of a pixel at 640x480."""
-    settling_scales = 0.4
+    settling_scales = 0.6
     """The same of standard deviations."""
     final_identity_decay = 0.2
     """Share of their length to which the last identity steps shrink."""

@@ -104,7 +104,7 @@ def test_a_map_trained_at_three_sizes_is_right_at_all() -> None:
     for mapper in (one, three):
         mapper.run(40)
     with overridden(OtherSizeTuning, share=0.0):
-        one.refine(300)
-    three.refine(300)
+        one.refine(200)
+    three.refine(200)
     (half, own, large), (half_3, own_3, large_3) = psnr_at_sizes(one), psnr_at_sizes(three)
     assert half_3 > half + 0.5 and large_3 > large + 0.2 and own_3 > own - 1.0
