@@ -252,7 +252,6 @@ class CpuMapper(Mapper):
             compared = self._comparable(keyframe)
             usable = torch.from_numpy(shown if compared is None else shown & compared).float()
             residuals = self._rasterizer.backward(missing * usable).sh
-            self._render(keyframe, features=False)
             weights = self._rasterizer.backward(usable.expand(3, -1, -1).contiguous()).sh
             yield ShownColors(keyframe.T_world_camera[:3, 3], weights, residuals)
 
