@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -154,7 +155,7 @@ def octomaps() -> None:
     """Paths per second on large occupancy maps, of files."""
     for name, (size, voxel, things) in OCTOMAPS.items():
         began = time.process_time()
-        occupancy = _fill(size, voxel, things)
+        occupancy = fill_place(size, voxel, things)
         found = occupancy.summary()
         print(
             f"  {name}, {size[0]:g} x {size[1]:g} x {size[2]:g} m, {100 * voxel:g} cm: {found.occupied} occupied and "
@@ -182,7 +183,7 @@ def _of_file(name: str, occupancy: OccupancyMap, path: Path, size: tuple[float, 
         )
 
 
-def _fill(size: tuple[float, float, float], voxel: float, things: int) -> OccupancyMap:
+def fill_place(size: tuple[float, float, float], voxel: float, things: int) -> OccupancyMap:
     """A map of a place with things in it, by scans from a raster of positions."""
     room, occupancy = random_room(1, size, 0, things), OccupancyMap(voxel)
     rng, apart = np.random.default_rng(0), 4.0 if size[0] < 100 else 12.0
@@ -202,16 +203,35 @@ def _fill(size: tuple[float, float, float], voxel: float, things: int) -> Occupa
     return occupancy
 
 
-def _paths(plan_map: PlanMap, clearance: float, size: tuple[float, float, float], height: float) -> str:
-    """What comes of planning between 60 random pairs, each again until no page of the map is read for it."""
+@dataclass(frozen=True)
+class PairTimes:
+    """What planning between random pairs took, processor time: of each found path in milliseconds and metres, of every
+    pair the first time in milliseconds, with pages that were read for it."""
+
+    ms: list[float]
+    lengths_m: list[float]
+    cold_ms: list[float]
+    pages: int
+    memory_bytes: int
+
+    @property
+    def paths_per_s(self) -> float:
+        """Once every page is read; 0 if no pair is joined."""
+        return 1e3 / float(np.mean(self.ms)) if self.ms else 0.0
+
+
+def plan_pairs(
+    plan_map: PlanMap, clearance: float, size: tuple[float, float, float], height: float, pairs: int = 60
+) -> PairTimes:
+    """Plans between random pairs at a height, each again until no page of the map is read for it."""
     planner, rng = Planner(plan_map, clearance), np.random.default_rng(0)
     ms, lengths, cold = [], [], []
-    for _ in range(60):
+    for _ in range(pairs):
         ends = rng.uniform(0, size, (2, 3))
         ends[:, 2] = height
         began = time.process_time()
         path = planner.plan(ends[0], ends[1], explain=False)
-        cold.append(time.process_time() - began)
+        cold.append(1e3 * (time.process_time() - began))
         for _ in range(6 if path.is_found else 0):
             planner.grid.write((0, 0, 0), planner.grid.read((0, 0, 0), (1,) * plan_map.dimensions))  # forgets the goal
             began = time.process_time()
@@ -221,13 +241,18 @@ def _paths(plan_map: PlanMap, clearance: float, size: tuple[float, float, float]
                 ms.append(1e3 * took)
                 lengths.append(path.length)
                 break
+    return PairTimes(ms, lengths, cold, planner.pages, planner.grid.memory_bytes)
+
+
+def _paths(plan_map: PlanMap, clearance: float, size: tuple[float, float, float], height: float) -> str:
+    found = plan_pairs(plan_map, clearance, size, height)
     where = "space" if plan_map.dimensions == 3 else "floor"
-    if not ms:
-        return f"{where}: no path between {len(cold)} pairs"
+    if not found.ms:
+        return f"{where}: no path between {len(found.cold_ms)} pairs"
     return (
-        f"{where}: {len(ms)} paths of {np.mean(lengths):.0f} m in the mean; CPU ms: {_spread(np.array(ms))}, "
-        f"{1e3 / np.mean(ms):.0f} paths/s; {planner.pages} pages read in all, "
-        f"{planner.grid.memory_bytes / 1e6:.0f} MB; the first time, with reading, {1e3 * np.mean(cold):.0f} ms"
+        f"{where}: {len(found.ms)} paths of {np.mean(found.lengths_m):.0f} m in the mean; CPU ms: "
+        f"{_spread(np.array(found.ms))}, {found.paths_per_s:.0f} paths/s; {found.pages} pages read in all, "
+        f"{found.memory_bytes / 1e6:.0f} MB; the first time, with reading, {np.mean(found.cold_ms):.0f} ms"
     )
 
 

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows of a paper's table or figure, with ours beside the published: printed, and kept for docs/papers.md."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "benchmarks"), str(ROOT / "tests"), str(ROOT / "tests" / "volumes")]
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+NOT_MADE = "–"
+
+
+@dataclass
+class Paper:
+    """What one script prints.
+
+    Attributes:
+        name: of the script's results, `NAME.json`.
+        title: of the paper and its source.
+        conditions: what ours ran on.
+        rows: (table or figure, row, published, ours, remark), each text.
+    """
+
+    name: str
+    title: str
+    conditions: str = ""
+    rows: list[tuple[str, str, str, str, str]] = field(default_factory=list)
+
+    def add(self, table: str, row: str, published: str, ours: str, remark: str = "") -> None:
+        """Takes and prints one row."""
+        self.rows.append((table, row, published or NOT_MADE, ours or NOT_MADE, remark))
+        print("| " + " | ".join(self.rows[-1]) + " |", flush=True)
+
+    def write(self, out: Path) -> None:
+        """Keeps the rows as `out`/NAME.json, whole or not at all."""
+        out.mkdir(parents=True, exist_ok=True)
+        path = out / f"{self.name}.json"
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n")
+        part.replace(path)
+        print(path)
+
+    def markdown(self) -> str:
+        """The section of the page."""
+        lines = ["| table | row | published | ours | remark |", "| --- | --- | --- | --- | --- |"]
+        lines += ["| " + " | ".join(row) + " |" for row in self.rows]
+        return f"## {self.title}\n\n{self.conditions}\n\n" + "\n".join(lines) + "\n"
+
+
+def options(text: str | None) -> argparse.ArgumentParser:
+    """The options that every script has."""
+    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    default = Path(os.environ.get("GGSLAM_DATA", ROOT.parent / "shared" / "data"))
+    parser.add_argument("--data", type=Path, default=default, help="folder with the recordings (or GGSLAM_DATA)")
+    parser.add_argument("--quick", action="store_true", help="less of everything, under a minute")
+    parser.add_argument("--out", type=Path, default=Path("runs/papers"), help="where results and pictures go")
+    return parser
