@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
+import find_benchmarks  # noqa: F401  # isort: skip
 from rows import Paper, options
 
 from bench_frontends import WINDOW, Run, track_frames  # isort: skip

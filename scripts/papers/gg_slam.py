@@ -16,6 +16,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+import find_benchmarks  # noqa: F401  # isort: skip
 from rows import Paper, options
 
 from bench_identity import NONE, PUBLISHED  # isort: skip

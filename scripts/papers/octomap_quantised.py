@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+import find_benchmarks  # noqa: F401  # isort: skip
 from rows import Paper, options
 
 from agreement import agreement  # isort: skip

@@ -4,14 +4,21 @@
     python scripts/papers/replica.py                         # ours stay empty, and say so
     python scripts/papers/replica.py --batch runs/Replica    # ours from `ggslam batch --replica X --by-paper-rules`
     python scripts/papers/replica.py --check                 # whether the page's published figures are the code's
+
+The other scripts of this folder print one paper each; what they wrote with `--out docs/papers` follows on the page.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import json
 import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from rows import Paper
 
 from ggslam.jobs.batch.manifest import REPLICA
 from ggslam.jobs.batch.published import PUBLISHED, Published
@@ -30,10 +37,19 @@ makes our rows, scored by each paper's own rules, and `python scripts/papers/rep
 this page. A dash says that a figure was not made here. GG-SLAM's own figures are not in the code, so there is no row of
 them.
 """
-MISSING = """
-Not made yet, and without a command that makes them: GG-SLAM's comparison of semantic losses on one recording (table 2),
-and real-time runs with identity at 10, 20 and 30 frames a second (table 3).
+OTHERS = """
+# Other papers
+
+Each section is printed by the script of its name in `scripts/papers/`. A dash under "published" is a figure that is not
+in the code; recordings of the papers that are not to be had are replaced by generated ones, which the rows name.
+
 """
+
+
+def sections(folder: Path) -> str:
+    """What the other scripts wrote, in the order of their names."""
+    papers = [Paper(**json.loads(path.read_text())) for path in sorted(folder.glob("*.json"))]
+    return OTHERS + "\n".join(paper.markdown() for paper in papers) if papers else ""
 
 
 def own_figures(batch: Path | None, paper: Published) -> dict[str, str]:
@@ -61,6 +77,7 @@ def table(paper: Published, batch: Path | None) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch", type=Path, help="folder of the batch")
+    parser.add_argument("--papers", type=Path, default=PAGE.parent / "papers", help="what the other scripts wrote")
     parser.add_argument("--check", action="store_true")
     arguments = parser.parse_args()
     tables = [table(paper, arguments.batch) for paper in PUBLISHED if set(REPLICA) <= set(paper.values)]
@@ -69,7 +86,7 @@ def main() -> None:
         published = [line for line in lines if line.startswith("| ") and "ours" not in line]
         page = PAGE.read_text()
         sys.exit("docs/papers.md is not up to date" if [line for line in published if line not in page] else 0)
-    PAGE.write_text(HEAD + "".join(tables) + MISSING)
+    PAGE.write_text(HEAD + "".join(tables) + sections(arguments.papers))
     print(PAGE)
 
 

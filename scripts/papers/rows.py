@@ -6,13 +6,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "scripts" / "benchmarks"), str(ROOT / "tests"), str(ROOT / "tests" / "volumes")]
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 NOT_MADE = "–"
 
@@ -51,7 +48,7 @@ class Paper:
         """The section of the page."""
         lines = ["| table | row | published | ours | remark |", "| --- | --- | --- | --- | --- |"]
         lines += ["| " + " | ".join(row) + " |" for row in self.rows]
-        return f"## {self.title}\n\n{self.conditions}\n\n" + "\n".join(lines) + "\n"
+        return f"## {self.title}\n\n`{self.name}.py`. {self.conditions}\n\n" + "\n".join(lines) + "\n"
 
 
 def options(text: str | None) -> argparse.ArgumentParser:

@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+import find_benchmarks  # noqa: F401  # isort: skip
 from rows import Paper, options
 
 from bench_submaps import case  # isort: skip
