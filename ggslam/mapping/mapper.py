@@ -487,7 +487,8 @@ class Mapper(ABC):
     def _pose_rate(self) -> float:
         """Step size of keyframes' poses, metres and radians; 0: they stay."""
         refinement = self.settings.pose_refinement
-        return min(refinement.rate_sigmas * self.depth_sigma, refinement.max_rate) if refinement.enabled else 0.0
+        sigmas = refinement.noisy_rate_sigmas if self._is_noisy else refinement.rate_sigmas
+        return min(sigmas * self.depth_sigma, refinement.max_rate) if refinement.enabled else 0.0
 
     @abstractmethod
     def _render(
