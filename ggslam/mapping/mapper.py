@@ -446,7 +446,7 @@ class Mapper(ABC):
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
         share = 1 if grid.is_whole else 1 / MapperTuning.noisy_steps  # fewer pixels tell less of where the camera was
-        pose_rate = 0.0 if self._is_world(keyframe) else share * pose_factor * self._pose_rate
+        pose_rate = 0.0 if self.is_world(keyframe) else share * pose_factor * self._pose_rate
         self._finish_step(keyframe, step.twist, loss, pose_rate)
         times.backward += watch.lap()
         times.steps += 1
@@ -464,7 +464,7 @@ class Mapper(ABC):
         if self.map.sh_degree == 0:
             self.map.bound_colors()
 
-    def _is_world(self, keyframe: Keyframe) -> bool:
+    def is_world(self, keyframe: Keyframe) -> bool:
         """Whether the pose is fixed (gauge): the first keyframe, with those of its rig then, defines the world."""
         number, first = self._all_numbers[0], self.keyframes[self._all_numbers[0]].instant
         if keyframe.index == number or first is None or keyframe.instant != first:

@@ -143,15 +143,18 @@ class ColorPoses:
             self.poses.frames[number] = frame
 
     def align_keyframes(self) -> None:
-        """Aligns all keyframes but the first to the map as it is now, where colour tells more than depth: they were
-        placed one after the other, and those that came early see the least of what the others agree on."""
+        """Aligns all keyframes but the one that defines the world to the map as it is now, where colour tells more than
+        depth: they were placed one after the other, and those that came early see the least of what the others agree
+        on."""
         if not (self.active and self.mapper.settings.pose_refinement.enabled):
             return
         for numbers in self.mapper.stages():
-            for keyframe in (self.mapper.keyframes[number] for number in numbers if number > 0):
+            for keyframe in (self.mapper.keyframes[number] for number in numbers):
                 known = keyframe.depth_m()
                 if keyframe.frame_index == FROM_EARLIER_RUN or keyframe.instant is not None or not known.any():
                     continue  # keyframes of a rig stay as the rig has them
+                if self.mapper.is_world(keyframe):
+                    continue
                 depth = float(np.median(known[known > 0]))
                 if self._tells_more(depth):
                     self._align_keyframe(keyframe, depth)
