@@ -167,8 +167,10 @@ class ViewAlignmentTuning:
 
     hidden_noise: float = setting(8.0, 1, 1e6)
     """Align frames as they arrive if tracking residuals are this many times the noise that the first image shows."""
-    last_noise: float = setting(0.1, 0, 1e6, "px")
+    last_noise: float = setting(0.2, 0, 1e6, "px")
     """Align frames after the last one if the depth noise is at least this wide in the image."""
+    keyframe_noise: float = setting(0.1, 0, 1e6, "px")
+    """The same for keyframes before the final refinement, which goes on from there."""
     points: int = setting(8000, 500, 10**6)
     """Maximum number of textured pixels."""
     min_gradient: float = setting(0.01, 1e-4, 1)

@@ -50,6 +50,11 @@ class ColorPoseTuning(Tuning):
     """Farthest pose that is believed, in `farthest_sigmas`. Beyond 1 it has to fit the image clearly better."""
     convincing = 0.87
     """Grey difference, as a share of that at the tracked pose, below which a pose fits clearly better."""
+    keyframe_better = 0.97
+    """The same below which a keyframe moves by a map that was trained little."""
+    enough_steps = 10.0
+    """Steps per keyframe from which a map is trained enough to tell keyframes' poses. One trained less repeats the
+    errors of poses that it was made with."""
     hidden_margin_pixels = 9
     """Side, in pixels, of the square by which masks of hidden surfaces are dilated. Odd."""
 
@@ -148,6 +153,9 @@ class ColorPoses:
         on."""
         if not (self.active and self.mapper.settings.pose_refinement.enabled):
             return
+        steps = np.mean([keyframe.iterations for keyframe in self.mapper.keyframes] or [0.0])
+        is_trained = self._is_due or steps >= ColorPoseTuning.enough_steps
+        better = float("inf") if is_trained else ColorPoseTuning.keyframe_better
         for numbers in self.mapper.stages():
             for keyframe in (self.mapper.keyframes[number] for number in numbers):
                 known = keyframe.depth_m()
@@ -156,14 +164,14 @@ class ColorPoses:
                 if self.mapper.is_world(keyframe):
                     continue
                 depth = float(np.median(known[known > 0]))
-                if self._tells_more(depth):
-                    self._align_keyframe(keyframe, depth)
+                if self._tells_more(depth, self.mapper.settings.view_alignment.keyframe_noise):
+                    self._align_keyframe(keyframe, depth, better)
 
-    def _align_keyframe(self, keyframe: Keyframe, depth: float) -> None:
-        """Aligns a keyframe with this median depth, in metres."""
+    def _align_keyframe(self, keyframe: Keyframe, depth: float, better: float) -> None:
+        """Aligns a keyframe with this median depth, in metres; `better` as in `_pose`."""
         hidden = _find_hidden(None, self.mapper.valid_of(keyframe))
         settings, blurs = self.mapper.settings.view_alignment, AlignmentTuning.blurs[-1:]
-        T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, blurs)
+        T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, blurs, better)
         if T is not None:
             keyframe.T_camera_world = inverse(orthonormalize(T))
 
@@ -188,12 +196,13 @@ class ColorPoses:
     def _is_due(self) -> bool:
         return self.state.residuals.hidden >= self.mapper.settings.view_alignment.hidden_noise
 
-    def _tells_more(self, depth: float) -> bool:
-        """Whether colour tells a pose better than depth with the noise at a distance in metres."""
+    def _tells_more(self, depth: float, least: float | None = None) -> bool:
+        """Whether colour tells a pose better than depth with the noise at a distance in metres: it is at least so many
+        pixels wide; None: as for frames after the last one."""
         if self._is_due:
             return True
         noise, camera = self.state.noise, self.state.camera
-        least = self.mapper.settings.view_alignment.last_noise
+        least = self.mapper.settings.view_alignment.last_noise if least is None else least
         return noise is not None and depth > 0 and noise.in_pixels(depth, camera.fx) >= least
 
     def _align_frame(self, number: int, depth: float, grey: np.ndarray, hidden: np.ndarray | None) -> TrackedFrame:
@@ -215,8 +224,10 @@ class ColorPoses:
     def _pose(
         self, grey: np.ndarray, T_world_camera: np.ndarray, median_depth: float, hidden: np.ndarray | None,
         settings: ViewAlignmentSettings, blurs: Sequence[float] = AlignmentTuning.blurs,
+        better: float = float("inf"),
     ) -> np.ndarray | None:  # fmt: skip
-        """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed."""
+        """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed, or none whose
+        grey difference is less than a share `better` of that at the one near by."""
         camera, T_camera_world = self.state.camera, inverse(T_world_camera)
         assert isinstance(self.mapper, CpuMapper)
         view = self.mapper.render_view(camera, T_camera_world)
@@ -236,12 +247,14 @@ class ColorPoses:
         moved, turned = separation(found, T_world_camera)
         limit = settings.farthest_sigmas * sigma
         way = max(moved, np.radians(turned) * median_depth)
-        if way <= limit:
-            return found
         if way > ColorPoseTuning.farthest * limit:
             return None
+        if way > limit:
+            better = min(better, ColorPoseTuning.convincing)
+        if better == float("inf"):
+            return found
         before, after = (misfit(grey, rendered, depth, alpha, camera, settings, pose) for pose in (np.eye(4), T))
-        return found if after < ColorPoseTuning.convincing * before else None
+        return found if after < better * before else None
 
 
 def _find_hidden(moving: np.ndarray | None, valid: np.ndarray | None) -> np.ndarray | None:
