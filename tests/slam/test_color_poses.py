@@ -265,3 +265,35 @@ def test_a_pose_far_from_the_tracked_one_is_believed_if_it_fits_clearly_better(r
         assert found() is None
     with overridden(color_poses.ColorPoseTuning, farthest=1.5):
         assert found() is None
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_a_map_trained_little_moves_keyframes_only_if_they_fit_better(
+    room: Path, monkeypatch: pytest.MonkeyPatch, trained: bool
+) -> None:
+    sequence = open_sequence(room)
+    few = ["masks.source=none", "identity.enabled=false", "mapping.first_frame_iterations=4", "keyframes.max_gap=1"]
+    slam = Slam(sequence.camera, load_config(None, few))
+    for index in range(3):
+        slam.step(sequence.frame(index))
+    keyframes, asked = slam.mapper.keyframes, []
+    for keyframe in keyframes:
+        keyframe.iterations = 20 if trained else 5
+    slam.tracker.state.residuals.hidden = 1
+    monkeypatch.setattr(slam.color_poses, "_pose", lambda *given: asked.append(given[-1]))
+    slam.color_poses.align_keyframes()
+    best = float("inf") if trained else color_poses.ColorPoseTuning.keyframe_better
+    assert len(keyframes) > 1 and asked == [best] * (len(keyframes) - 1)  # the first one is the world
+
+
+def test_a_pose_that_hardly_fits_better_may_be_refused(room: Path) -> None:
+    sequence = open_sequence(room)
+    slam = Slam(sequence.camera, load_config(None, ["masks.source=none", "refine_iterations=0"]))
+    slam.step(sequence.frame(0))
+    frame, truth = sequence.frame(0), slam.mapper.keyframes[0].T_world_camera
+    depth, grey = float(np.median(frame.depth[frame.depth > 0])), grey_of(frame.color)
+    aside = truth @ se3_exp(np.array([0.02, 0, 0, 0, 0, 0]))
+    found = [slam.color_poses._pose(grey, T, depth, None, SETTINGS, better=0.97) for T in (truth, aside)]
+    assert found[0] is None and found[1] is not None
+    assert np.linalg.norm((found[1] - truth)[:3, 3]) < 0.01
+    assert slam.color_poses._pose(grey, truth, depth, None, SETTINGS) is not None
