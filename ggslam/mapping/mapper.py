@@ -161,6 +161,8 @@ class Mapper(ABC):
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.depth_noise_px = 0.0
         """The same as it moves a point in the image, pixels; see `MapperSettings.sparse_noise`."""
+        self.has_soft_outlines = False
+        """Whether the depth camera smooths outlines: depth beside them is missing then."""
         self.pixel_m = 0.0
         """Metres that a pixel of the images is wide at the scene's median depth; 0: not known."""
         self.is_live = False
