@@ -153,7 +153,7 @@ class ColorPoses:
         on."""
         if not (self.active and self.mapper.settings.pose_refinement.enabled):
             return
-        steps = np.mean([keyframe.iterations for keyframe in self.mapper.keyframes] or [0.0])
+        steps = np.mean([keyframe.iterations for keyframe in self.mapper.keyframes] or [0])
         is_trained = self._is_due or steps >= ColorPoseTuning.enough_steps
         better = float("inf") if is_trained else ColorPoseTuning.keyframe_better
         for numbers in self.mapper.stages():
