@@ -161,6 +161,8 @@ class Mapper(ABC):
         """Standard deviation of the depth camera at the scene's median depth, metres; set it when it is known."""
         self.depth_noise_px = 0.0
         """The same as it moves a point in the image, pixels; see `MapperSettings.sparse_noise`."""
+        self.has_soft_outlines = False
+        """Whether the depth camera smooths outlines: depth beside them is missing then."""
         self.pixel_m = 0.0
         """Metres that a pixel of the images is wide at the scene's median depth; 0: not known."""
         self.is_live = False
@@ -446,7 +448,7 @@ class Mapper(ABC):
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
         share = 1 if grid.is_whole else 1 / MapperTuning.noisy_steps  # fewer pixels tell less of where the camera was
-        pose_rate = 0.0 if self._is_world(keyframe) else share * pose_factor * self._pose_rate
+        pose_rate = 0.0 if self.is_world(keyframe) else share * pose_factor * self._pose_rate
         self._finish_step(keyframe, step.twist, loss, pose_rate)
         times.backward += watch.lap()
         times.steps += 1
@@ -464,7 +466,7 @@ class Mapper(ABC):
         if self.map.sh_degree == 0:
             self.map.bound_colors()
 
-    def _is_world(self, keyframe: Keyframe) -> bool:
+    def is_world(self, keyframe: Keyframe) -> bool:
         """Whether the pose is fixed (gauge): the first keyframe, with those of its rig then, defines the world."""
         number, first = self._all_numbers[0], self.keyframes[self._all_numbers[0]].instant
         if keyframe.index == number or first is None or keyframe.instant != first:
@@ -487,7 +489,8 @@ class Mapper(ABC):
     def _pose_rate(self) -> float:
         """Step size of keyframes' poses, metres and radians; 0: they stay."""
         refinement = self.settings.pose_refinement
-        return min(refinement.rate_sigmas * self.depth_sigma, refinement.max_rate) if refinement.enabled else 0.0
+        sigmas = refinement.noisy_rate_sigmas if self._is_noisy else refinement.rate_sigmas
+        return min(sigmas * self.depth_sigma, refinement.max_rate) if refinement.enabled else 0.0
 
     @abstractmethod
     def _render(

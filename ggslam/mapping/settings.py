@@ -115,6 +115,8 @@ class PoseRefinementTuning:
 
     rate_sigmas: float = setting(0.1, 0, 100)
     """Step in standard deviations of the depth noise at the median depth; a turn by one radian counts as 1 m."""
+    noisy_rate_sigmas: float = setting(0.3, 0, 100)
+    """The same where depth is noisy, see `MapperSettings.sparse_noise`."""
     max_rate: float = setting(5e-4, 0, 1, "m")
     """Upper bound of the step."""
 
@@ -167,6 +169,8 @@ class ViewAlignmentTuning:
     """Align frames as they arrive if tracking residuals are this many times the noise that the first image shows."""
     last_noise: float = setting(0.2, 0, 1e6, "px")
     """Align frames after the last one if the depth noise is at least this wide in the image."""
+    keyframe_noise: float = setting(0.1, 0, 1e6, "px")
+    """The same for keyframes before the final refinement, which goes on from there."""
     points: int = setting(8000, 500, 10**6)
     """Maximum number of textured pixels."""
     min_gradient: float = setting(0.01, 1e-4, 1)

@@ -8,6 +8,7 @@ map is the mean over many frames, and a picture of it fits a camera's image to a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import cv2
@@ -15,7 +16,7 @@ import numpy as np
 
 from ggslam.mapping.settings import ViewAlignmentSettings
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import se3_exp, transform_points
+from ggslam.scene.poses import se3_exp, se3_log, transform_points
 from ggslam.system.tuning import Tuning
 
 
@@ -28,11 +29,34 @@ class AlignmentTuning(Tuning):
     """Fewest textured pixels of an alignment."""
     huber = 0.05
     """Grey difference, in [0, 1], from which a residual counts linearly."""
+    pixels_alike = 30.0
+    """Residuals that count as one where the image is weighed against the pose that it starts from: what the map draws
+    wrongly, many neighbours share."""
 
 
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)
+_MEDIAN_OF_NORMAL: Final = 0.6745
+"""Median of the absolute value of a standard normal variable."""
 _CHUNK: Final = 1024  # columns of the images that cv2.remap is asked for: it takes no more than 32767
 """Columns per row that cv2.remap is called with. It takes no more than 32767."""
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """How well the pose is known that an alignment starts from.
+
+    Attributes:
+        translation: standard deviation, metres.
+        rotation: standard deviation, radians.
+    """
+
+    translation: float
+    rotation: float
+
+    @property
+    def information(self) -> np.ndarray:
+        """Inverse variances of a twist [6], translation first."""
+        return 1 / np.square([self.translation] * 3 + [self.rotation] * 3)
 
 
 def grey_of(color: np.ndarray) -> np.ndarray:
@@ -43,7 +67,7 @@ def grey_of(color: np.ndarray) -> np.ndarray:
 
 def align_view(
     grey: np.ndarray, rendered: np.ndarray, depth: np.ndarray, alpha: np.ndarray, camera: Camera,
-    settings: ViewAlignmentSettings, blurs: Sequence[float] = AlignmentTuning.blurs,
+    settings: ViewAlignmentSettings, blurs: Sequence[float] = AlignmentTuning.blurs, prior: PosePrior | None = None,
 ) -> np.ndarray | None:  # fmt: skip
     """How the camera that saw an image stands to the pose that a map was rendered from.
 
@@ -58,6 +82,8 @@ def align_view(
         camera: of both.
         settings: number of points and iterations.
         blurs: standard deviations in pixels of the smoothing, one after the other.
+        prior: how well the pose of the rendering is known; None: not at all. A camera that moves aside and turns back
+            changes its image little: there another sensor's word counts.
 
     Returns:
         T_camera_rendered [4, 4], None if too little texture is seen or the solution leaves the image.
@@ -72,13 +98,43 @@ def align_view(
         channels = np.dstack([ours, *_gradients(ours)])
         values = theirs.reshape(-1)[pixels]
         for _ in range(settings.iterations):
-            step = _step(points, values, channels, camera, T, exposure)
+            step = _step(points, values, channels, camera, T, exposure, prior)
             if step is None:
                 return None
             T, exposure = se3_exp(step[:6]) @ T, exposure + step[6:]
             if np.abs(step[:6]).max() < settings.tolerance:
                 break
     return T
+
+
+def misfit(
+    grey: np.ndarray, rendered: np.ndarray, depth: np.ndarray, alpha: np.ndarray, camera: Camera,
+    settings: ViewAlignmentSettings, T: np.ndarray,
+) -> float:  # fmt: skip
+    """How badly the map fits an image seen from a pose: mean absolute grey difference of textured pixels, after the
+    best gain and offset; NaN if too few are seen.
+
+    Args:
+        grey, rendered, depth, alpha, camera, settings: as of `align_view`.
+        T: T_camera_rendered [4, 4].
+    """
+    ours, theirs = (cv2.GaussianBlur(image, (0, 0), AlignmentTuning.blurs[-1]) for image in (grey, rendered))
+    pixels = _choose_textured(theirs, depth, alpha, settings)
+    points = camera.rays().reshape(-1, 3)[pixels].astype(np.float64) * depth.reshape(-1)[pixels, None]
+    u, v, inside = _project(transform_points(points, T), camera)
+    if inside.sum() < AlignmentTuning.min_points:
+        return float("nan")
+    seen = _sample(np.ascontiguousarray(ours[..., None]), u[inside], v[inside])[0]
+    values = theirs.reshape(-1)[pixels[inside]].astype(np.float64)
+    shown = np.column_stack([values, np.ones(len(values))])
+    return float(np.abs(seen - shown @ np.linalg.lstsq(shown, seen, rcond=None)[0]).mean())
+
+
+def _project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows [n] of points [n, 3] in a camera's image, and which of them are in it, bool [n]."""
+    z = np.maximum(points[:, 2], 0.05)
+    u, v = camera.fx * points[:, 0] / z + camera.cx, camera.fy * points[:, 1] / z + camera.cy
+    return u, v, (u > 1) & (v > 1) & (u < camera.width - 2) & (v < camera.height - 2)
 
 
 def _gradients(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -99,15 +155,15 @@ def _choose_textured(
 
 
 def _step(
-    points: np.ndarray, values: np.ndarray, channels: np.ndarray, camera: Camera, T: np.ndarray, exposure: np.ndarray
+    points: np.ndarray, values: np.ndarray, channels: np.ndarray, camera: Camera, T: np.ndarray, exposure: np.ndarray,
+    prior: PosePrior | None = None,
 ) -> np.ndarray | None:
     """A step of Gauss-Newton: twist (translation first) and change of gain and offset, [8]; None: nothing is seen."""
     moved = transform_points(points, T)
-    z = np.maximum(moved[:, 2], 0.05)
-    u, v = camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy
-    inside = (u > 1) & (v > 1) & (u < camera.width - 2) & (v < camera.height - 2)
+    u, v, inside = _project(moved, camera)
     if inside.sum() < AlignmentTuning.min_points:
         return None
+    z = np.maximum(moved[:, 2], 0.05)
     grey, du, dv = _sample(channels, u, v)
     residual = grey - (exposure[0] * values + exposure[1])
     weight = np.where(inside, np.minimum(1, AlignmentTuning.huber / np.maximum(np.abs(residual), 1e-6)), 0)
@@ -116,7 +172,13 @@ def _step(
     jacobian = np.column_stack([by_point, np.cross(moved, by_point), -values, -np.ones(len(values))])
     weighted = jacobian * weight[:, None]
     hessian = jacobian.T @ weighted + np.diag([1e-6] * 6 + [1e-3] * 2)
-    step = np.linalg.solve(hessian, -weighted.T @ residual)
+    gradient = weighted.T @ residual
+    if prior is not None:
+        variance = (np.median(np.abs(residual[inside])) / _MEDIAN_OF_NORMAL) ** 2
+        strength = AlignmentTuning.pixels_alike * variance * prior.information
+        hessian[range(6), range(6)] += strength
+        gradient[:6] += strength * se3_log(T)
+    step = np.linalg.solve(hessian, -gradient)
     return step if np.isfinite(step).all() else None
 
 

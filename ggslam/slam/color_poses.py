@@ -13,10 +13,10 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.mapping.cpu.mapper import CpuMapper
-from ggslam.mapping.keyframe import FROM_EARLIER_RUN
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import ViewAlignmentSettings
-from ggslam.mapping.view_alignment import AlignmentTuning, align_view, grey_of
+from ggslam.mapping.view_alignment import AlignmentTuning, PosePrior, align_view, grey_of, misfit
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, orthonormalize, separation
 from ggslam.slam.frame_poses import FramePoses
@@ -46,6 +46,15 @@ class ColorPoseTuning(Tuning):
     """Iterations of the alignment at the end."""
     report_every = 20
     """Aligned frames between two reports of progress."""
+    farthest = 10.0
+    """Farthest pose that is believed, in `farthest_sigmas`. Beyond 1 it has to fit the image clearly better."""
+    convincing = 0.87
+    """Grey difference, as a share of that at the tracked pose, below which a pose fits clearly better."""
+    keyframe_better = 0.97
+    """The same below which a keyframe moves by a map that was trained little."""
+    enough_steps = 10.0
+    """Steps per keyframe from which a map is trained enough to tell keyframes' poses. One trained less repeats the
+    errors of poses that it was made with."""
     hidden_margin_pixels = 9
     """Side, in pixels, of the square by which masks of hidden surfaces are dilated. Odd."""
 
@@ -139,28 +148,32 @@ class ColorPoses:
             self.poses.frames[number] = frame
 
     def align_keyframes(self) -> None:
-        """Aligns all keyframes but the first to the map as it is now, where depth hides its errors: they were placed
-        one after the other, and those that came early see the least of what the others agree on."""
-        if not (self.active and self._is_due and self.mapper.settings.pose_refinement.enabled):
+        """Aligns all keyframes but the one that defines the world to the map as it is now, where colour tells more than
+        depth: they were placed one after the other, and those that came early see the least of what the others agree
+        on."""
+        if not (self.active and self.mapper.settings.pose_refinement.enabled):
             return
-        settings = self.mapper.settings.view_alignment
+        steps = np.mean([keyframe.iterations for keyframe in self.mapper.keyframes] or [0])
+        is_trained = self._is_due or steps >= ColorPoseTuning.enough_steps
+        better = float("inf") if is_trained else ColorPoseTuning.keyframe_better
         for numbers in self.mapper.stages():
-            for keyframe in (self.mapper.keyframes[number] for number in numbers if number > 0):
+            for keyframe in (self.mapper.keyframes[number] for number in numbers):
                 known = keyframe.depth_m()
                 if keyframe.frame_index == FROM_EARLIER_RUN or keyframe.instant is not None or not known.any():
                     continue  # keyframes of a rig stay as the rig has them
+                if self.mapper.is_world(keyframe):
+                    continue
                 depth = float(np.median(known[known > 0]))
-                hidden = _find_hidden(None, self.mapper.valid_of(keyframe))
-                T = self._pose(
-                    grey_of(keyframe.color),
-                    keyframe.T_world_camera,
-                    depth,
-                    hidden,
-                    settings,
-                    AlignmentTuning.blurs[-1:],
-                )
-                if T is not None:
-                    keyframe.T_camera_world = inverse(orthonormalize(T))
+                if self._tells_more(depth, self.mapper.settings.view_alignment.keyframe_noise):
+                    self._align_keyframe(keyframe, depth, better)
+
+    def _align_keyframe(self, keyframe: Keyframe, depth: float, better: float) -> None:
+        """Aligns a keyframe with this median depth, in metres; `better` as in `_pose`."""
+        hidden = _find_hidden(None, self.mapper.valid_of(keyframe))
+        settings, blurs = self.mapper.settings.view_alignment, AlignmentTuning.blurs[-1:]
+        T = self._pose(grey_of(keyframe.color), keyframe.T_world_camera, depth, hidden, settings, blurs, better)
+        if T is not None:
+            keyframe.T_camera_world = inverse(orthonormalize(T))
 
     def check(self) -> None:
         """Raises FormatError if what is kept cannot be of this run: it may have come out of a file."""
@@ -183,12 +196,13 @@ class ColorPoses:
     def _is_due(self) -> bool:
         return self.state.residuals.hidden >= self.mapper.settings.view_alignment.hidden_noise
 
-    def _tells_more(self, depth: float) -> bool:
-        """Whether colour tells a pose better than depth with the noise at a distance in metres."""
+    def _tells_more(self, depth: float, least: float | None = None) -> bool:
+        """Whether colour tells a pose better than depth with the noise at a distance in metres: it is at least so many
+        pixels wide; None: as for frames after the last one."""
         if self._is_due:
             return True
         noise, camera = self.state.noise, self.state.camera
-        least = self.mapper.settings.view_alignment.last_noise
+        least = self.mapper.settings.view_alignment.last_noise if least is None else least
         return noise is not None and depth > 0 and noise.in_pixels(depth, camera.fx) >= least
 
     def _align_frame(self, number: int, depth: float, grey: np.ndarray, hidden: np.ndarray | None) -> TrackedFrame:
@@ -210,8 +224,10 @@ class ColorPoses:
     def _pose(
         self, grey: np.ndarray, T_world_camera: np.ndarray, median_depth: float, hidden: np.ndarray | None,
         settings: ViewAlignmentSettings, blurs: Sequence[float] = AlignmentTuning.blurs,
+        better: float = float("inf"),
     ) -> np.ndarray | None:  # fmt: skip
-        """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed."""
+        """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed, or none whose
+        grey difference is less than a share `better` of that at the one near by."""
         camera, T_camera_world = self.state.camera, inverse(T_world_camera)
         assert isinstance(self.mapper, CpuMapper)
         view = self.mapper.render_view(camera, T_camera_world)
@@ -219,13 +235,26 @@ class ColorPoses:
         if hidden is not None:
             alpha = np.where(hidden, np.float32(0), alpha)
         rendered = grey_of(np.ascontiguousarray(view.image.numpy().clip(0, 1).transpose(1, 2, 0)))
-        T = align_view(grey, rendered, depth, alpha, camera, settings, blurs)
-        if T is None or self.state.noise is None:
+        if self.state.noise is None or median_depth <= 0:
+            return None
+        sigma = self.state.noise.sigma(median_depth)
+        # Where depth hides its errors, a pose that it gave says nothing.
+        trust = None if self._is_due else PosePrior(sigma, sigma / median_depth)
+        T = align_view(grey, rendered, depth, alpha, camera, settings, blurs, trust)
+        if T is None:
             return None
         found = inverse(T @ T_camera_world)
         moved, turned = separation(found, T_world_camera)
-        limit = settings.farthest_sigmas * self.state.noise.sigma(median_depth)
-        return found if moved <= limit and np.radians(turned) * median_depth <= limit else None
+        limit = settings.farthest_sigmas * sigma
+        way = max(moved, np.radians(turned) * median_depth)
+        if way > ColorPoseTuning.farthest * limit:
+            return None
+        if way > limit:
+            better = min(better, ColorPoseTuning.convincing)
+        if better == float("inf"):
+            return found
+        before, after = (misfit(grey, rendered, depth, alpha, camera, settings, pose) for pose in (np.eye(4), T))
+        return found if after < better * before else None
 
 
 def _find_hidden(moving: np.ndarray | None, valid: np.ndarray | None) -> np.ndarray | None:

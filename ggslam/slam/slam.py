@@ -24,6 +24,7 @@ from ggslam.geometry.scene_size import scene_scale
 from ggslam.mapping.scale import scale_settings as scale_mapping
 from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
+from ggslam.slam.filters.depth_edges import DepthEdges
 from ggslam.slam.frame_locator import Located
 from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.run_end import refine, result_of
@@ -132,6 +133,7 @@ class Slam(RunState):
         # 4. Insert Gaussians where the map lacks what the keyframe shows, after removing what it looks through. Its
         #    place and its points are prepared meanwhile, in other threads.
         chain.before_insertion(self.removal, frame, tracking)
+        self.mapper.has_soft_outlines = bool(chain.get(DepthEdges).soft)
         if self.pager is not None:
             self.pager.prepare(tracking.T_world_camera, frame.depth)
         before = self.map.count

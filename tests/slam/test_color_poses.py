@@ -12,7 +12,7 @@ import pytest
 
 from ggslam.evaluation.trajectory import score_trajectory
 from ggslam.mapping.settings import ViewAlignmentSettings
-from ggslam.mapping.view_alignment import align_view, grey_of
+from ggslam.mapping.view_alignment import PosePrior, align_view, grey_of, misfit
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, se3_log
@@ -54,6 +54,33 @@ def test_a_view_is_laid_onto_the_map(gain: float, offset: float) -> None:
     seen = gain * corner(MOTION)[0] + np.float32(offset)
     found = error(align_view(seen, rendered, depth, np.ones_like(depth), CAMERA, SETTINGS))
     assert found[:3].max() < 1e-3 and found[3:].max() < 5e-4  # of 12 mm and 8 mrad; a pixel is 8 mrad
+
+
+def test_what_the_picture_leaves_open_the_depth_sensor_says() -> None:
+    """A map drawn wrongly in patches pulls a camera aside that turns back: its image hardly changes."""
+    rendered, depth = corner(np.eye(4))
+    random, rows = np.random.default_rng(0), []
+    for _ in range(16):
+        moved = se3_exp(random.standard_normal(6) * np.repeat([2e-3, 1e-3], 3))
+        patches = cv2.GaussianBlur(random.standard_normal(depth.shape).astype(np.float32), (0, 0), 1.5)
+        seen = corner(moved)[0] + patches * np.float32(0.02 / patches.std())
+        found = [
+            align_view(seen, rendered, depth, np.ones_like(depth), CAMERA, SETTINGS, prior=prior)
+            for prior in (PosePrior(2e-3, 1e-3), None)
+        ]
+        rows.append([float("nan") if T is None else np.linalg.norm((T @ moved)[:3, 3]) for T in (*found, np.eye(4))])
+    both, picture, depth_sensor = np.sqrt(np.mean(np.square(rows), axis=0))
+    assert both < 0.85 * depth_sensor and both < 0.3 * picture
+
+
+def test_a_pose_that_is_right_fits_better() -> None:
+    rendered, depth = corner(np.eye(4))
+    seen, full = 0.7 * corner(MOTION)[0] + np.float32(0.1), np.ones_like(depth)
+    at_start, at_truth = (
+        misfit(seen, rendered, depth, full, CAMERA, SETTINGS, T) for T in (np.eye(4), inverse(MOTION))
+    )
+    assert at_truth < 0.2 * at_start
+    assert np.isnan(misfit(seen, rendered, 0 * depth, full, CAMERA, SETTINGS, np.eye(4)))
 
 
 def test_without_texture_or_map_there_is_no_pose() -> None:
@@ -217,3 +244,56 @@ def test_a_pose_that_contradicts_the_tracker_is_not_believed(room: Path, monkeyp
         found = slam.track([frame]).joint
         assert np.allclose(found.T_world_camera, before[-1].T_world_camera @ inverse(moved if believed else np.eye(4)))
         slam.tracker.state.motion.velocity = np.eye(4)
+
+
+def test_a_pose_far_from_the_tracked_one_is_believed_if_it_fits_clearly_better(room: Path) -> None:
+    sequence = open_sequence(room)
+    slam = Slam(sequence.camera, load_config(None, ["masks.source=none", "refine_iterations=0"]))
+    slam.step(sequence.frame(0))
+    frame, truth = sequence.frame(0), slam.mapper.keyframes[0].T_world_camera
+    depth = float(np.median(frame.depth[frame.depth > 0]))
+    assert slam.tracker.state.noise is not None
+    limit = SETTINGS.farthest_sigmas * slam.tracker.state.noise.sigma(depth)
+    tracked = truth @ se3_exp(np.array([3 * limit, 0, 0, 0, 0, 0]))
+
+    def found() -> np.ndarray | None:
+        return slam.color_poses._pose(grey_of(frame.color), tracked, depth, None, SETTINGS)
+
+    believed = found()
+    assert believed is not None and np.linalg.norm((believed - truth)[:3, 3]) < 0.5 * limit
+    with overridden(color_poses.ColorPoseTuning, convincing=0.0):
+        assert found() is None
+    with overridden(color_poses.ColorPoseTuning, farthest=1.5):
+        assert found() is None
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_a_map_trained_little_moves_keyframes_only_if_they_fit_better(
+    room: Path, monkeypatch: pytest.MonkeyPatch, trained: bool
+) -> None:
+    sequence = open_sequence(room)
+    few = ["masks.source=none", "identity.enabled=false", "mapping.first_frame_iterations=4", "keyframes.max_gap=1"]
+    slam = Slam(sequence.camera, load_config(None, few))
+    for index in range(3):
+        slam.step(sequence.frame(index))
+    keyframes, asked = slam.mapper.keyframes, []
+    for keyframe in keyframes:
+        keyframe.iterations = 20 if trained else 5
+    slam.tracker.state.residuals.hidden = 1
+    monkeypatch.setattr(slam.color_poses, "_pose", lambda *given: asked.append(given[-1]))
+    slam.color_poses.align_keyframes()
+    best = float("inf") if trained else color_poses.ColorPoseTuning.keyframe_better
+    assert len(keyframes) > 1 and asked == [best] * (len(keyframes) - 1)  # the first one is the world
+
+
+def test_a_pose_that_hardly_fits_better_may_be_refused(room: Path) -> None:
+    sequence = open_sequence(room)
+    slam = Slam(sequence.camera, load_config(None, ["masks.source=none", "refine_iterations=0"]))
+    slam.step(sequence.frame(0))
+    frame, truth = sequence.frame(0), slam.mapper.keyframes[0].T_world_camera
+    depth, grey = float(np.median(frame.depth[frame.depth > 0])), grey_of(frame.color)
+    aside = truth @ se3_exp(np.array([0.02, 0, 0, 0, 0, 0]))
+    found = [slam.color_poses._pose(grey, T, depth, None, SETTINGS, better=0.97) for T in (truth, aside)]
+    assert found[0] is None and found[1] is not None
+    assert np.linalg.norm((found[1] - truth)[:3, 3]) < 0.01
+    assert slam.color_poses._pose(grey, truth, depth, None, SETTINGS) is not None

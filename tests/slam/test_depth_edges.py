@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ggslam.geometry.soft_edges import edge_sharpness, soft_edges
+from ggslam.mapping.cpu.mapper import CpuMapper, SoftOutlineTuning
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.slam.config import load_config
@@ -87,3 +88,20 @@ def test_a_run_uses_what_is_left() -> None:
     kept = slam.mapper.keyframes[0].depth_m()
     assert 0.01 < (kept == 0).mean() < 0.06
     assert np.abs(kept - smooth(wall_and_box()))[kept > 0].max() < 1e-3
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_beside_soft_outlines_every_pixel_becomes_a_gaussian(soft: bool) -> None:
+    """There depth is missing, and what is left says less."""
+    few = ["mapping.first_frame_iterations=0", "identity.enabled=false"]
+    slam = Slam(CAMERA, load_config(None, few), False)
+    color = np.random.default_rng(0).integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    depth = smooth(wall_and_box()) if soft else wall_and_box()
+    slam.step(dataclasses.replace(frame(depth), color=color))
+    mapper = slam.mapper
+    assert isinstance(mapper, CpuMapper) and mapper.has_soft_outlines == soft
+    assert mapper._insertion.fill_stride == (1 if soft else mapper.settings.insertion.fill_stride)
+    share = mapper._loss_settings.depth_weight / mapper.settings.loss.depth_weight
+    assert share == pytest.approx(SoftOutlineTuning.depth_weight_share if soft else 1)
+    missing = (mapper.keyframes[0].depth_m() == 0).sum()
+    assert not soft or len(mapper.map) > 0.98 * 240 * 320 > 240 * 320 - missing

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -22,7 +23,7 @@ from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
-from ggslam.mapping.settings import MapperSettings
+from ggslam.mapping.settings import InsertionSettings, LossSettings, MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.exposure import SeenAgain
@@ -40,6 +41,13 @@ class HiddenGaussianTuning(Tuning):
 
     few_keyframes = 8
     """Keyframes below which each looks with all its pixels. With more, each looks with a quarter of them by turns."""
+
+
+class SoftOutlineTuning(Tuning):
+    """Training by depth of a camera that smooths its outlines."""
+
+    depth_weight_share = 0.7
+    """Weight of depth in the loss, as a share of the usual one."""
 
 
 @savable(not_saved="settings residency extra_loss fits_view_colors _rasterizer _loss _adam_of_pixel", check="check")
@@ -112,7 +120,7 @@ class CpuMapper(Mapper):
         self, keyframe: Keyframe, T_world_camera: np.ndarray, labeller: Labeller | None,
         begin_others: Callable[[], None],
     ) -> None:  # fmt: skip
-        depth, s = keyframe.depth_m(), self.settings.insertion
+        depth, s = keyframe.depth_m(), self._insertion
         where, alpha = None, np.zeros(depth.shape, np.float32)
         show: Callable[[], MapLabels] | None = None
         seen: SeenAgain | None = None
@@ -225,7 +233,19 @@ class CpuMapper(Mapper):
         color, depth = grid.color_of(keyframe.color), grid.depth_of(keyframe.depth)
         shown = None if shown is None else grid.valid_of(shown)
         target = LossTarget(color, depth, keyframe.depth_unit, self._exposure_of(keyframe), shown)
-        return self._loss.evaluate(view, target, self.settings.loss)
+        return self._loss.evaluate(view, target, self._loss_settings)
+
+    @property
+    def _insertion(self) -> InsertionSettings:
+        """How Gaussians are inserted: beside soft outlines one for each pixel, as at sharp ones."""
+        s = self.settings.insertion
+        return replace(s, fill_stride=min(s.fill_stride, 1)) if self.has_soft_outlines else s
+
+    @property
+    def _loss_settings(self) -> LossSettings:
+        """Terms of the loss: what smooths outlines smooths creases and relief, too, and says less of depth."""
+        s, share = self.settings.loss, SoftOutlineTuning.depth_weight_share
+        return replace(s, depth_weight=share * s.depth_weight) if self.has_soft_outlines else s
 
     def _comparable(self, keyframe: Keyframe) -> np.ndarray | None:
         """Where a keyframe's colours are compared with the map's, bool [H, W]; None: everywhere."""
