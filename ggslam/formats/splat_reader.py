@@ -52,8 +52,10 @@ class SplatReader:
 def read_whole(
     name: str, is_of: Callable[[Path, bytes], bool],
     read: Callable[[Path], SplatColumns | tuple[SplatColumns, Names | None]], indices: tuple[str, ...] = (),
+    notes: Callable[[Path], list[str]] = lambda path: [],
 ) -> SplatReader:  # fmt: skip
-    """A format that is read as a whole: `read` gives the columns, and the names of objects where there are ids."""
+    """A format that is read as a whole: `read` gives the columns, and the names of objects where there are ids;
+    `notes` what the user should know of a file that can be read."""
 
     def open_file(path: Path) -> SplatFile:
         found = read(path)
@@ -61,7 +63,7 @@ def read_whole(
         faults = SplatFaults()
         keep = mend(columns, faults)
         gaussians = map_of_columns(columns if keep.all() else columns.take(keep.nonzero()[0]))
-        return SplatFile(name, GaussiansInMemory(path, gaussians), names, faults.notes())
+        return SplatFile(name, GaussiansInMemory(path, gaussians), names, [*notes(path), *faults.notes()])
 
     return SplatReader(name, is_of, open_file, indices)
 

@@ -5,6 +5,10 @@ github.com/nianticlabs/spz: a header of 16 bytes and, one attribute after the ot
 point; version 1: float16), opacities, base colours, logarithms of sizes, quaternions (versions 1 and 2: x y z in
 bytes; 3 and 4: the three smallest) and higher harmonics. Versions 1 to 3 are one gzip stream. Version 4 has a table of
 zstd frames, one for each attribute. y is upwards and z backwards.
+
+The flag `antialiased` says that a renderer has to make Gaussians more transparent by what its low-pass filter widens
+them in the image, as Mip-Splatting does. How much that is depends on the view, so no opacity in the file can be right
+for all: it is read as it is, which is right from nearby, and named.
 """
 
 from __future__ import annotations
@@ -23,11 +27,15 @@ from ggslam.formats.splat_columns import SplatColumns
 from ggslam.formats.splat_reader import read_whole
 from ggslam.formats.splat_repair import columns_of, logits_of
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import read_untrusted
+from ggslam.system.untrusted_files import open_untrusted, read_untrusted
 
 MAGIC = b"NGSP"
 _HEADER: Final = 16
 """Bytes of SPZ's header."""
+_ANTIALIASED: Final = 1
+"""Bit of the header's flags."""
+_FLAGS: Final = 14
+"""Where they are in the header, of every version."""
 _COLOR_SCALE: Final = 0.15
 """SPZ's factor of colours before they are rounded to bytes."""
 
@@ -39,6 +47,8 @@ class SpzTuning(Tuning):
     """Bytes that a file of any size may expand to."""
     max_ratio = 64
     """Largest expansion of larger files."""
+    head_bytes = 4096
+    """Bytes of a file that its header is looked for in."""
 
 
 def read_spz(path: Path) -> SplatColumns:
@@ -158,4 +168,17 @@ def _smallest_three(words: np.ndarray) -> np.ndarray:
     return np.roll(quaternions_of_smallest(shares * np.sqrt(0.5), words >> 30), 1, axis=1)
 
 
-READER = read_whole("SPZ", lambda path, head: path.suffix.lower() == ".spz" or head[:4] == MAGIC, read_spz)
+def _notes(path: Path) -> list[str]:
+    with open_untrusted(path) as file:
+        head = file.read(SpzTuning.head_bytes)
+    if head[:4] != MAGIC:
+        head = zlib.decompressobj(31).decompress(head, _HEADER)
+    if len(head) <= _FLAGS or not head[_FLAGS] & _ANTIALIASED:
+        return []
+    return ["antialiased: it is made for renderers that take from opacities what their low-pass filter adds to sizes; "
+            "here small and far Gaussians look bolder"]  # fmt: skip
+
+
+READER = read_whole(
+    "SPZ", lambda path, head: path.suffix.lower() == ".spz" or head[:4] == MAGIC, read_spz, notes=_notes
+)

@@ -25,6 +25,9 @@ class OtherSizeTuning(Tuning):
     share = 0.5
     """Part of the final refinement, its first one, of which half of the steps are on other sizes. The later ones
     sharpen the map at its own size."""
+    later_every = 20
+    """Of so many of the later steps one is on half and one on twice the size. Without them the map forgets in the
+    later part half of what it learned in the first."""
     alike = 1.02
     """Depths that differ by this factor are not averaged: they are of different surfaces."""
 
@@ -71,14 +74,20 @@ class TwiceTheSize(PixelGrid):
         return low_pass / 4 + 1 / 16
 
 
-_TURNS: Final = (ALL_PIXELS, HalfSize(), TwiceTheSize(), ALL_PIXELS)
+_HALF: Final = HalfSize()
+_TWICE: Final = TwiceTheSize()
+_TURNS: Final = (ALL_PIXELS, _HALF, _TWICE, ALL_PIXELS)
 
 
 def picture_of_turn(turn: int, done: float, camera: Camera) -> PixelGrid:
     """What the `turn`-th step of the final refinement looks at, of which `done`, 0 to 1, is over."""
-    if done >= OtherSizeTuning.share or not is_divisible(camera):
+    if not is_divisible(camera):
         return ALL_PIXELS
-    return _TURNS[turn % len(_TURNS)]
+    if done < OtherSizeTuning.share:
+        return _TURNS[turn % len(_TURNS)]
+    every = OtherSizeTuning.later_every
+    others = {every // 4: _HALF, 3 * every // 4: _TWICE}
+    return others.get(turn % every, ALL_PIXELS)
 
 
 def _four(image: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import RenderError
+from ggslam.scene.camera import Camera
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh", "features")
 """Names of the parameter arrays of a set of Gaussians."""
@@ -19,6 +21,25 @@ LOW_PASS_3DGS: Final = 0.3
 """Pixels^2 that 3D Gaussian Splatting, and viewers that follow it, add to both variances of a projected Gaussian."""
 LOW_PASS = LOW_PASS_3DGS
 """Ours: the same, so that a map looks alike everywhere. Trained with 0.1 and drawn with 0.3, maps lose up to 4 dB."""
+
+LARGEST_ZOOM: Final = 50.0
+"""Up to which `low_pass_at` grows."""
+
+
+def low_pass_at(zoom: float) -> float:
+    """The filter, pixels^2, with which pictures `zoom` times as large show a map as those did that it was trained on:
+    as wide as theirs. But a pixel is the mean over its square, with a variance of 1/12: what smaller squares blur less
+    the filter blurs less, too."""
+    square = min(zoom, LARGEST_ZOOM) ** 2
+    return LOW_PASS * square + (1 - square) / 12
+
+
+def low_pass_for(camera: Camera, trained: Camera | None) -> float:
+    """That of pictures by `camera` of a map that pictures by `trained` taught; of one that no recording is known of
+    (None) 3DGS's."""
+    if trained is None:
+        return LOW_PASS
+    return low_pass_at(math.sqrt(camera.fx * camera.fy / (trained.fx * trained.fy)))
 
 
 class Gaussians(Protocol):

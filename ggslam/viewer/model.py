@@ -80,6 +80,10 @@ class ViewedMap(Protocol):
         """Of the recording."""
 
     @property
+    def training_camera(self) -> Camera | None:
+        """The camera whose pictures taught the map; None: not known."""
+
+    @property
     def frame_poses(self) -> dict[int, np.ndarray]:
         """T_world_camera [4, 4] of the frames that were located, in order; at least one."""
 

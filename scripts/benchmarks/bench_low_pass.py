@@ -6,8 +6,9 @@
 
 Held-out frames and keyframes are rendered at half, once and twice the size that the run was trained at and compared
 with the recording read at that size, over pixels with measured depth. Twice the size needs a run at `--scale 0.5` or
-less. Which rules: see `LOW_PASS` in ggslam/rendering/types.py and `as_3dgs` of `CpuRasterizer.forward`. --low-pass adds
-a column with ours but for another filter. --zoom fits the map to a window of another size, as `ggslam export --zoom`.
+less. Which rules: see `low_pass_at` in ggslam/rendering/types.py and `as_3dgs` of `CpuRasterizer.forward`. --low-pass
+adds a column with ours but for another filter. --zoom fits the map to a window of another size, as `ggslam export
+--zoom`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from held_out import held_out_poses
 
 from ggslam.evaluation.images import psnr, unit_range
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.types import LOW_PASS
+from ggslam.rendering.types import low_pass_at
 from ggslam.rendering.zoom import ZoomFit
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
@@ -36,10 +37,10 @@ SETS = ("held out", "keyframes")
 
 @dataclass(frozen=True)
 class Drawing:
-    """Rules to draw by."""
+    """Rules to draw by; `low_pass` None: that of the size, see `low_pass_at`."""
 
     name: str
-    low_pass: float = LOW_PASS
+    low_pass: float | None = None
     as_3dgs: bool = False
 
 
@@ -73,8 +74,8 @@ def psnr_at_sizes(
     """
     means: dict[tuple[float, str, str], float] = {}
     scale = folder.sequence().open.scale
-    rasterizers = {drawing: CpuRasterizer(low_pass=drawing.low_pass) for drawing in drawings}
     for size in sizes:
+        rasterizers = {drawing: CpuRasterizer(low_pass=drawing.low_pass or low_pass_at(size)) for drawing in drawings}
         sequence = open_recording_of(folder, recording, scale=size * scale)
         for name, poses in views_of(folder, every).items():
             found: dict[str, list[float]] = {drawing.name: [] for drawing in drawings}

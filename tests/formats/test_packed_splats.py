@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gzip
 import sys
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from ggslam.errors import FormatError, MissingDependency
 from ggslam.formats.morton import morton_order
 from ggslam.formats.packed_splats import write_spz
 from ggslam.formats.splat_file import SPLAT_ROW, write_splat
+from ggslam.formats.splat_formats import open_splats
 from ggslam.scene.gaussian_map import GaussianMap
 
 
@@ -58,6 +60,17 @@ def test_too_far_for_spz(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="2048"):
         write_spz(tmp_path / "map.spz", far)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_maps_are_not_trained_for_antialiased_renderers_and_say_so(version: int, tmp_path: Path) -> None:
+    for package in ("gaussforge", *(["zstandard"] if version == 4 else [])):
+        pytest.importorskip(package, reason=f"{package} is not installed (extra [splats])")
+    write_spz(tmp_path / "map.spz", small_map(), version)
+    data = (tmp_path / "map.spz").read_bytes()
+    header = data if version == 4 else gzip.decompress(data)
+    assert header[:4] == b"NGSP" and header[4] == version and header[14] & 1 == 0
+    assert open_splats(tmp_path / "map.spz").notes == []
 
 
 def test_without_gaussforge(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

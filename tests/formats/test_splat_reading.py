@@ -21,7 +21,7 @@ from ggslam.formats.gaussian_gltf import write_gaussian_gltf
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.sog import write_sog
 from ggslam.formats.splat_file import write_splat
-from ggslam.formats.splat_formats import read_splats, splat_format
+from ggslam.formats.splat_formats import open_splats, read_splats, splat_format
 from ggslam.scene.gaussian_map import GaussianMap
 
 
@@ -34,7 +34,7 @@ def some_map(count: int = 40, degree: int = 1) -> GaussianMap:
     return out
 
 
-def spz(version: int, xyz: np.ndarray, rotation: bytes) -> bytes:
+def spz(version: int, xyz: np.ndarray, rotation: bytes, flags: int = 0) -> bytes:
     """A file of version 1 or 2 with Gaussians of 2^-4 m, a grey base colour and no harmonics; y is up in it."""
     n = len(xyz)
     if version == 1:
@@ -43,7 +43,7 @@ def spz(version: int, xyz: np.ndarray, rotation: bytes) -> bytes:
         steps = np.rint(xyz * 4096).astype("<i4")
         positions = steps.view("u1").reshape(n, 3, 4)[..., :3].tobytes()
     size = int(np.rint(16 * (np.log(2.0**-4) + 10)))
-    body = struct.pack("<4sIIBBBB", b"NGSP", version, n, 0, 12, 0, 0) + positions
+    body = struct.pack("<4sIIBBBB", b"NGSP", version, n, 0, 12, flags, 0) + positions
     return gzip.compress(body + bytes([128]) * n + bytes([128]) * 3 * n + bytes([size]) * 3 * n + rotation)
 
 
@@ -59,6 +59,19 @@ def test_spz_of_the_first_versions(version: int, tmp_path: Path) -> None:
     turn = Rotation.from_quat(np.roll(found.quaternions.numpy()[0], -1)).as_matrix()
     np.testing.assert_allclose(turn, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=0.02)
     assert found.rgb.numpy() == pytest.approx(0.5, abs=0.01)
+
+
+def test_the_flag_of_an_antialiased_spz_is_named_and_changes_no_number(tmp_path: Path) -> None:
+    """Bit 0x1 of the flags; another one means nothing of it."""
+    xyz, turns, maps = np.array([[0.5, 1.25, -2.0]]), bytes([127, 128, 127]), []
+    for flags, named in ((0, False), (1, True), (2, False), (3, True)):
+        (tmp_path / "map.spz").write_bytes(spz(2, xyz, turns, flags))
+        opened = open_splats(tmp_path / "map.spz")
+        assert [note.startswith("antialiased") for note in opened.notes] == [True] * named
+        maps.append(opened.rows.read(0, 1))
+    for found in maps:
+        assert torch.equal(found.log_scales, maps[0].log_scales)
+        assert torch.sigmoid(found.opacity_logits).numpy() == pytest.approx(128 / 255, abs=1e-6)
 
 
 def test_gltf_whose_node_is_turned_scaled_and_moved(tmp_path: Path) -> None:

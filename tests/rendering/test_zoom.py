@@ -9,7 +9,7 @@ import torch
 
 from ggslam.errors import ConfigError
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.types import LOW_PASS
+from ggslam.rendering.types import LARGEST_ZOOM, LOW_PASS, low_pass_at, low_pass_for
 from ggslam.rendering.zoom import ZoomFit
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -125,3 +125,32 @@ def test_fitted_gaussians_look_in_small_as_they_did_in_large(size: int) -> None:
     before = error()
     ZoomFit(CAMERA, [np.eye(4)], 1 / size)(gaussians)
     assert error() < 0.4 * before and before > 0.02
+
+
+def test_the_filter_of_other_sizes() -> None:
+    """Four pixels of twice the size spread by 1/16 px^2 of the own size, four of the own size by 1/4."""
+    assert low_pass_at(1) == LOW_PASS == low_pass_for(CAMERA, None) == low_pass_for(CAMERA, CAMERA)
+    assert low_pass_at(2) / 4 + 1 / 16 == pytest.approx(LOW_PASS)
+    assert low_pass_at(0.5) == pytest.approx((LOW_PASS + 1 / 4) / 4) == pytest.approx(0.1375)
+    assert low_pass_for(CAMERA.scale(2), CAMERA) == pytest.approx(0.95)
+    assert low_pass_at(1e6) == low_pass_at(LARGEST_ZOOM) < 1e3
+    assert low_pass_at(1e-6) > 0
+
+
+@pytest.mark.parametrize("zoom", [0.5, 2.0])
+def test_pictures_of_other_sizes_show_the_map_as_trained(zoom: float) -> None:
+    """Where little hides, so that what is averaged adds up: means of four pixels of the larger picture are the smaller
+    one."""
+    gaussians, rasterizer, images = wall(0.03), CpuRasterizer(1), {}
+    gaussians.opacity_logits[:] = -4.0
+    for size in (1.0, zoom):
+        for low_pass in (LOW_PASS, low_pass_at(size)):
+            camera = CAMERA.scale(size)
+            view = rasterizer.forward(gaussians, camera, np.eye(4), features=False, low_pass=low_pass)
+            image = view.image.numpy().copy()  # the next picture goes to the same place
+            if size == max(1.0, zoom):
+                image = image.reshape(3, camera.height // 2, 2, camera.width // 2, 2).mean((2, 4))
+            images[size, low_pass] = image
+    own = images[1.0, LOW_PASS]
+    fitted, as_3dgs = (np.abs(images[zoom, f] - own).mean() for f in (low_pass_at(zoom), LOW_PASS))
+    assert fitted < 0.3 * as_3dgs

@@ -13,7 +13,7 @@ import pytest
 
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.labels import vote_label_image
-from ggslam.rendering.types import GaussianTensors, RenderBuffers
+from ggslam.rendering.types import LOW_PASS, GaussianTensors, RenderBuffers, low_pass_at
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.camera import Camera
@@ -61,14 +61,16 @@ def page(gaussians: GaussianMap, poses: list[np.ndarray], tmp_path_factory: pyte
     return m.write_map_page(path, chunks, SIZE, FOCAL, poses[0])
 
 
-def expected(gaussians: GaussianMap, pose: np.ndarray, rows: np.ndarray | None = None) -> RenderBuffers:
+def expected(
+    gaussians: GaussianMap, pose: np.ndarray, rows: np.ndarray | None = None, low_pass: float = LOW_PASS
+) -> RenderBuffers:
     """By our renderer, with the part of the colours that is the same from all sides."""
     g, index = gaussians, slice(None) if rows is None else rows
     part = GaussianTensors(
         g.means[index], g.quaternions[index], g.log_scales[index], g.opacity_logits[index],
         g.sh[index, :1].contiguous(), g.features[index],
     )  # fmt: skip
-    return CpuRasterizer().forward(part, CAMERA, inverse(pose), features=False)
+    return CpuRasterizer(low_pass=low_pass).forward(part, CAMERA, inverse(pose), features=False)
 
 
 def decibels(picture: np.ndarray, buffers: RenderBuffers) -> float:
@@ -93,6 +95,19 @@ def test_the_page_draws_what_the_rasterizer_draws(
     assert decibels(rest, expected(gaussians, poses[-1], np.flatnonzero(owner != gone))) > 45
     assert decibels(rest, expected(gaussians, poses[-1])) < 30
     assert b.errors(browser) == []
+
+
+@pytest.mark.parametrize("renderer", ["processor", "webgl"])
+@pytest.mark.parametrize("zoom", [0.5, 2.0])
+def test_pictures_of_other_sizes_than_the_training_s_have_their_filter(
+    browser: Any, page: Path, gaussians: GaussianMap, poses: list[np.ndarray], zoom: float, renderer: str
+) -> None:
+    m.open_map(browser, page, renderer)
+    m.ask(browser, "map.trained = values[0]; map.redraw()", FOCAL / zoom)
+    m.look_from(browser, poses[0])
+    picture = m.picture(browser)
+    assert decibels(picture, expected(gaussians, poses[0], low_pass=low_pass_at(zoom))) > 45
+    assert decibels(picture, expected(gaussians, poses[0])) < 40
 
 
 def test_what_is_picked_is_there(

@@ -10,7 +10,7 @@ import numpy as np
 from ggslam.errors import ConfigError
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.types import RenderBuffers
+from ggslam.rendering.types import RenderBuffers, low_pass_for
 from ggslam.reporting.pictures import color_of_depth, color_of_ids, color_to_uint8, depth_range, identity_picture
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.objects_in_parts import ObjectsInParts
@@ -49,6 +49,7 @@ class Artist:
         self.objects = ObjectsInParts.of(folder) if set(kinds) & set(OBJECT_KINDS) else None
         self._parts = folder.map_in_parts() if self.objects is None else self.objects.map
         self.depth_limits: tuple[float, float] | None = None
+        self._trained = folder.sequence().camera if folder.has_poses else None
         self._rasterizer = CpuRasterizer()
         self._painters: dict[str, Painter] = {
             "color": lambda view, _: color_to_uint8(view.image.numpy()),
@@ -74,7 +75,10 @@ class Artist:
     def _view(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[RenderBuffers, GaussianMap]:
         T_camera_world = inverse(T_world_camera)
         gaussians = self._parts.in_view(camera, T_camera_world)
-        view = self._rasterizer.forward(gaussians, camera, T_camera_world, features=self.objects is not None)
+        view = self._rasterizer.forward(
+            gaussians, camera, T_camera_world, features=self.objects is not None,
+            low_pass=low_pass_for(camera, self._trained),
+        )
         return view, gaussians
 
     def _object_painters(self, objects: ObjectsInParts) -> dict[str, Painter]:

@@ -11,7 +11,7 @@ import numpy as np
 from ggslam.objects.rendered_ids import object_ids
 from ggslam.objects.segmented_map import SegmentedMap
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.types import GaussianTensors
+from ggslam.rendering.types import GaussianTensors, low_pass_for
 from ggslam.reporting.pictures import (
     IdentityColors,
     IdentityPictureTuning,
@@ -46,13 +46,15 @@ class ViewPictures:
         segmented: the same with its objects, if it has any.
         camera_of: tells the camera of a frame.
         recorded: gives a frame's images, None if the recording is not there.
+        trained: the camera whose pictures taught the map; None: not known.
     """
 
     def __init__(
         self, gaussians: GaussianMap, segmented: SegmentedMap | None, camera_of: Callable[[int], Camera],
-        recorded: Callable[[int], Frame | None],
+        recorded: Callable[[int], Frame | None], trained: Camera | None,
     ) -> None:  # fmt: skip
         self._gaussians, self._segmented, self._camera_of, self._recorded = gaussians, segmented, camera_of, recorded
+        self._trained = trained
         self._rasterizer = CpuRasterizer()
         self.identity: IdentityColors | None = None if segmented is None else _identity_colors(segmented)
 
@@ -61,8 +63,9 @@ class ViewPictures:
         segmented, whole = self._segmented, self._camera_of(frame)
         camera = whole.resize(FramePictureTuning.width, round(whole.height * FramePictureTuning.width / whole.width))
         view = self._rasterizer.forward(
-            self._gaussians, camera, inverse(T_world_camera), features=segmented is not None
-        )
+            self._gaussians, camera, inverse(T_world_camera), features=segmented is not None,
+            low_pass=low_pass_for(camera, self._trained),
+        )  # fmt: skip
         rendered, alpha = color_to_uint8(view.image.numpy()), view.alpha.numpy()
         depth = np.where(alpha > 0.5, view.expected_depth.numpy(), 0)
         found = self._recorded(frame)
@@ -81,7 +84,8 @@ class ViewPictures:
     def picture(self, camera: Camera, T_world_camera: np.ndarray, hidden: set[int]) -> np.ndarray:
         """See `ViewedMap.picture`."""
         part = self._visible(hidden)
-        view = self._rasterizer.forward(part, camera, inverse(T_world_camera), features=False)
+        low_pass = low_pass_for(camera, self._trained)
+        view = self._rasterizer.forward(part, camera, inverse(T_world_camera), features=False, low_pass=low_pass)
         return color_to_uint8(view.image.numpy())
 
     def _visible(self, hidden: set[int]) -> GaussianMap | GaussianTensors:

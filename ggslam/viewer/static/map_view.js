@@ -4,7 +4,8 @@
 
 class MapView {
   // canvas: gets the pointer and shows lines; the picture of the map is put beneath it. camera: {view() column-major
-  // world to camera, focal(width, height), near}. options: {background: [r, g, b], renderer: "webgl" | "processor"}.
+  // world to camera, focal(width, height), near}. options: {background: [r, g, b], renderer: "webgl" | "processor",
+  // trained: focal length, pixels, of the pictures that taught the map}.
   constructor(canvas, camera, options = {}) {
     Object.assign(this, {
       canvas,
@@ -13,6 +14,7 @@ class MapView {
       marks: new Map(),
       colors: new Map(),
       background: options.background || [15, 17, 19],
+      trained: options.trained,
     });
     this.states = new Uint8Array(65536).fill(SPLAT_RULES.visible);
     this.displacement = null;
@@ -175,14 +177,20 @@ class MapView {
     const width = Math.max(1, Math.round(this.canvas.clientWidth * scale)),
       height = Math.max(1, Math.round(this.canvas.clientHeight * scale));
     return {
+      ...this.lens(width, height),
       view: this.camera.view(),
-      focal: this.camera.focal(width, height),
       near: this.camera.near,
       width,
       height,
       background: this.background,
       sharp,
     };
+  }
+
+  // What a picture's size makes of the camera.
+  lens(width, height) {
+    const focal = this.camera.focal(width, height);
+    return { focal, lowPass: lowPassFor(focal, this.trained) };
   }
 
   // A picture is on the screen; complete: its splats are in order.
@@ -222,18 +230,19 @@ class MapView {
   pick(x, y) {
     const width = this.canvas.clientWidth,
       height = this.canvas.clientHeight,
-      focal = this.camera.focal(width, height);
+      lens = this.lens(width, height);
     const chunks = new Map(
       [...this.chunks].map(([chunk, splats]) => [chunk, { splats, marks: this.marks.get(chunk) }]),
     );
-    const shot = { view: this.camera.view(), focal, near: this.camera.near, width, height };
-    return pickSplat(chunks, this.states, this.displacement, shot, [(x - width / 2) / focal, (y - height / 2) / focal]);
+    const shot = { ...lens, view: this.camera.view(), near: this.camera.near, width, height };
+    const ray = [(x - width / 2) / lens.focal, (y - height / 2) / lens.focal];
+    return pickSplat(chunks, this.states, this.displacement, shot, ray);
   }
 
   // Expected depth of the surfaces of the present picture, Float32Array [height * width], metres along the optical
   // axis; 0 where more than half of the light is the background's.
   async depthImage(width, height) {
-    const shot = { ...this.shot(1, true), width, height, focal: this.camera.focal(width, height) };
+    const shot = { ...this.shot(1, true), width, height, ...this.lens(width, height) };
     return this.painters().depth(shot);
   }
 

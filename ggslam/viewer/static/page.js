@@ -39,7 +39,10 @@ class Viewer {
     this.panels = document.getElementById("panels");
     this.shownLines = new Set(["path", "movers"]);
     this.camera = new OrbitCamera(this.canvas, scene.up || [0, -1, 0], scene.fov || 1, () => this.moved());
-    this.map = new MapView(this.canvas, this.camera, { background: BACKGROUNDS[this.theme()] });
+    this.map = new MapView(this.canvas, this.camera, {
+      background: BACKGROUNDS[this.theme()],
+      trained: scene.trained_focal,
+    });
     this.edits = source.served ? new ServedEdits(this) : new LocalEdits(this);
     this.notes = new Notes(this, scene.annotations);
     this.film = new Film(this, scene.camera_keys);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // What is drawn at one place of the screen: of which object, which splat, and where its surface is.
 
-// chunks: Map chunk -> {splats, marks}; states: Uint8 [65536]; shot: {view, focal, near, width, height} in pixels of
+// chunks: Map chunk -> {splats, marks}; states: Uint8 [65536]; shot: {view, focal, near, width, height, lowPass} in pixels of
 // the screen; ray: [x, y] slopes of the pixel.
 // Gives {id, chunk, row, point, depth}, or null where more than half of the light is the background's.
 function pickSplat(chunks, states, displacement, shot, ray) {
@@ -45,7 +45,7 @@ function outOfCamera(v, [x, y, z]) {
   return [v[0] * x + v[1] * y + v[2] * z, v[4] * x + v[5] * y + v[6] * z, v[8] * x + v[9] * y + v[10] * z];
 }
 
-function splatsOnRay(splats, marks, states, displacement, { view, focal, near, width, height }, [u, w]) {
+function splatsOnRay(splats, marks, states, displacement, { view, focal, near, width, height, lowPass }, [u, w]) {
   const { count, centers, alphas, ids, covariances: all } = splats,
     shapes = shapesOf(splats);
   const eyes = [view, displacement && multiply(view, displacement.T)].map((v) => v && eyeOf(v));
@@ -53,7 +53,7 @@ function splatsOnRay(splats, marks, states, displacement, { view, focal, near, w
     limitY = (SPLAT_RULES.slopeMargin * height) / focal,
     hits = [];
   const moved = displacement && multiply(view, displacement.T),
-    floor = SPLAT_RULES.lowPass / (focal * focal);
+    floor = lowPass / (focal * focal);
   for (let i = 0; i < count; i++) {
     const mark = marks ? marks[i] : 0;
     if (!(states[ids[i]] & SPLAT_RULES.visible) || mark & SPLAT_RULES.gone) continue;

@@ -146,7 +146,7 @@ class SplatProjector {
 }
 
 // What of a picture's rows top .. bottom the projection needs to know.
-function frameOf({ focal, near, width, height, sharp }, top, bottom) {
+function frameOf({ focal, near, width, height, sharp, lowPass }, top, bottom) {
   const middleX = width / 2 - 0.5;
   const middleY = height / 2 - 0.5;
   const right = (width / 2 + 2) / focal;
@@ -167,7 +167,7 @@ function frameOf({ focal, near, width, height, sharp }, top, bottom) {
     stretchY: Math.sqrt(1 + Math.max(above * above, below * below)),
     limitX: (SPLAT_RULES.slopeMargin * width) / focal,
     limitY: (SPLAT_RULES.slopeMargin * height) / focal,
-    lowPass: SPLAT_RULES.lowPass,
+    lowPass,
     faint: sharp ? 0 : Math.log(SPLAT_RULES.movingMinAlpha / SPLAT_RULES.minAlpha),
   };
 }

@@ -3,7 +3,8 @@
 // forward. Screens have their principal point in the middle.
 
 const SPLAT_RULES = Object.freeze({
-  lowPass: 0.3, // pixels squared, added to both variances of a projected splat
+  lowPass: 0.3, // pixels squared, added to both variances of a projected splat, at the size of the training
+  largestZoom: 50,
   minAlpha: 1 / 255, // fainter contributions are left out
   maxAlpha: 0.999,
   minTransmittance: 1e-4, // a pixel takes no further splat once its transmittance is below
@@ -17,6 +18,13 @@ const SPLAT_RULES = Object.freeze({
   tint: [255, 217, 26],
   tintShare: 0.45, // of what is selected
 });
+
+// As low_pass_for of ggslam/rendering/types.py: the filter of pictures of a focal length, pixels, of a map that ones of
+// another taught (not known: 0).
+function lowPassFor(focal, trained) {
+  const square = trained ? Math.min(focal / trained, SPLAT_RULES.largestZoom) ** 2 : 1;
+  return SPLAT_RULES.lowPass * square + (1 - square) / 12;
+}
 
 // A worker from functions and classes of this page: `main` runs in it and sees `parts` and constants by their names.
 function startWorker(main, constants, ...parts) {

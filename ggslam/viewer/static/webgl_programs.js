@@ -5,7 +5,7 @@
 const SPLAT_VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D shapes, colors, marks; uniform sampler2D states;
-uniform mat4 view, displacement; uniform vec2 focal, size; uniform float near;
+uniform mat4 view, displacement; uniform vec2 focal, size; uniform float near, lowPass;
 uniform int displaced; // id, or -1: marked
 in vec2 corner; in uint which;
 out vec2 place; out vec4 color;
@@ -59,7 +59,7 @@ void main() {
   vec2 limit = ${SPLAT_RULES.slopeMargin} * size / focal, ray = clamp(p.xy / p.z, -limit, limit);
   mat3 J = mat3(focal.x / p.z, 0, 0, 0, focal.y / p.z, 0, -focal.x * ray.x / p.z, -focal.y * ray.y / p.z, 0);
   mat3 T = J * mat3(camera); mat3 cov = T * sigma * transpose(T);
-  float xx = cov[0][0] + ${SPLAT_RULES.lowPass}, xy = cov[0][1], yy = cov[1][1] + ${SPLAT_RULES.lowPass};
+  float xx = cov[0][0] + lowPass, xy = cov[0][1], yy = cov[1][1] + lowPass;
   float middle = 0.5 * (xx + yy), off = length(vec2(0.5 * (xx - yy), xy));
   float large = middle + off, small = max(middle - off, 0.01);
   color = vec4(rgba) / 255.0 * vec4(1, 1, 1, share);

@@ -31,7 +31,7 @@ class WebglRenderer {
     this.displacement = null;
     this.program = buildProgram(gl, SPLAT_VERTEX, SPLAT_FRAGMENT);
     this.places = Object.fromEntries(
-      ["view", "displacement", "focal", "size", "near", "displaced", "shapes", "colors", "marks", "states"].map(
+      ["view", "displacement", "focal", "size", "near", "lowPass", "displaced", "shapes", "colors", "marks", "states"].map(
         (name) => [name, gl.getUniformLocation(this.program, name)],
       ),
     );
@@ -125,10 +125,10 @@ class WebglRenderer {
     });
   }
 
-  // shot: {view, focal, near, width, height, background}, in pixels of the canvas. Whether what is drawn is in order.
+  // shot: {view, focal, near, lowPass, width, height, background}, in pixels of the canvas. Whether what is drawn is in order.
   draw(shot) {
     const gl = this.gl,
-      { view, focal, near, width, height, background: b } = shot,
+      { view, focal, near, lowPass, width, height, background: b } = shot,
       canvas = this.canvas;
     if (canvas.width !== width || canvas.height !== height) {
       canvas.width = width;
@@ -151,6 +151,7 @@ class WebglRenderer {
       gl.uniform2f(at.focal, focal, focal);
       gl.uniform2f(at.size, width, height);
       gl.uniform1f(at.near, near);
+      gl.uniform1f(at.lowPass, lowPass);
       if (moved) gl.uniformMatrix4fv(at.displacement, false, moved.T);
       gl.uniform1i(at.displaced, moved ? moved.object || -1 : 0);
       gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
