@@ -42,7 +42,10 @@ class HiddenGaussianTuning(Tuning):
     """Keyframes below which each looks with all its pixels. With more, each looks with a quarter of them by turns."""
 
 
-@savable(not_saved="settings residency extra_loss fits_view_colors _rasterizer _loss _adam_of_pixel", check="check")
+@savable(
+    not_saved="settings residency extra_loss fits_view_colors _beside _rasterizer _loss _adam_of_pixel",
+    growing="between", check="check",
+)  # fmt: skip
 class CpuMapper(Mapper):
     """See `Mapper`. With the same seed, frames and iteration counts a run on one machine repeats bit for bit, for any
     number of threads.
@@ -61,6 +64,7 @@ class CpuMapper(Mapper):
         """Raises FormatError if its parts are not of the same keyframes and Gaussians: it may come from a file."""
         count = len(self.keyframes)
         check_indices("keyframes that were left out", self.left_out, count)
+        check_indices("frames between keyframes", (frame.keyframe for frame in self.between), count)
         if len(self._pose_optimizers) != count:
             raise FormatError(f"optimisers of poses: expected {count}, found {len(self._pose_optimizers)}")
         self._exposures.check(count)
@@ -98,6 +102,16 @@ class CpuMapper(Mapper):
         super().load_map(gaussians, keyframes)
         self._pose_optimizers = [PoseAdam() for _ in keyframes]
         self._exposures.load(len(keyframes))
+
+    @property
+    def keeps_between(self) -> bool:
+        alone = self.residency is None and self.extra_loss is None and not self.is_live
+        return alone and not self._is_noisy and not self.settings.exposure.enabled
+
+    def _is_plain(self, keyframe: Keyframe) -> bool:
+        exposures = self._exposures
+        steady = not exposures.changed and not exposures.blind[keyframe.index]
+        return steady and super()._is_plain(keyframe)
 
     def render_view(self, camera: Camera, T_camera_world: np.ndarray) -> RenderBuffers:
         """The map as a camera sees it from a pose [4, 4], without identities; not beside `run`."""
