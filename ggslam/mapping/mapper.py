@@ -51,7 +51,7 @@ class MapperTuning(Tuning):
     """Iterations of the final refinement per iteration before it."""
     live_end_share = 0.4
     """The same in real time."""
-    between_end_share = 2.0
+    between_end_share = 1.9
     """The same where frames between keyframes are trained on, too: more is to be learned."""
     all_pixels_end_share = 0.7
     """The same where the iterations before it used all pixels."""
@@ -436,7 +436,7 @@ class Mapper(ABC):
         if self.is_live or not before:
             return round(MapperTuning.live_end_share * before)
         own = sum(self.keyframes[k].frame_index != FROM_EARLIER_RUN for k in self._all_numbers)
-        share = MapperTuning.between_end_share if self.keeps_between and self.between else MapperTuning.end_share
+        share = MapperTuning.between_end_share if self._find_beside(self._all_numbers) else MapperTuning.end_share
         return max(round(share * before), MapperTuning.min_visits * own)
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
@@ -575,9 +575,9 @@ class Mapper(ABC):
                     progress(done, iterations)
             self._mean.move_into(self.map)
             self._bound_values()
-        self._beside = {}
         if self.fits_view_colors and (self.residency is None or self.residency.is_whole):
             self._fit_view_colors()
+        self._beside = {}
 
     def _fit_view_colors(self) -> None:  # noqa: B027
         """Gives Gaussians colours that depend on the view where keyframes ask for them; on the CPU."""

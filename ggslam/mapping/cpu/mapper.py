@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import FormatError
+from ggslam.mapping.between_frames import BetweenTuning
 from ggslam.mapping.color_changes import scale_colors, take_colors
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
@@ -106,7 +107,8 @@ class CpuMapper(Mapper):
     @property
     def keeps_between(self) -> bool:
         alone = self.residency is None and self.extra_loss is None and not self.is_live
-        return alone and not self._is_noisy and not self.settings.exposure.enabled
+        known = not self._is_noisy and self.depth_noise_px <= BetweenTuning.most_noise
+        return alone and known and not self.settings.exposure.enabled
 
     def _is_plain(self, keyframe: Keyframe) -> bool:
         exposures = self._exposures
@@ -256,18 +258,25 @@ class CpuMapper(Mapper):
         fit_view_colors(self.map, self._shown_colors, ridge, self._rasterizer.context)
 
     def _shown_colors(self) -> Iterator[ShownColors]:
-        """What the keyframes show of the Gaussians where they have measured depth: elsewhere places are guesses."""
+        """What the keyframes, and a frame beside each, show of the Gaussians where they have measured depth, or the map
+        shows something: elsewhere places are guesses."""
         for keyframe in (self.keyframes[number] for number in self._trainable()):
             if keyframe.frame_index == FROM_EARLIER_RUN:
                 continue
-            image = self._render(keyframe, features=False).image
-            missing = self._colors_of_map(keyframe) - image
-            shown = keyframe.depth > 0
-            compared = self._comparable(keyframe)
-            usable = torch.from_numpy(shown if compared is None else shown & compared).float()
-            residuals = self._rasterizer.backward(missing * usable).sh
-            weights = self._rasterizer.backward(usable.expand(3, -1, -1).contiguous()).sh
-            yield ShownColors(keyframe.T_world_camera[:3, 3], weights, residuals)
+            yield self._shown_by(keyframe, keyframe.depth > 0)
+            beside = self._beside.get(keyframe.index, [])
+            if beside:
+                yield self._shown_by(beside[len(beside) // 2].view(keyframe))
+
+    def _shown_by(self, keyframe: Keyframe, shown: np.ndarray | None = None) -> ShownColors:
+        view = self._render(keyframe, features=False)
+        missing = self._colors_of_map(keyframe) - view.image
+        shown = view.alpha.numpy() > 0.5 if shown is None else shown
+        compared = self._comparable(keyframe)
+        usable = torch.from_numpy(shown if compared is None else shown & compared).float()
+        residuals = self._rasterizer.backward(missing * usable).sh
+        weights = self._rasterizer.backward(usable.expand(3, -1, -1).contiguous()).sh
+        return ShownColors(keyframe.T_world_camera[:3, 3], weights, residuals)
 
     def _colors_of_map(self, keyframe: Keyframe) -> torch.Tensor:
         """A keyframe's colours [3, H, W] as the map's exposure shows them."""
