@@ -145,7 +145,8 @@ class CpuMapper(Mapper):
             alpha = np.where(valid, alpha, np.float32(1))  # where images show nothing there is nothing to fill
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, show))
-        context = self._rasterizer.context
+        # Others work by now: threads for the few pixels of a later keyframe would only wait for one another.
+        context = self._rasterizer.context if where is None else None
         parts = [new_gaussians(color, depth, keyframe.camera, T_world_camera, where, s, context)]
         if s.fill_stride:
             parts.append(fill_gaussians(color, depth, alpha, keyframe.camera, T_world_camera, s))
