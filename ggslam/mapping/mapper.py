@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from ggslam.mapping.between_frames import BetweenFrame, BetweenTuning, code_frame, frame_of_turn
+from ggslam.mapping.between_frames import BetweenFrame, BetweenTuning, code_frame, frame_of_turn, own_every
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
@@ -51,7 +51,7 @@ class MapperTuning(Tuning):
     """Iterations of the final refinement per iteration before it."""
     live_end_share = 0.4
     """The same in real time."""
-    between_end_share = 1.9
+    between_end_share = 2.0
     """The same where frames between keyframes are trained on, too: more is to be learned."""
     all_pixels_end_share = 0.7
     """The same where the iterations before it used all pixels."""
@@ -355,7 +355,8 @@ class Mapper(ABC):
         for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
             keyframe = self._draw(numbers)
             grid = self._choose_grid(keyframe) if self._is_noisy else self._choose_size(keyframe, done)
-            beside = frame_of_turn(keyframe.iterations, self._beside.get(keyframe.index, ()))
+            candidates = self._beside.get(keyframe.index, ())
+            beside = frame_of_turn(keyframe.iterations, candidates, own_every(keyframe.camera))
             if beside is None:
                 learns = step == 0 and self._is_identity_due(keyframe)
                 self._step(keyframe, (rate_factor, pose_factor), grid, learns, settles)
