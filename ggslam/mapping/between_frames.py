@@ -39,6 +39,8 @@ class BetweenTuning(Tuning):
     instead gains 0.04 dB on a quarter of the images of livingroom, and depth there is an eighth less accurate."""
     own_every_fine = 3
     """The same for large images, which tell themselves where edges are."""
+    depth_factor = 2.0
+    """Factor on the weight of depth in a keyframe's own visits where images are small: frames beside it have none."""
     fine_pixels = 200_000
     """Pixels of a large image."""
 
@@ -87,8 +89,16 @@ def code_frame(frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> Be
 
 def own_every(camera: Camera) -> int:
     """Every how manyth visit of a keyframe with this camera trains itself."""
-    fine = camera.width * camera.height >= BetweenTuning.fine_pixels
-    return int(BetweenTuning.own_every_fine if fine else BetweenTuning.own_every)
+    return int(BetweenTuning.own_every_fine if _is_fine(camera) else BetweenTuning.own_every)
+
+
+def depth_factor(camera: Camera) -> float:
+    """Factor on the weight of depth where a keyframe with this camera has frames beside it."""
+    return 1.0 if _is_fine(camera) else float(BetweenTuning.depth_factor)
+
+
+def _is_fine(camera: Camera) -> bool:
+    return camera.width * camera.height >= BetweenTuning.fine_pixels
 
 
 def frame_of_turn(turn: int, beside: Sequence[BetweenFrame], own: int) -> BetweenFrame | None:

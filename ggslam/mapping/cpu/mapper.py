@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
 
 from ggslam.errors import FormatError
-from ggslam.mapping.between_frames import BetweenTuning
+from ggslam.mapping.between_frames import BetweenTuning, depth_factor
 from ggslam.mapping.color_changes import scale_colors, take_colors
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
@@ -242,7 +243,10 @@ class CpuMapper(Mapper):
         color, depth = grid.color_of(keyframe.color), grid.depth_of(keyframe.depth)
         shown = None if shown is None else grid.valid_of(shown)
         target = LossTarget(color, depth, keyframe.depth_unit, self._exposure_of(keyframe), shown)
-        return self._loss.evaluate(view, target, self.settings.loss)
+        loss = self.settings.loss
+        if keyframe.index in self._beside:
+            loss = replace(loss, depth_weight=min(loss.depth_weight * depth_factor(keyframe.camera), 1e6))
+        return self._loss.evaluate(view, target, loss)
 
     def _comparable(self, keyframe: Keyframe) -> np.ndarray | None:
         """Where a keyframe's colours are compared with the map's, bool [H, W]; None: everywhere."""
@@ -264,12 +268,12 @@ class CpuMapper(Mapper):
         for keyframe in (self.keyframes[number] for number in self._trainable()):
             if keyframe.frame_index == FROM_EARLIER_RUN:
                 continue
-            yield self._shown_by(keyframe, keyframe.depth > 0)
+            yield self._show_colors(keyframe, keyframe.depth > 0)
             beside = self._beside.get(keyframe.index, [])
             if beside:
-                yield self._shown_by(beside[len(beside) // 2].view(keyframe))
+                yield self._show_colors(beside[len(beside) // 2].view(keyframe))
 
-    def _shown_by(self, keyframe: Keyframe, shown: np.ndarray | None = None) -> ShownColors:
+    def _show_colors(self, keyframe: Keyframe, shown: np.ndarray | None = None) -> ShownColors:
         view = self._render(keyframe, features=False)
         missing = self._colors_of_map(keyframe) - view.image
         shown = view.alpha.numpy() > 0.5 if shown is None else shown
