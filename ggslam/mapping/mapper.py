@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from ggslam.mapping.between_frames import BetweenFrame, BetweenTuning, code_frame, frame_of_turn, own_every
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
@@ -50,6 +51,8 @@ class MapperTuning(Tuning):
     """Iterations of the final refinement per iteration before it."""
     live_end_share = 0.4
     """The same in real time."""
+    between_end_share = 2.0
+    """The same where frames between keyframes are trained on, too: more is to be learned."""
     all_pixels_end_share = 0.7
     """The same where the iterations before it used all pixels."""
     min_visits = 10
@@ -147,6 +150,7 @@ class Mapper(ABC):
 
     keyframes: list[Keyframe]
     left_out: set[int]
+    between: list[BetweenFrame]
     _valid: dict[int, Mask | None]
 
     def __init__(
@@ -173,6 +177,9 @@ class Mapper(ABC):
         """Keeps a part of the map on disk; None: all of it is in memory."""
         self.left_out = set()
         """Numbers of the keyframes that neither train the map nor have Gaussians in it any more."""
+        self.between = []
+        """Frames between keyframes for the final refinement."""
+        self._beside: dict[int, list[BetweenFrame]] = {}
         self._valid = {}
         self.extra_loss: ExtraLoss | None = None
         """A loss of the user's own, added to the mapper's; on the CPU only."""
@@ -233,6 +240,30 @@ class Mapper(ABC):
         self.times.insertion += time.perf_counter() - start
         self.times.keyframes += 1
         return keyframe
+
+    @property
+    def keeps_between(self) -> bool:
+        """Whether the final refinement trains on frames between keyframes, if there are any. Where depth is noisy they
+        are not where they are thought to be; on the CPU, with the whole map in memory."""
+        return False
+
+    def keep_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
+        """Keeps a frame that is no keyframe, while there is memory for it; arguments as the attributes of
+        `BetweenFrame`."""
+        if self.keeps_between and sum(kept.color.nbytes for kept in self.between) < BetweenTuning.kept_bytes:
+            self.between.append(code_frame(frame, keyframe, T_keyframe_camera))
+
+    def _find_beside(self, numbers: Sequence[int]) -> dict[int, list[BetweenFrame]]:
+        """By the number of a keyframe the frames that are trained with it."""
+        found: dict[int, list[BetweenFrame]] = {}
+        for frame in self.between if self.keeps_between else ():
+            if frame.keyframe in numbers and self._is_plain(self.keyframes[frame.keyframe]):
+                found.setdefault(frame.keyframe, []).append(frame)
+        return found
+
+    def _is_plain(self, keyframe: Keyframe) -> bool:
+        """Whether frames after a keyframe can be compared with the map as they are."""
+        return keyframe.frame_index != FROM_EARLIER_RUN and keyframe.moving is None
 
     def load_map(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         """Goes on with a map made before. Keyframes without images keep their Gaussians but are never trained on."""
@@ -326,8 +357,14 @@ class Mapper(ABC):
         for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
             keyframe = self._draw(numbers)
             grid = self._choose_grid(keyframe) if self._is_noisy else self._choose_size(keyframe, done)
-            learns = step == 0 and self._is_identity_due(keyframe)
-            self._step(keyframe, (rate_factor, pose_factor), grid, learns, settles)
+            candidates = self._beside.get(keyframe.index, ())
+            beside = frame_of_turn(keyframe.iterations, candidates, own_every(keyframe.camera))
+            if beside is None:
+                learns = step == 0 and self._is_identity_due(keyframe)
+                self._step(keyframe, (rate_factor, pose_factor), grid, learns, settles)
+            else:
+                self._step(beside.view(keyframe), (rate_factor, 0.0), grid, False, settles)
+                keyframe.iterations += 1
             if not self._is_noisy or grid.is_whole:
                 break
         self._count_iteration()
@@ -402,7 +439,8 @@ class Mapper(ABC):
         if self.is_live or not before:
             return round(MapperTuning.live_end_share * before)
         own = sum(self.keyframes[k].frame_index != FROM_EARLIER_RUN for k in self._all_numbers)
-        return max(round(MapperTuning.end_share * before), MapperTuning.min_visits * own)
+        share = MapperTuning.between_end_share if self._find_beside(self._all_numbers) else MapperTuning.end_share
+        return max(round(share * before), MapperTuning.min_visits * own)
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
         """One iteration on the whole images of one keyframe.
@@ -526,6 +564,7 @@ class Mapper(ABC):
         `begin` steps were made before; between steps `progress` is told how many of how many are."""
         share, done = self._averaged_share, 0
         for numbers, steps in self._stages(iterations):
+            self._beside = self._find_beside(numbers)
             every = max(1, min(MapperTuning.average_every, int(share * steps) // MapperTuning.averaged_maps))
             for i in range(steps):
                 done += 1
@@ -542,6 +581,7 @@ class Mapper(ABC):
             self._bound_values()
         if self.fits_view_colors and (self.residency is None or self.residency.is_whole):
             self._fit_view_colors()
+        self._beside = {}
 
     def _fit_view_colors(self) -> None:  # noqa: B027
         """Gives Gaussians colours that depend on the view where keyframes ask for them; on the CPU."""

@@ -22,7 +22,7 @@ from ggslam.system.tuning import Tuning
 class OtherSizeTuning(Tuning):
     """Training at other sizes than the recording's."""
 
-    share = 0.5
+    share = 0.4
     """Part of the final refinement, its first one, of which half of the steps are on other sizes. The later ones
     sharpen the map at its own size."""
     later_every = 20

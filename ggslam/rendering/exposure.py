@@ -135,8 +135,16 @@ def measure_exposure(
         used = (x > ExposureTuning.dark) & (x < ExposureTuning.bright) & (y < ExposureTuning.bright)
         if used.sum() < ExposureTuning.min_share * known.size:
             return None
-        exposure[channel, 0] = float(np.median(y[used] / x[used]))
+        exposure[channel, 0] = _median(y[used] / x[used])
     return exposure if (exposure[:, 0] > 0).all() else None
+
+
+def _median(values: np.ndarray) -> float:
+    """The same as `np.median` of numbers [N] that are not NaN, in a fraction of its time."""
+    middle = len(values) // 2
+    parted = np.partition(values, middle)
+    upper = parted[middle]
+    return float(upper if len(values) % 2 else (parted[:middle].max() + upper) / 2)
 
 
 def relative_sharpness(color: np.ndarray, seen: SeenAgain, exposure: np.ndarray) -> float:

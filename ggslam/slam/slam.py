@@ -35,7 +35,7 @@ from ggslam.system.process_memory import trim
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.scale import scale_settings
-from ggslam.tracking.tracker import TrackingStatus
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 
 class TrimTuning(Tuning):
@@ -258,6 +258,15 @@ class Slam(RunState):
             self.poses.add(frame, tracking)
             if k not in chosen:
                 self.locator.note(frame, tracking)
+                self._keep_between(frame, tracking)
+
+    def _keep_between(self, frame: Frame, tracking: TrackingResult) -> None:
+        """Keeps the frame that `poses` took last for the final refinement, if it shows the map and nothing else."""
+        located = tracking.status in (TrackingStatus.OK, TrackingStatus.RECOVERED) and not tracking.still
+        alone = frame.instant is None and (frame.moving is None or not frame.moving.any())
+        if located and alone and self.growing and not self.config.evaluation.is_held_out(frame.index):
+            pose = self.poses.frames[-1]
+            self.mapper.keep_between(frame, pose.keyframe, pose.T_keyframe_camera)
 
     def _report(self, is_keyframe: bool, seconds: float, number: int) -> StepReport:
         """What the step did that has just ended with frame `number` of `frames` and took `seconds`; `steps` remembers

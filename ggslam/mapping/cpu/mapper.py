@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ggslam.errors import FormatError
+from ggslam.mapping.between_frames import BetweenTuning, depth_factor
 from ggslam.mapping.color_changes import scale_colors, take_colors
 from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_gaussians
@@ -50,7 +51,10 @@ class SoftOutlineTuning(Tuning):
     """Weight of depth in the loss, as a share of the usual one."""
 
 
-@savable(not_saved="settings residency extra_loss fits_view_colors _rasterizer _loss _adam_of_pixel", check="check")
+@savable(
+    not_saved="settings residency extra_loss fits_view_colors _beside _rasterizer _loss _adam_of_pixel",
+    growing="between", check="check",
+)  # fmt: skip
 class CpuMapper(Mapper):
     """See `Mapper`. With the same seed, frames and iteration counts a run on one machine repeats bit for bit, for any
     number of threads.
@@ -69,6 +73,7 @@ class CpuMapper(Mapper):
         """Raises FormatError if its parts are not of the same keyframes and Gaussians: it may come from a file."""
         count = len(self.keyframes)
         check_indices("keyframes that were left out", self.left_out, count)
+        check_indices("frames between keyframes", (frame.keyframe for frame in self.between), count)
         if len(self._pose_optimizers) != count:
             raise FormatError(f"optimisers of poses: expected {count}, found {len(self._pose_optimizers)}")
         self._exposures.check(count)
@@ -107,6 +112,17 @@ class CpuMapper(Mapper):
         self._pose_optimizers = [PoseAdam() for _ in keyframes]
         self._exposures.load(len(keyframes))
 
+    @property
+    def keeps_between(self) -> bool:
+        alone = self.residency is None and self.extra_loss is None and not self.is_live
+        known = not self._is_noisy and self.depth_noise_px <= BetweenTuning.most_noise
+        return alone and known and not self.settings.exposure.enabled
+
+    def _is_plain(self, keyframe: Keyframe) -> bool:
+        exposures = self._exposures
+        steady = not exposures.changed and not exposures.blind[keyframe.index]
+        return steady and super()._is_plain(keyframe)
+
     def render_view(self, camera: Camera, T_camera_world: np.ndarray) -> RenderBuffers:
         """The map as a camera sees it from a pose [4, 4], without identities; not beside `run`."""
         return self._rasterizer.forward(self.map, camera, T_camera_world, features=False)
@@ -137,7 +153,8 @@ class CpuMapper(Mapper):
             alpha = np.where(valid, alpha, np.float32(1))  # where images show nothing there is nothing to fill
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, show))
-        context = self._rasterizer.context
+        # Others work by now: threads for the few pixels of a later keyframe would only wait for one another.
+        context = self._rasterizer.context if where is None else None
         parts = [new_gaussians(color, depth, keyframe.camera, T_world_camera, where, s, context)]
         if s.fill_stride:
             parts.append(fill_gaussians(color, depth, alpha, keyframe.camera, T_world_camera, s))
@@ -233,7 +250,7 @@ class CpuMapper(Mapper):
         color, depth = grid.color_of(keyframe.color), grid.depth_of(keyframe.depth)
         shown = None if shown is None else grid.valid_of(shown)
         target = LossTarget(color, depth, keyframe.depth_unit, self._exposure_of(keyframe), shown)
-        return self._loss.evaluate(view, target, self._loss_settings)
+        return self._loss.evaluate(view, target, self._loss_settings(keyframe))
 
     @property
     def _insertion(self) -> InsertionSettings:
@@ -241,11 +258,15 @@ class CpuMapper(Mapper):
         s = self.settings.insertion
         return replace(s, fill_stride=min(s.fill_stride, 1)) if self.has_soft_outlines else s
 
-    @property
-    def _loss_settings(self) -> LossSettings:
-        """Terms of the loss: what smooths outlines smooths creases and relief, too, and says less of depth."""
-        s, share = self.settings.loss, SoftOutlineTuning.depth_weight_share
-        return replace(s, depth_weight=share * s.depth_weight) if self.has_soft_outlines else s
+    def _loss_settings(self, keyframe: Keyframe) -> LossSettings:
+        """Terms of the loss: what smooths outlines smooths creases and relief, too, and says less of depth; beside
+        frames without depth a keyframe's own says more."""
+        s, factor = self.settings.loss, 1.0
+        if self.has_soft_outlines:
+            factor *= SoftOutlineTuning.depth_weight_share
+        if keyframe.index in self._beside:
+            factor *= depth_factor(keyframe.camera)
+        return s if factor == 1 else replace(s, depth_weight=min(factor * s.depth_weight, 1e6))
 
     def _comparable(self, keyframe: Keyframe) -> np.ndarray | None:
         """Where a keyframe's colours are compared with the map's, bool [H, W]; None: everywhere."""
@@ -262,18 +283,25 @@ class CpuMapper(Mapper):
         fit_view_colors(self.map, self._shown_colors, ridge, self._rasterizer.context)
 
     def _shown_colors(self) -> Iterator[ShownColors]:
-        """What the keyframes show of the Gaussians where they have measured depth: elsewhere places are guesses."""
+        """What the keyframes, and a frame beside each, show of the Gaussians where they have measured depth, or the map
+        shows something: elsewhere places are guesses."""
         for keyframe in (self.keyframes[number] for number in self._trainable()):
             if keyframe.frame_index == FROM_EARLIER_RUN:
                 continue
-            image = self._render(keyframe, features=False).image
-            missing = self._colors_of_map(keyframe) - image
-            shown = keyframe.depth > 0
-            compared = self._comparable(keyframe)
-            usable = torch.from_numpy(shown if compared is None else shown & compared).float()
-            residuals = self._rasterizer.backward(missing * usable).sh
-            weights = self._rasterizer.backward(usable.expand(3, -1, -1).contiguous()).sh
-            yield ShownColors(keyframe.T_world_camera[:3, 3], weights, residuals)
+            yield self._show_colors(keyframe, keyframe.depth > 0)
+            beside = self._beside.get(keyframe.index, [])
+            if beside:
+                yield self._show_colors(beside[len(beside) // 2].view(keyframe))
+
+    def _show_colors(self, keyframe: Keyframe, shown: np.ndarray | None = None) -> ShownColors:
+        view = self._render(keyframe, features=False)
+        missing = self._colors_of_map(keyframe) - view.image
+        shown = view.alpha.numpy() > 0.5 if shown is None else shown
+        compared = self._comparable(keyframe)
+        usable = torch.from_numpy(shown if compared is None else shown & compared).float()
+        residuals = self._rasterizer.backward(missing * usable).sh
+        weights = self._rasterizer.backward(usable.expand(3, -1, -1).contiguous()).sh
+        return ShownColors(keyframe.T_world_camera[:3, 3], weights, residuals)
 
     def _colors_of_map(self, keyframe: Keyframe) -> torch.Tensor:
         """A keyframe's colours [3, H, W] as the map's exposure shows them."""

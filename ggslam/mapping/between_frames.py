@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames between keyframes that the final refinement trains on, too.
+
+A map that is trained on few images learns their noise (of JPEG, of pixels that lie on edges); frames between them have
+other noise. They are kept coded, without depth: keyframes tell where surfaces are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import numpy as np
+
+from ggslam.errors import FormatError
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse
+from ggslam.system.array_forms import Form, MaybeNan, Pose
+from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
+
+
+class BetweenTuning(Tuning):
+    """Training on frames between keyframes."""
+
+    most_noise = 0.15
+    """Noise of depth in the image, pixels, from which poses are not known well enough. Exact depth at 640x480 has 0.05,
+    a phone 0.19, a Kinect 0.9."""
+    jpeg_quality = 95
+    """JPEG quality of kept images, of 100. A map trained on them is within 0.001 dB of one trained on the originals."""
+    kept_bytes = 40 << 20
+    """Most bytes of kept images. Keyframes that come later have no frames beside them."""
+    own_every = 2
+    """A keyframe is trained itself every so manyth of its visits, else a frame beside it, which teaches colours only: 3
+    instead gains 0.04 dB on a quarter of the images of livingroom, and depth there is an eighth less accurate."""
+    own_every_fine = 3
+    """The same for large images, which tell themselves where edges are."""
+    depth_factor = 2.0
+    """Factor on the weight of depth in a keyframe's own visits where images are small: frames beside it have none."""
+    fine_pixels = 200_000
+    """Pixels of a large image."""
+
+
+@savable(fixed="color")
+@dataclass(frozen=True)
+class BetweenFrame:
+    """A frame that was located and is no keyframe.
+
+    Attributes:
+        keyframe: number of the keyframe that its pose hangs on.
+        T_keyframe_camera: float64 [4, 4], its pose relative to that keyframe.
+        color: its colours as a JPEG file, uint8.
+    """
+
+    frame_index: int
+    timestamp: MaybeNan
+    keyframe: int
+    T_keyframe_camera: Pose
+    color: Annotated[np.ndarray, Form("u1", None)]
+
+    def view(self, keyframe: Keyframe) -> Keyframe:
+        """The frame as a keyframe without depth, with the number of the one that it hangs on.
+
+        Raises:
+            FormatError: its image is not of the keyframe's size: it may come from a file.
+        """
+        size = (keyframe.camera.height, keyframe.camera.width)
+        image = cv2.imdecode(self.color, cv2.IMREAD_COLOR) if len(self.color) else None
+        if image is None or image.shape[:2] != size:
+            raise FormatError("frames between keyframes: the image of one is not of this recording")
+        return Keyframe(
+            keyframe.index, self.frame_index, self.timestamp, keyframe.camera, cv2.cvtColor(image, cv2.COLOR_BGR2RGB),
+            np.zeros(size, np.uint16), inverse(keyframe.T_world_camera @ self.T_keyframe_camera),
+            camera_number=keyframe.camera_number, depth_unit=keyframe.depth_unit,
+        )  # fmt: skip
+
+
+def code_frame(frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> BetweenFrame:
+    """A frame as it is kept; arguments as the attributes of `BetweenFrame`."""
+    how = [cv2.IMWRITE_JPEG_QUALITY, BetweenTuning.jpeg_quality]
+    how += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]  # hues as sharp as grey values
+    coded = cv2.imencode(".jpg", cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR), how)[1]
+    return BetweenFrame(frame.index, frame.timestamp, keyframe, T_keyframe_camera, coded.reshape(-1))
+
+
+def own_every(camera: Camera) -> int:
+    """Every how manyth visit of a keyframe with this camera trains itself."""
+    return int(BetweenTuning.own_every_fine if _is_fine(camera) else BetweenTuning.own_every)
+
+
+def depth_factor(camera: Camera) -> float:
+    """Factor on the weight of depth where a keyframe with this camera has frames beside it."""
+    return 1.0 if _is_fine(camera) else float(BetweenTuning.depth_factor)
+
+
+def _is_fine(camera: Camera) -> bool:
+    return camera.width * camera.height >= BetweenTuning.fine_pixels
+
+
+def frame_of_turn(turn: int, beside: Sequence[BetweenFrame], own: int) -> BetweenFrame | None:
+    """What the `turn`-th visit of a keyframe with these frames beside it trains; None: the keyframe itself, on every
+    `own`-th visit and if there are none."""
+    if turn % own == 0 or not beside:
+        return None
+    return beside[(turn - turn // own - 1) % len(beside)]
