@@ -7,6 +7,7 @@
 #   TORCH=...    what to install first (default: torch==2.13.0), so that nothing else chooses another build of it
 #   PYTHONS=...  Pythons to install the wheel for, one after another (default: python3)
 #   DEMO=1       runs the README's first commands, too: minutes for each Python
+#   BUILT=1      takes what is in FOLDER/dist
 set -eu
 cd "$(dirname "$0")/.."
 root=$PWD
@@ -15,9 +16,10 @@ work=${FOLDER:-$(mktemp -d)}
 mkdir -p "$work"
 [ -n "${FOLDER:-}" ] || trap 'rm -rf "$work"' EXIT
 python=${PYTHON:-python3}
-FOLDER=$work bash scripts/build_wheels.sh
+[ -n "${BUILT:-}" ] || FOLDER=$work bash scripts/build_wheels.sh
+wheel=$(echo "$work"/dist/*"$(uname -m)".whl)
 
-"$python" - "$work"/dist/*.whl "$work"/dist/*.tar.gz <<'CHECK'
+"$python" - "$wheel" "$work"/dist/*.tar.gz <<'CHECK'
 import sys, tarfile, zipfile
 from pathlib import Path
 
@@ -53,7 +55,7 @@ use_in_empty_environment() {  # $1: a Python
   install() { PATH="$bin" "$bin/python" -m pip install -q --disable-pip-version-check --only-binary=:all: "$@"; }
   ggslam() { PATH="$bin" "$bin/ggslam" "$@"; }
   install "${TORCH:-torch==2.13.0}"
-  install "$work"/dist/*.whl
+  install "$wheel"
   rm -rf "$work/away" && mkdir "$work/away" && cd "$work/away"
   ggslam doctor
   ggslam synth room --frames 12 --width 160 --height 120
