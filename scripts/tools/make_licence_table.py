@@ -25,6 +25,13 @@ LESSER = re.compile(r"LGPL|Lesser", re.I)
 ONLY_TESTS = ("test", "dev", "docs", "bench", "browser")
 
 
+WHEELS = [
+    "The wheels of `scripts/build_wheels.sh` also hold parts of GCC's C++ library (libstdc++: GPL-3.0-or-later WITH",
+    "GCC-exception-3.1). The exception lets compiled programs that contain it have any licence.",
+]
+"""Lines of the page on what is linked into the core."""
+
+
 def requirements() -> dict[str, list[str]]:
     """Extra ("" for the core) -> packages it names."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -78,7 +85,7 @@ def main() -> None:
                  "written by `scripts/tools/make_licence_table.py`.", "", "| package | needed by | licence |",
                  "|---|---|---|"]  # fmt: skip
         lines += [f"| {name} | {extra} | {licence} |" for name, extra, licence in table]
-        PAGE.write_text("\n".join([*lines, ""]))
+        PAGE.write_text("\n".join([*lines, "", *WHEELS, ""]))
         print(f"{PAGE}: {len(table)} packages")
     sys.exit(1 if problems(table) else 0)
 

@@ -49,7 +49,9 @@ class PlaneColors {
   bool is_shade_of(std::size_t bin, std::size_t other) const {
     const auto &own = means_[bin], &usual = means_[other];
     const double shade = own[0] / std::max(usual[0], 1.0);
-    return std::hypot(own[1] - usual[1], own[2] - usual[2]) < job_.same_hue && shade > job_.darkest && shade < job_.brightest;
+    // Squares, not std::hypot: the C library rounded that otherwise before glibc 2.35.
+    const double u = own[1] - usual[1], v = own[2] - usual[2];
+    return u * u + v * v < job_.same_hue * job_.same_hue && shade > job_.darkest && shade < job_.brightest;
   }
 
  private:

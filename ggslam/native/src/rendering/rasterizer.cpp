@@ -111,7 +111,7 @@ bool allot_pairs(Rasterizer& r) {
 
 Status forward(Rasterizer& r, const GaussianArrays& gaussians, const CameraView& view, const RenderTargets& targets) {
   prepare(r, gaussians, view);
-  const Isa isa = r.context.isa;
+  [[maybe_unused]] const Isa isa = r.context.isa;
   ThreadPool& pool = r.context.pool;
   const auto project = GGSLAM_DISPATCH(isa, project_block);
   const auto scatter = GGSLAM_DISPATCH(isa, scatter_block);
@@ -127,7 +127,7 @@ Status forward(Rasterizer& r, const GaussianArrays& gaussians, const CameraView&
 
 Status backward(Rasterizer& r, const ImageGradients& image_gradients, const GaussianGradients& gradients,
                 const AdamArguments* adam) {
-  const Isa isa = r.context.isa;
+  [[maybe_unused]] const Isa isa = r.context.isa;
   ThreadPool& pool = r.context.pool;
   const auto differentiate = GGSLAM_DISPATCH(isa, backward_tile);
   const auto gather = GGSLAM_DISPATCH(isa, gather_block);

@@ -345,7 +345,7 @@ GGSLAM_EXPORT double ggslam_gicp_linearize(void* context_, const void* target_, 
                                            const ggslam::AlignSettings* settings, int level, const double* pose,
                                            int32_t* match, float* squared_distance, double* h, double* b) try {
   using namespace ggslam;
-  const auto& context = object_of<Context>(context_);
+  [[maybe_unused]] const auto& context = object_of<Context>(context_);
   const auto& target = check_target(target_);
   check_points(points, settings, match, squared_distance);
   check_within("pose", pose, 12, 1e9);
