@@ -36,11 +36,15 @@ class BetweenTuning(Tuning):
     """Most bytes of kept images. Keyframes that come later have no frames beside them."""
     own_every = 2
     """A keyframe is trained itself every so manyth of its visits, else a frame beside it, which teaches colours only: 3
-    instead gains 0.04 dB on a quarter of the images of livingroom, and depth there is an eighth less accurate."""
-    own_every_fine = 3
-    """The same for large images, which tell themselves where edges are."""
+    instead gains 0.04 dB, and depth is an eighth less accurate."""
     depth_factor = 2.0
-    """Factor on the weight of depth in a keyframe's own visits where images are small: frames beside it have none."""
+    """Factor on the weight of depth in a keyframe's own visits: frames beside it have none."""
+    depth_factor_fine = 1.6
+    """The same for large images, which tell themselves where edges are."""
+    end_share = 2.0
+    """Iterations of the final refinement per iteration before it: with more images there is more to be learned."""
+    end_share_fine = 3.0
+    """The same for large images."""
     fine_pixels = 200_000
     """Pixels of a large image."""
 
@@ -87,23 +91,25 @@ def code_frame(frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> Be
     return BetweenFrame(frame.index, frame.timestamp, keyframe, T_keyframe_camera, coded.reshape(-1))
 
 
-def own_every(camera: Camera) -> int:
-    """Every how manyth visit of a keyframe with this camera trains itself."""
-    return int(BetweenTuning.own_every_fine if _is_fine(camera) else BetweenTuning.own_every)
-
-
 def depth_factor(camera: Camera) -> float:
     """Factor on the weight of depth where a keyframe with this camera has frames beside it."""
-    return 1.0 if _is_fine(camera) else float(BetweenTuning.depth_factor)
+    return float(BetweenTuning.depth_factor_fine if _is_fine(camera) else BetweenTuning.depth_factor)
+
+
+def end_share(camera: Camera) -> float:
+    """Iterations of the final refinement per iteration before it where keyframes with this camera have frames beside
+    them."""
+    return float(BetweenTuning.end_share_fine if _is_fine(camera) else BetweenTuning.end_share)
 
 
 def _is_fine(camera: Camera) -> bool:
     return camera.width * camera.height >= BetweenTuning.fine_pixels
 
 
-def frame_of_turn(turn: int, beside: Sequence[BetweenFrame], own: int) -> BetweenFrame | None:
+def frame_of_turn(turn: int, beside: Sequence[BetweenFrame]) -> BetweenFrame | None:
     """What the `turn`-th visit of a keyframe with these frames beside it trains; None: the keyframe itself, on every
-    `own`-th visit and if there are none."""
+    second visit (`BetweenTuning.own_every`) and if there are none."""
+    own = BetweenTuning.own_every
     if turn % own == 0 or not beside:
         return None
     return beside[(turn - turn // own - 1) % len(beside)]

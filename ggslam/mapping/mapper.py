@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from ggslam.mapping.between_frames import BetweenFrame, BetweenTuning, code_frame, frame_of_turn, own_every
+from ggslam.mapping.between_frames import BetweenFrame, BetweenTuning, code_frame, end_share, frame_of_turn
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
@@ -51,8 +51,6 @@ class MapperTuning(Tuning):
     """Iterations of the final refinement per iteration before it."""
     live_end_share = 0.4
     """The same in real time."""
-    between_end_share = 2.0
-    """The same where frames between keyframes are trained on, too: more is to be learned."""
     all_pixels_end_share = 0.7
     """The same where the iterations before it used all pixels."""
     min_visits = 10
@@ -358,7 +356,7 @@ class Mapper(ABC):
             keyframe = self._draw(numbers)
             grid = self._choose_grid(keyframe) if self._is_noisy else self._choose_size(keyframe, done)
             candidates = self._beside.get(keyframe.index, ())
-            beside = frame_of_turn(keyframe.iterations, candidates, own_every(keyframe.camera))
+            beside = frame_of_turn(keyframe.iterations, candidates)
             if beside is None:
                 learns = step == 0 and self._is_identity_due(keyframe)
                 self._step(keyframe, (rate_factor, pose_factor), grid, learns, settles)
@@ -439,7 +437,8 @@ class Mapper(ABC):
         if self.is_live or not before:
             return round(MapperTuning.live_end_share * before)
         own = sum(self.keyframes[k].frame_index != FROM_EARLIER_RUN for k in self._all_numbers)
-        share = MapperTuning.between_end_share if self._find_beside(self._all_numbers) else MapperTuning.end_share
+        beside = self._find_beside(self._all_numbers)
+        share = end_share(self.keyframes[min(beside)].camera) if beside else MapperTuning.end_share
         return max(round(share * before), MapperTuning.min_visits * own)
 
     def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:

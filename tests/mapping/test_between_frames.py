@@ -55,11 +55,9 @@ def test_a_frame_follows_its_keyframe(exact: Path) -> None:
 
 def test_a_keyframe_and_the_frames_beside_it_take_turns(exact: Path) -> None:
     frames = [code_frame(open_sequence(exact).frame(k), 0, np.eye(4)) for k in range(3)]
-    turns = [frame_of_turn(turn, frames, 2) for turn in range(8)]
+    turns = [frame_of_turn(turn, frames) for turn in range(8)]
     assert turns == [None, frames[0], None, frames[1], None, frames[2], None, frames[0]]
-    thirds = [frame_of_turn(turn, frames, 3) for turn in range(7)]
-    assert thirds == [None, frames[0], frames[1], None, frames[2], frames[0], None]
-    assert frame_of_turn(1, [], 2) is None
+    assert frame_of_turn(1, []) is None
 
 
 def test_frames_that_are_neither_keyframes_nor_held_out_are_kept(exact: Path) -> None:
