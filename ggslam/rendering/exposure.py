@@ -164,6 +164,10 @@ def relative_sharpness(color: np.ndarray, seen: SeenAgain, exposure: np.ndarray)
 
 def without_exposure(color: np.ndarray, exposure: np.ndarray) -> np.ndarray:
     """The colours uint8 [H, W, 3] as they would have been seen with the map's own exposure."""
+    return np.clip(exactly_without_exposure(color, exposure) + np.float32(0.5), 0, 255).astype(np.uint8)
+
+
+def exactly_without_exposure(color: np.ndarray, exposure: np.ndarray) -> np.ndarray:
+    """The same neither rounded nor kept within 0 and 255, float32 [H, W, 3]."""
     gain, offset = exposure.astype(np.float32).T
-    restored = (color.astype(np.float32) - np.float32(255) * offset) / gain
-    return np.clip(restored + np.float32(0.5), 0, 255).astype(np.uint8)
+    return (color.astype(np.float32) - np.float32(255) * offset) / gain

@@ -27,7 +27,7 @@ from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.settings import InsertionSettings, LossSettings, MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.exposure import SeenAgain
+from ggslam.rendering.exposure import SeenAgain, exactly_without_exposure
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -305,11 +305,9 @@ class CpuMapper(Mapper):
 
     def _colors_of_map(self, keyframe: Keyframe) -> torch.Tensor:
         """A keyframe's colours [3, H, W] as the map's exposure shows them."""
-        colors, exposure = keyframe.color.transpose(2, 0, 1) / np.float32(255), self._exposure_of(keyframe)
-        if exposure is not None:
-            gain, offset = exposure.astype(np.float32).T[:, :, None, None]
-            colors = (colors - offset) / gain
-        return torch.from_numpy(np.ascontiguousarray(colors))
+        exposure = self._exposure_of(keyframe)
+        colors = keyframe.color if exposure is None else exactly_without_exposure(keyframe.color, exposure)
+        return torch.from_numpy(np.ascontiguousarray(colors.transpose(2, 0, 1) / np.float32(255)))
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
         if pose_rate:
