@@ -101,7 +101,7 @@ def test_beside_soft_outlines_every_pixel_becomes_a_gaussian(soft: bool) -> None
     mapper = slam.mapper
     assert isinstance(mapper, CpuMapper) and mapper.has_soft_outlines == soft
     assert mapper._insertion.fill_stride == (1 if soft else mapper.settings.insertion.fill_stride)
-    share = mapper._loss_settings.depth_weight / mapper.settings.loss.depth_weight
+    share = mapper._loss_settings(mapper.keyframes[0]).depth_weight / mapper.settings.loss.depth_weight
     assert share == pytest.approx(SoftOutlineTuning.depth_weight_share if soft else 1)
     missing = (mapper.keyframes[0].depth_m() == 0).sum()
     assert not soft or len(mapper.map) > 0.98 * 240 * 320 > 240 * 320 - missing

@@ -189,7 +189,8 @@ def test_nothing_is_drawn_before_the_order_or_while_nothing_changes(browser: Any
     shots = """const shown = map.renderer.onframe; let frames = 0;
       map.renderer.onframe = (...values) => { frames++; shown(...values); };"""
     idle = f"""{shots} const rest = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
-      for (let k = 0, before = -1; k < 40 && before !== frames; k++) {{ before = frames; await rest(500); }}
+      for (let k = 0, quiet = 0, before = -1; k < 60 && quiet < 3; k++) {{
+        quiet = before === frames ? quiet + 1 : 0; before = frames; await rest(500); }}
       frames = 0; await rest(500); return frames"""
     assert m.ask(browser, idle) == 0
     early = """const canvas = document.createElement("canvas"); map.canvas.before(canvas);
