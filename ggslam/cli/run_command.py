@@ -86,7 +86,7 @@ Iterations = Annotated[int | None, typer.Option(help="Mapping iterations per fra
 Refine = Annotated[
     int | None,
     typer.Option(
-        help="Mapping iterations after the last frame (default: 1.3 x the iterations so far, more for few frames)."
+        help="Mapping iterations after the last frame (default: 1.3 to 3 x the iterations so far, more for few frames)."
     ),
 ]
 Realtime = Annotated[
