@@ -5,7 +5,7 @@
     python scripts/papers/replica.py --batch runs/Replica    # ours from `ggslam batch --replica X --by-paper-rules`
     python scripts/papers/replica.py --check                 # whether the page's published figures are the code's
 
-The other scripts of this folder print one paper each; what they wrote with `--out docs/papers` follows on the page.
+The other scripts of this folder print a paper each; what they wrote with `--out docs/papers` follows on the page.
 """
 
 from __future__ import annotations
@@ -38,10 +38,13 @@ this page. A dash says that a figure was not made here. GG-SLAM's own figures ar
 them.
 """
 OTHERS = """
-# Other papers
+## Other papers
 
-Each section is printed by the script of its name in `scripts/papers/`. A dash under "published" is a figure that is not
-in the code; recordings of the papers that are not to be had are replaced by generated ones, which the rows name.
+The other scripts in `scripts/papers/` print a paper each, ours beside what is published (`--quick`: less of
+everything): `gg_slam.py` (schedules of learning objects, real time with objects), `embedded.py` (odometry by 100
+frames, coding by quantiser and scale), `octomap_quantised.py`, `srt_pm.py` (partial maps) and `gpu_mapping.py`. A dash
+under "published" is a figure that is not in the code; recordings that are not to be had are replaced by generated
+ones, which the rows name. What they wrote with `--out docs/papers` {what}.
 
 """
 
@@ -49,7 +52,8 @@ in the code; recordings of the papers that are not to be had are replaced by gen
 def sections(folder: Path) -> str:
     """What the other scripts wrote, in the order of their names."""
     papers = [Paper(**json.loads(path.read_text())) for path in sorted(folder.glob("*.json"))]
-    return OTHERS + "\n".join(paper.markdown() for paper in papers) if papers else ""
+    what = "follows" if papers else "would follow here; nothing yet"
+    return OTHERS.format(what=what) + "\n".join(paper.markdown() for paper in papers)
 
 
 def own_figures(batch: Path | None, paper: Published) -> dict[str, str]:

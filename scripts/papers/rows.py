@@ -48,7 +48,7 @@ class Paper:
         """The section of the page."""
         lines = ["| table | row | published | ours | remark |", "| --- | --- | --- | --- | --- |"]
         lines += ["| " + " | ".join(row) + " |" for row in self.rows]
-        return f"## {self.title}\n\n`{self.name}.py`. {self.conditions}\n\n" + "\n".join(lines) + "\n"
+        return f"### {self.title}\n\n`{self.name}.py`. {self.conditions}\n\n" + "\n".join(lines) + "\n"
 
 
 def options(text: str | None) -> argparse.ArgumentParser:
