@@ -13,7 +13,6 @@ from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import MapperSettings
 from ggslam.native.loader import NativeContext
-from ggslam.rendering.exposure import identity_exposure
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.tuning import Tuning
 
@@ -97,9 +96,6 @@ class StillMapper(CpuMapper):
 
     def valid_of(self, keyframe: Keyframe) -> np.ndarray | None:
         return self._counted[keyframe.index]
-
-    def _is_exposed(self, keyframe: Keyframe) -> bool:
-        return bool((keyframe.exposure != identity_exposure()).any())
 
     def _finish_step(self, keyframe: Keyframe, twist: np.ndarray, loss: CpuLossResult, pose_rate: float) -> None:
         exposure = keyframe.exposure

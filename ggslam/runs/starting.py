@@ -166,6 +166,7 @@ def _with_images(
     for keyframe, record in zip(keyframes[first:], records, strict=True):
         frame = sequence.frame(record.frame, masks=with_masks)
         made = make_keyframe(keyframe.index, frame, keyframe.T_world_camera)
+        made.exposure = record.known_exposure
         out.append(replace(made, frame_index=FROM_EARLIER_RUN, iterations=record.iterations, instant=None))
     return out
 

@@ -55,7 +55,7 @@ class MergedRun:
     Attributes:
         sources: the runs.
         poses: where their keyframes were put.
-        keyframes: of all runs, with their final poses.
+        keyframes: of all runs, with their final poses and exposures.
         gaussians: the map; `birth_keyframe` counts `keyframes`.
         objects: of the map.
         doubles: Gaussians of each run that were left out.
@@ -144,7 +144,8 @@ class MergedRun:
                 keyframes.append(old.model_copy(update={
                     "index": new.index, "frame": frame,
                     "timestamp": None if old.timestamp is None else old.timestamp + source.time_shift_s,
-                    "T_world_camera": new.T_world_camera, "iterations": old.iterations + new.iterations,
+                    "T_world_camera": new.T_world_camera, "exposure": new.exposure,
+                    "iterations": old.iterations + new.iterations,
                 }))  # fmt: skip
             for f in source.record.frames:
                 frames.append(f.model_copy(update={

@@ -26,7 +26,7 @@ class TrainedSeams:
     """Result of training at the seams.
 
     Attributes:
-        keyframes: of all runs, as training left their poses.
+        keyframes: of all runs, as training left their poses and exposures.
         count: of those that were trained on.
         steps: that were made.
         notes: what the user should know.
@@ -102,6 +102,7 @@ def keyframes_of(
                 frame = replace(frame, index=source.first_frame + record.frame, mask=mask, instant=None)
                 keyframe = make_keyframe(index, frame, T)
                 trained.append(index)
+            keyframe.exposure = record.known_exposure
             keyframes.append(keyframe)
     return keyframes, trained
 

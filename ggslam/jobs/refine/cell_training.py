@@ -13,7 +13,7 @@ import torch
 from ggslam.jobs.refine.cell_mapper import CellBox, CellMapper, CellView
 from ggslam.jobs.refine.settings import RefineSettings
 from ggslam.jobs.submaps.cell_gaussians import arrays_of_map, gaussians_from_bytes, gaussians_to_bytes, map_of_arrays
-from ggslam.jobs.submaps.visit_records import exposure_of, recording_of
+from ggslam.jobs.submaps.visit_records import recording_of
 from ggslam.jobs.tasks.processors import own_threads
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.native.loader import NativeContext
@@ -105,7 +105,7 @@ def _views(task: CellTask, record: VisitRecord, sequence: Sequence) -> tuple[lis
         if view.shown.mean() < task.settings.share or not view.shown.any():
             continue
         keyframe = make_keyframe(len(keyframes), frame, known.T_world_camera)
-        keyframe.exposure = exposure_of(known).copy()
+        keyframe.exposure = known.known_exposure
         keyframes.append(keyframe)
         views.append(view)
     return keyframes, views

@@ -14,7 +14,6 @@ from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.geometry.scene_size import scene_scale
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.refine.settings import RefineSettings
-from ggslam.jobs.submaps.visit_records import exposure_of
 from ggslam.mapping.finished import StillMapper
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, make_keyframe
 from ggslam.mapping.scale import scale_settings
@@ -129,7 +128,7 @@ def _read_keyframes(
         if record.frame != FROM_EARLIER_RUN:
             frame = sequence.frame(record.frame, masks=False)
             keyframe = make_keyframe(len(keyframes), frame, record.T_world_camera)
-            keyframe.exposure = exposure_of(record).copy()
+            keyframe.exposure = record.known_exposure
             keyframes.append(keyframe)
             valid.append(frame.valid)
         observer.advance(done, len(known))

@@ -9,14 +9,10 @@ import logging
 from collections.abc import Collection
 from functools import lru_cache
 
-import numpy as np
-
 from ggslam.errors import ConfigError, GgslamError
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN
-from ggslam.rendering.exposure import identity_exposure
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recorded
-from ggslam.runs.records.keyframes import KeyframeRecord
 from ggslam.runs.records.visit import VisitRecord
 from ggslam.sequences import Sequence
 from ggslam.slam.config import config_to_dict
@@ -25,11 +21,6 @@ from ggslam.submaps.visit_files import read_visit, visit_file, write_visit
 from ggslam.system.untrusted_files import printable
 
 _log = logging.getLogger(__name__)
-
-
-def exposure_of(keyframe: KeyframeRecord) -> np.ndarray:
-    """Gain and offset of each colour channel, [3, 2]."""
-    return identity_exposure() if keyframe.exposure is None else keyframe.exposure
 
 
 def remember_run(store: GridStore, folder: RunFolder) -> None:

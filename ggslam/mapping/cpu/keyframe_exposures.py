@@ -73,9 +73,13 @@ class KeyframeExposures:
         if counts != [count] * 3:
             raise FormatError(f"exposures: expected those of {quantity(count, 'keyframe')}, found {counts}")
 
-    def load(self, count: int) -> None:
-        """Starts with so many keyframes of an earlier run, whose exposures are what they are."""
-        self.optimizers = [ExposureAdam(self.settings) for _ in range(count)]
+    def load(self, keyframes: Sequence[Keyframe]) -> None:
+        """Starts with keyframes of an earlier run: their exposures are what they are, and stay about there."""
+        count = len(keyframes)
+        self.optimizers = [ExposureAdam(self.settings) for _ in keyframes]
+        for optimizer, keyframe in zip(self.optimizers, keyframes, strict=True):
+            optimizer.anchor, optimizer.measured = keyframe.exposure.copy(), keyframe.exposure.copy()
+        self.changed = any(optimizer.is_anchored for optimizer in self.optimizers)
         self.known, self.blind, self.found_lit = [True] * count, [False] * count, count > 0
 
     def add(self) -> None:

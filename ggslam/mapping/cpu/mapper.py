@@ -110,7 +110,7 @@ class CpuMapper(Mapper):
     def load_map(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         super().load_map(gaussians, keyframes)
         self._pose_optimizers = [PoseAdam() for _ in keyframes]
-        self._exposures.load(len(keyframes))
+        self._exposures.load(keyframes)
 
     @property
     def keeps_between(self) -> bool:

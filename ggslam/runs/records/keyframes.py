@@ -35,6 +35,11 @@ class KeyframeRecord(Record):
     iterations: int = 0
 
     @property
+    def known_exposure(self) -> np.ndarray:
+        """Its exposure, a copy; the map's own if none is recorded."""
+        return identity_exposure() if self.exposure is None else self.exposure.copy()
+
+    @property
     def is_exposed(self) -> bool:
         """Whether it has another exposure than the map."""
         return self.exposure is not None and bool((self.exposure != identity_exposure()).any())

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes where maps of several runs meet."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ggslam.jobs.merge.seams import keyframes_of
+from ggslam.mapping.cpu.mapper import CpuMapper
+from ggslam.mapping.finished import load_finished
+from ggslam.mapping.settings import MapperSettings
+from ggslam.merging.objects import UnitedObjects
+from ggslam.merging.settings import MergeSettings
+from ggslam.native.loader import NativeContext
+from ggslam.rendering.exposure import identity_exposure
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.recordings import open_recording_of
+from ggslam.scene.gaussian_map import GaussianMap
+
+
+def test_keyframes_at_seams_keep_their_exposures(room_run: RunFolder) -> None:
+    """Those that are trained on are compared with the map in their own."""
+    record, sequence, dark = room_run.keyframes(), open_recording_of(room_run), identity_exposure() * [0.6, 1]
+    known = [k.model_copy(update={"exposure": dark if number else None}) for number, k in enumerate(record.keyframes)]
+    assert len(known) > 2
+    source: Any = SimpleNamespace(
+        record=record.model_copy(update={"keyframes": known}), sequence=sequence, first_frame=0, first_keyframe=0,
+        known=SimpleNamespace(cameras=[sequence.camera] * len(known)),
+    )  # fmt: skip
+    seam = np.arange(len(known)) < 2
+    poses = np.stack([k.T_world_camera for k in known])
+    found, trained = keyframes_of([source], [poses], [seam], False, UnitedObjects(MergeSettings().uniting))
+    assert trained == [0, 1]
+    assert np.array_equal([k.exposure for k in found], [identity_exposure(), *[dark] * (len(known) - 1)])
+    mapper = CpuMapper(GaussianMap(), MapperSettings(), NativeContext(1))
+    load_finished(mapper, mapper.map, found)
+    assert mapper._exposure_of(found[0]) is None and mapper._exposure_of(found[1]) is found[1].exposure
