@@ -65,13 +65,15 @@ class StillMapper(CpuMapper):
         context: threads.
         keyframes: numbered from 0.
         valid: of each keyframe the pixels that count, bool [H, W]; None: all.
+        fits_view_colors: as the attribute of `Mapper`.
     """
 
     def __init__(
         self, gaussians: GaussianMap, settings: MapperSettings, context: NativeContext, keyframes: list[Keyframe],
-        valid: Sequence[np.ndarray | None],
+        valid: Sequence[np.ndarray | None], fits_view_colors: bool = False,
     ) -> None:  # fmt: skip
         super().__init__(gaussians, settings, context)
+        self.fits_view_colors = fits_view_colors
         load_finished(self, gaussians, keyframes)
         self._counted = valid
 
@@ -90,6 +92,8 @@ class StillMapper(CpuMapper):
             found.setdefault(keyframe.index, []).append(self.last_psnr)
 
         train_by_turns(self, range(len(self.keyframes)), steps, seed, note, progress)
+        if self.fits_view_colors and steps:
+            self._fit_view_colors()
         ends = [(values[0], values[-1]) for values in found.values() if len(values) > 1]
         before, after = np.mean(ends, axis=0) if ends else (np.nan, np.nan)
         return float(before), float(after)

@@ -107,8 +107,9 @@ def _refine(
     scene = source.segmented_map() if source.has_objects() else None
     gaussians = source.gaussians(with_moments=True)
     scale = scene_scale(keyframes[0].depth_m()) if keyframes else 1.0  # as the run itself did
-    trained_by = scale_settings(source.config().mapping, scale)
-    mapper = StillMapper(gaussians, trained_by, NativeContext(), keyframes, valid)
+    config = source.config()
+    trained_by = scale_settings(config.mapping, scale)
+    mapper = StillMapper(gaussians, trained_by, NativeContext(), keyframes, valid, config.fits_view_colors)
     observer.begin("refine", settings.steps)
     before, after = mapper.train(settings.steps, [settings.seed], observer.advance)
     refined = None if scene is None else SegmentedMap(gaussians, scene.classifier, scene.table, scene.votes)
