@@ -80,3 +80,12 @@ def test_colours_that_are_fitted_are_not_trained(trained: GaussianMap) -> None:
     still.train(2, [0])
     still.train(0, [0])
     assert calls == [len(still.map)]
+
+
+@pytest.mark.parametrize("steps", [1, 20, 50])
+def test_few_steps_do_no_harm(trained: GaussianMap, steps: int) -> None:
+    """The map is the mean of many; what is said of it is true of the map before the first step and after the last."""
+    still = StillMapper(trained.copy("cpu"), MapperSettings(), NativeContext(2), keyframes(1, 1), [None, None])
+    before, after = still.train(steps, [0])
+    assert before == pytest.approx(psnr(trained), abs=0.2) and after == pytest.approx(psnr(still.map), abs=0.2)
+    assert after > before - 0.1

@@ -118,9 +118,13 @@ class CellMapper(StillMapper):
         """Of the pixels that show the cell."""
         return self._own_psnr
 
-    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
+    def _psnr_of(self, keyframe: Keyframe) -> float:
+        super()._psnr_of(keyframe)
+        return self._own_psnr
+
+    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0, settles: bool = False) -> None:
         """One step; see `Mapper.iterate`."""
-        super().iterate(keyframe, rate_factor)
+        super().iterate(keyframe, rate_factor, settles)
         for name, values in self._others.items():
             getattr(self.map, name)[self._own :] = values
         self._box.clamp(self.map.means[: self._own])

@@ -56,8 +56,8 @@ class TrainedCell:
         data: its part with Gaussians.
         count: of them.
         views: keyframes that it was trained on; none: the cell is as it was.
-        before, after: PSNR of the pixels that show it, of each keyframe the first and the last time it was trained on,
-            mean in dB; NaN without steps.
+        before, after: PSNR of the pixels that show it, before the first step and after the last one, mean in dB over
+            the keyframes or some of them; NaN without steps.
     """
 
     key: CellKey

@@ -47,7 +47,7 @@ class RunRefinement:
         folder: the refined run.
         keyframes: that it was trained on.
         steps: optimisation steps.
-        before, after: PSNR of keyframes the first and the last time they were trained on, mean in dB.
+        before, after: PSNR of keyframes, or some of them, before the first step and after the last one, mean in dB.
         seconds: that it took.
         notes: what the user should know.
     """
