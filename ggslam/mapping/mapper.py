@@ -441,15 +441,20 @@ class Mapper(ABC):
         share = end_share(self.keyframes[min(beside)].camera) if beside else MapperTuning.end_share
         return max(round(share * before), MapperTuning.min_visits * own)
 
-    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
+    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0, settles: bool = False) -> None:
         """One iteration on the whole images of one keyframe.
 
         Args:
             keyframe: what to train on.
             rate_factor: multiplies every learning rate.
+            settles: whether Gaussians are about where they belong: steps of means and standard deviations are shorter.
         """
-        self._step(keyframe, (rate_factor, rate_factor), ALL_PIXELS, self._is_identity_due(keyframe))
+        self._step(keyframe, (rate_factor, rate_factor), ALL_PIXELS, self._is_identity_due(keyframe), settles)
         self._count_iteration()
+
+    def average(self) -> None:
+        """The map as it is joins those whose mean `end_refinement` makes of it."""
+        self._mean.add(self.map)
 
     def _step(
         self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
@@ -586,7 +591,7 @@ class Mapper(ABC):
         """Gives Gaussians colours that depend on the view where keyframes ask for them; on the CPU."""
 
     def end_refinement(self) -> None:
-        """Of a refinement that was cut off the map becomes the mean over what it has made of the last steps."""
+        """The map becomes the mean over what a refinement, perhaps cut off, has made of it in the last steps."""
         self._mean.move_into(self.map)
 
     @property

@@ -109,6 +109,11 @@ class Config:
     paging: PagingSettings = field(default_factory=PagingSettings)
     volumes: VolumeSettings = field(default_factory=VolumeSettings)
 
+    @property
+    def fits_view_colors(self) -> bool:
+        """Whether colours that depend on the view are fitted after training, and not trained."""
+        return self.sh_degree < 0
+
 
 def config_to_dict(config: Config) -> dict[str, Any]:
     """The settings as nested dictionaries of plain values, in the order of the fields."""

@@ -78,7 +78,7 @@ CAPABILITIES = (
     ),
     Capability(
         "colours that depend on the view, fitted after training", {Mode.GPU: _OUT, Mode.PAGED: _OUT}, "sh_degree",
-        lambda c: c.sh_degree < 0,
+        lambda c: c.fits_view_colors,
     ),
     Capability("pruning hidden Gaussians where depth is noisy", {Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END}),
     Capability("checkpoints and `resume`", {Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}),

@@ -138,7 +138,7 @@ def make_mapper(
         compact = compact and learns and config.identity.schedule != "dense"
         gaussians = GaussianMap(degree, channels, compact_features=compact)
         mapper = CpuMapper(gaussians, config.mapping, context, config.seed, learner)
-        mapper.fits_view_colors = config.sh_degree < 0
+        mapper.fits_view_colors = config.fits_view_colors
         return mapper
     device = library.whole_device(None)
     device_learner = CudaIdentityLearner(config.identity, config.seed, device, library) if learns else None

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.jobs.merge.seams import keyframes_of
+from ggslam.jobs.merge.sources import joint_config
 from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.finished import load_finished
 from ggslam.mapping.settings import MapperSettings
@@ -19,6 +20,7 @@ from ggslam.rendering.exposure import identity_exposure
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.slam.config import Config
 
 
 def test_keyframes_at_seams_keep_their_exposures(room_run: RunFolder) -> None:
@@ -38,3 +40,12 @@ def test_keyframes_at_seams_keep_their_exposures(room_run: RunFolder) -> None:
     mapper = CpuMapper(GaussianMap(), MapperSettings(), NativeContext(1))
     load_finished(mapper, mapper.map, found)
     assert mapper._exposure_of(found[0]) is None and mapper._exposure_of(found[1]) is found[1].exposure
+
+
+def test_a_joint_run_fits_its_colours_if_all_runs_do() -> None:
+    def source(degree: int) -> Any:
+        return SimpleNamespace(folder=SimpleNamespace(config=lambda: Config(sh_degree=degree)))
+
+    gaussians = GaussianMap(2)
+    assert joint_config([source(-1), source(-1)], gaussians).fits_view_colors
+    assert joint_config([source(-1), source(1)], gaussians).sh_degree == 2

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from test_mapper import make_mapper, wall
 
 from ggslam.mapping.cpu.mapper import CpuMapper
@@ -64,3 +65,27 @@ def test_known_exposures_count_beside_poses(trained: GaussianMap) -> None:
     train_by_turns(mapper, [0, 1], 30, 0)
     assert psnr(mapper.map) > 45
     assert np.abs(mapper.keyframes[1].exposure - keyframes(1, DARK)[1].exposure).max() < 0.05
+
+
+def test_colours_that_are_fitted_are_not_trained(trained: GaussianMap) -> None:
+    """No step gives harmonics; after all steps those get them that ask for them: of the wall from one side none."""
+    still = StillMapper(trained.copy("cpu"), MapperSettings(), NativeContext(2), keyframes(1, 1), [None, None], True)
+    still.map.raise_degree(2)
+    still.map.sh[:5, 1:] = 0.01
+    before = still.map.sh[:, 1:].clone()
+    train_by_turns(still, [0, 1], 10, 0)
+    assert torch.equal(still.map.sh[:, 1:], before)
+    calls = []
+    still._fit_view_colors = lambda: calls.append(len(still.map))  # type: ignore[method-assign]
+    still.train(2, [0])
+    still.train(0, [0])
+    assert calls == [len(still.map)]
+
+
+@pytest.mark.parametrize("steps", [1, 20, 50])
+def test_few_steps_do_no_harm(trained: GaussianMap, steps: int) -> None:
+    """The map is the mean of many; what is said of it is true of the map before the first step and after the last."""
+    still = StillMapper(trained.copy("cpu"), MapperSettings(), NativeContext(2), keyframes(1, 1), [None, None])
+    before, after = still.train(steps, [0])
+    assert before == pytest.approx(psnr(trained), abs=0.2) and after == pytest.approx(psnr(still.map), abs=0.2)
+    assert after > before - 0.1

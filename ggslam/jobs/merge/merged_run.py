@@ -13,7 +13,7 @@ import numpy as np
 from ggslam import __version__
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.trajectory import write_tum
-from ggslam.jobs.merge.sources import MergeSource
+from ggslam.jobs.merge.sources import MergeSource, joint_config
 from ggslam.jobs.merge.truth import truth_transforms
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.merging.joint_graph import JointPoses
@@ -124,8 +124,7 @@ class MergedRun:
 
     def _write_records(self, folder: Path, seconds: Mapping[str, float]) -> None:
         sources = self.sources
-        config = sources[0].folder.config()
-        save_config(replace(config, sh_degree=self.gaussians.sh_degree), folder / "config.yaml")
+        save_config(joint_config(sources, self.gaussians), folder / "config.yaml")
         record = self._keyframes_record()
         record.write(folder)
         times, poses = np.concatenate([s.times() for s in sources]), self._frame_poses(record)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ggslam.jobs.merge.sources import MergeSource
+from ggslam.jobs.merge.sources import MergeSource, joint_config
 from ggslam.jobs.merge.unseen_gaussians import UnseenGaussians
 from ggslam.jobs.progress import Observer
 from ggslam.mapping.finished import load_finished, train_by_turns
@@ -61,7 +61,7 @@ def train_seams(
         return TrainedSeams(keyframes, 0, 0, notes)
     depth = float(np.median(np.concatenate([p[:, 2] for source in sources for p in source.known.points])))
     sigma = max(source.known.noise.sigma(depth) for source in sources)
-    config = replace(sources[0].folder.config(), sh_degree=gaussians.sh_degree)
+    config = joint_config(sources, gaussians)
     mapper = make_mapper(replace(config, device="cpu"), with_masks, context, None)
     load_finished(mapper, gaussians, keyframes)
     mapper.depth_sigma = sigma

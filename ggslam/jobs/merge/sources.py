@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from ggslam.runs.records.sequence import PartRecord, SequenceRecord
 from ggslam.runs.writing import TRUTH_FILE
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.sequences import Sequence
+from ggslam.slam.config import Config
 from ggslam.system.tuning import Tuning
 
 
@@ -157,6 +158,14 @@ class MergeSource:
             inside = [k for k, f in enumerate(frames) if f.frame < len(self.sequence)]
             found[inside] = self.sequence.ground_truth[[frames[k].frame for k in inside]]
         return found if np.isfinite(found).all((1, 2)).any() else None
+
+
+def joint_config(sources: ListOf[MergeSource], gaussians: GaussianMap) -> Config:
+    """Settings of a run that several became: those of the first, with the map's degree, unless all runs fitted their
+    colours that depend on the view."""
+    configs = [source.folder.config() for source in sources]
+    fitted = all(config.fits_view_colors for config in configs)
+    return replace(configs[0], sh_degree=configs[0].sh_degree if fitted else gaussians.sh_degree)
 
 
 def read_sources(paths: ListOf[Path], context: NativeContext, unpacked: Path) -> list[MergeSource]:

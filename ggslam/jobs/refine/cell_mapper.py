@@ -100,13 +100,15 @@ class CellMapper(StillMapper):
         context: threads.
         keyframes: numbered from 0.
         views: what the pixels of each show.
+        fits_view_colors: whether colours that depend on the view stay as they were fitted, and are not trained.
     """
 
     def __init__(
         self, gaussians: GaussianMap, own: int, box: CellBox, settings: MapperSettings, context: NativeContext,
-        keyframes: list[Keyframe], views: Sequence[CellView],
+        keyframes: list[Keyframe], views: Sequence[CellView], fits_view_colors: bool = False,
     ) -> None:  # fmt: skip
-        super().__init__(gaussians, settings, context, keyframes, [~view.hidden for view in views])
+        counted = [~view.hidden for view in views]
+        super().__init__(gaussians, settings, context, keyframes, counted, fits_view_colors)
         self._own, self._box, self._views = own, box, views
         self._others = {name: getattr(gaussians, name)[own:].clone() for name in _TRAINED}
         self._own_psnr = float("nan")
@@ -116,12 +118,19 @@ class CellMapper(StillMapper):
         """Of the pixels that show the cell."""
         return self._own_psnr
 
-    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0) -> None:
+    def _psnr_of(self, keyframe: Keyframe) -> float:
+        super()._psnr_of(keyframe)
+        return self._own_psnr
+
+    def iterate(self, keyframe: Keyframe, rate_factor: float = 1.0, settles: bool = False) -> None:
         """One step; see `Mapper.iterate`."""
-        super().iterate(keyframe, rate_factor)
+        super().iterate(keyframe, rate_factor, settles)
         for name, values in self._others.items():
             getattr(self.map, name)[self._own :] = values
         self._box.clamp(self.map.means[: self._own])
+
+    def _fit_view_colors(self) -> None:
+        """Nothing: views show what is behind the cell, too."""
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> CpuLossResult:
         shown = torch.from_numpy(self._views[keyframe.index].shown)

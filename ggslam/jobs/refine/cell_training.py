@@ -56,8 +56,8 @@ class TrainedCell:
         data: its part with Gaussians.
         count: of them.
         views: keyframes that it was trained on; none: the cell is as it was.
-        before, after: PSNR of the pixels that show it, of each keyframe the first and the last time it was trained on,
-            mean in dB; NaN without steps.
+        before, after: PSNR of the pixels that show it, before the first step and after the last one, mean in dB over
+            the keyframes or some of them; NaN without steps.
     """
 
     key: CellKey
@@ -83,9 +83,10 @@ def train_cell(task: CellTask) -> TrainedCell:
     keyframes, views = _views(task, record, recording_of(task.record))
     if not keyframes or not task.settings.steps:
         return TrainedCell(task.key, task.own, own, 0)
-    settings = record.settings().mapping
-    context = NativeContext(own_threads())
-    mapper = CellMapper(gaussians, own, task.box, settings, context, keyframes, views)
+    config, context = record.settings(), NativeContext(own_threads())
+    mapper = CellMapper(
+        gaussians, own, task.box, config.mapping, context, keyframes, views, config.fits_view_colors
+    )  # fmt: skip
     seed = [task.settings.seed, *(place + 2**32 for place in task.key)]
     before, after = mapper.train(task.settings.steps, seed)
     trained = {name: values[:own] for name, values in arrays_of_map(mapper.map).items()}

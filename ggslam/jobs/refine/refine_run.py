@@ -47,7 +47,7 @@ class RunRefinement:
         folder: the refined run.
         keyframes: that it was trained on.
         steps: optimisation steps.
-        before, after: PSNR of keyframes the first and the last time they were trained on, mean in dB.
+        before, after: PSNR of keyframes, or some of them, before the first step and after the last one, mean in dB.
         seconds: that it took.
         notes: what the user should know.
     """
@@ -107,8 +107,9 @@ def _refine(
     scene = source.segmented_map() if source.has_objects() else None
     gaussians = source.gaussians(with_moments=True)
     scale = scene_scale(keyframes[0].depth_m()) if keyframes else 1.0  # as the run itself did
-    trained_by = scale_settings(source.config().mapping, scale)
-    mapper = StillMapper(gaussians, trained_by, NativeContext(), keyframes, valid)
+    config = source.config()
+    trained_by = scale_settings(config.mapping, scale)
+    mapper = StillMapper(gaussians, trained_by, NativeContext(), keyframes, valid, config.fits_view_colors)
     observer.begin("refine", settings.steps)
     before, after = mapper.train(settings.steps, [settings.seed], observer.advance)
     refined = None if scene is None else SegmentedMap(gaussians, scene.classifier, scene.table, scene.votes)
