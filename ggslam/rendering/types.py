@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -34,12 +35,19 @@ def low_pass_at(zoom: float) -> float:
     return LOW_PASS * square + (1 - square) / 12
 
 
-def low_pass_for(camera: Camera, trained: Camera | None) -> float:
-    """That of pictures by `camera` of a map that pictures by `trained` taught; of one that no recording is known of
-    (None) 3DGS's."""
-    if trained is None:
-        return LOW_PASS
-    return low_pass_at(math.sqrt(camera.fx * camera.fy / (trained.fx * trained.fy)))
+def focal_of(camera: Camera) -> float:
+    """Focal length, pixels, as of square ones."""
+    return math.sqrt(camera.fx * camera.fy)
+
+
+def low_pass_for(camera: Camera, trained: Sequence[Camera]) -> float:
+    """That of pictures by `camera` of a map that pictures by the cameras `trained` taught: as against the one whose
+    focal length in pixels is nearest, by the ratio, to that of `camera`, the longer one of two as near. So what each of
+    them took is drawn as it was trained, and what is finer than all of them as the finest one trained it. Of a map that
+    no recording is known of (there are none) 3DGS's."""
+    focal = focal_of(camera)
+    zooms = [focal / focal_of(one) for one in trained]
+    return low_pass_at(min(zooms, key=lambda zoom: (abs(math.log(zoom)), zoom))) if zooms else LOW_PASS
 
 
 class Gaussians(Protocol):

@@ -80,8 +80,8 @@ class ViewedMap(Protocol):
         """Of the recording."""
 
     @property
-    def training_camera(self) -> Camera | None:
-        """The camera whose pictures taught the map; None: not known."""
+    def training_cameras(self) -> list[Camera]:
+        """The cameras whose pictures taught the map; none: not known."""
 
     @property
     def frame_poses(self) -> dict[int, np.ndarray]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 import struct
 from dataclasses import asdict
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ggslam.scene.camera import Camera
+from ggslam.rendering.types import focal_of
 from ggslam.system.json_files import json_ready
 from ggslam.system.tuning import Tuning
 from ggslam.viewer.cameras import CameraTuning, best_view, top_view, vertical_fov, view_of_pose
@@ -57,7 +56,7 @@ def scene_values(model: ViewedMap, title: str, caption: str = "") -> dict[str, A
         "floor": {"height": model.floor, "found": model.floor is not None},
         "camera": {"width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
                    "cx": camera.cx, "cy": camera.cy},
-        "trained_focal": None if model.training_camera is None else focal_of(model.training_camera),
+        "trained_focals": [focal_of(camera) for camera in model.training_cameras],
         "objects": [_object_values(record) for record in model.objects()],
         "views": {"Start": asdict(start), "Top": asdict(top)},
         "path": [walk[::step].round(4) for walk in model.walks],
@@ -71,11 +70,6 @@ def scene_values(model: ViewedMap, title: str, caption: str = "") -> dict[str, A
         "changes": [_change_values(change, model) for change in model.changes()],
     }  # fmt: skip
     return dict(json_ready(values))
-
-
-def focal_of(camera: Camera) -> float:
-    """Of the pictures that taught a map, pixels: as of square ones."""
-    return math.sqrt(camera.fx * camera.fy)
 
 
 def _spread(count: int, most: int) -> list[int]:

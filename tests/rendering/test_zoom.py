@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -129,12 +131,21 @@ def test_fitted_gaussians_look_in_small_as_they_did_in_large(size: int) -> None:
 
 def test_the_filter_of_other_sizes() -> None:
     """Four pixels of twice the size spread by 1/16 px^2 of the own size, four of the own size by 1/4."""
-    assert low_pass_at(1) == LOW_PASS == low_pass_for(CAMERA, None) == low_pass_for(CAMERA, CAMERA)
+    assert low_pass_at(1) == LOW_PASS == low_pass_for(CAMERA, []) == low_pass_for(CAMERA, [CAMERA])
     assert low_pass_at(2) / 4 + 1 / 16 == pytest.approx(LOW_PASS)
     assert low_pass_at(0.5) == pytest.approx((LOW_PASS + 1 / 4) / 4) == pytest.approx(0.1375)
-    assert low_pass_for(CAMERA.scale(2), CAMERA) == pytest.approx(0.95)
+    assert low_pass_for(CAMERA.scale(2), [CAMERA]) == pytest.approx(0.95)
     assert low_pass_at(1e6) == low_pass_at(LARGEST_ZOOM) < 1e3
     assert low_pass_at(1e-6) > 0
+
+
+def test_the_filter_of_maps_that_several_cameras_taught() -> None:
+    """Each camera's own size is drawn as trained, other sizes as against the nearest, the finer one of two as near."""
+    rig = [CAMERA.scale(0.5), CAMERA.scale(2), CAMERA.scale(0.5)]
+    assert [low_pass_for(camera, rig) for camera in rig] == [LOW_PASS] * 3
+    for focal, zoom in ((0.25, 0.5), (0.8, 1.6), (1.0, 0.5), (1.25, 0.625), (8.0, 4.0)):
+        camera = replace(CAMERA, fx=focal * CAMERA.fx, fy=focal * CAMERA.fy)
+        assert low_pass_for(camera, rig) == pytest.approx(low_pass_at(zoom))
 
 
 @pytest.mark.parametrize("zoom", [0.5, 2.0])

@@ -103,7 +103,7 @@ def test_pictures_of_other_sizes_than_the_training_s_have_their_filter(
     browser: Any, page: Path, gaussians: GaussianMap, poses: list[np.ndarray], zoom: float, renderer: str
 ) -> None:
     m.open_map(browser, page, renderer)
-    m.ask(browser, "map.trained = values[0]; map.redraw()", FOCAL / zoom)
+    m.ask(browser, "map.trained = values[0]; map.redraw()", [FOCAL / zoom, 5 * FOCAL / zoom])
     m.look_from(browser, poses[0])
     picture = m.picture(browser)
     assert decibels(picture, expected(gaussians, poses[0], low_pass=low_pass_at(zoom))) > 45

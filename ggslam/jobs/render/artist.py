@@ -49,7 +49,7 @@ class Artist:
         self.objects = ObjectsInParts.of(folder) if set(kinds) & set(OBJECT_KINDS) else None
         self._parts = folder.map_in_parts() if self.objects is None else self.objects.map
         self.depth_limits: tuple[float, float] | None = None
-        self._trained = folder.sequence().camera if folder.has_poses else None
+        self._trained = folder.sequence().cameras() if folder.has_poses else []
         self._rasterizer = CpuRasterizer()
         self._painters: dict[str, Painter] = {
             "color": lambda view, _: color_to_uint8(view.image.numpy()),

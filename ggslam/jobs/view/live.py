@@ -14,7 +14,7 @@ from ggslam.errors import ConfigError
 from ggslam.jobs.view.pictures import FramePictureTuning, table_of
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.types import GaussianTensors
+from ggslam.rendering.types import GaussianTensors, focal_of
 from ggslam.reporting.pictures import color_of_depth, color_to_uint8, depth_range
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -28,7 +28,7 @@ from ggslam.viewer.cameras import CameraTuning, top_view, vertical_fov, view_fro
 from ggslam.viewer.packed_splats import SCALES, pack_splats
 from ggslam.viewer.page_server import PageServer
 from ggslam.viewer.page_source import Download
-from ggslam.viewer.scene_values import focal_of, jpeg, packed_chunk
+from ggslam.viewer.scene_values import jpeg, packed_chunk
 from ggslam.viewer.splats import colors_to_uint8, most_visible
 
 
@@ -198,7 +198,7 @@ def _scene_of(snapshot: _Snapshot, camera: Camera, title: str, centers: np.ndarr
         "floor": {"height": None, "found": False},
         "camera": {"width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
                    "cx": camera.cx, "cy": camera.cy},
-        "trained_focal": focal_of(camera),
+        "trained_focals": [focal_of(camera)],
         "objects": [], "unlabelled": 0, "views": {"Start": asdict(start), "Top": asdict(top)},
         "path": [positions.round(4)], "keyframes": [T.round(5).ravel() for T in snapshot.keyframes],
         "frames": [], "movers": [], "changes": [], "annotations": [], "camera_keys": [], "edits": [], "redo": 0,

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -46,12 +46,12 @@ class ViewPictures:
         segmented: the same with its objects, if it has any.
         camera_of: tells the camera of a frame.
         recorded: gives a frame's images, None if the recording is not there.
-        trained: the camera whose pictures taught the map; None: not known.
+        trained: the cameras whose pictures taught the map; none: not known.
     """
 
     def __init__(
         self, gaussians: GaussianMap, segmented: SegmentedMap | None, camera_of: Callable[[int], Camera],
-        recorded: Callable[[int], Frame | None], trained: Camera | None,
+        recorded: Callable[[int], Frame | None], trained: Sequence[Camera],
     ) -> None:  # fmt: skip
         self._gaussians, self._segmented, self._camera_of, self._recorded = gaussians, segmented, camera_of, recorded
         self._trained = trained

@@ -88,7 +88,7 @@ class ViewedRun:
         record = folder.keyframes()
         self._record = folder.sequence()
         self.camera: Camera = self._record.camera
-        self.training_camera = self.camera if folder.has_poses else None
+        self.training_cameras = self._record.cameras() if folder.has_poses else []
         self.frame_poses: dict[int, np.ndarray] = dict(sorted(record.poses().items()))
         self.keyframe_poses = np.array([k.T_world_camera for k in record.keyframes]).reshape(-1, 4, 4)
         if not self.frame_poses:
@@ -146,7 +146,7 @@ class ViewedRun:
         """What was worked out of the map before an edit holds no more."""
         self._pictures = ViewPictures(
             self._gaussians, self._segmented if self.has_objects else None, self._record.camera_of,
-            self._recorded_frame, self.training_camera,
+            self._recorded_frame, self.training_cameras,
         )
         self._rows: np.ndarray | None = None
 

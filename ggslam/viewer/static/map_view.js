@@ -5,7 +5,7 @@
 class MapView {
   // canvas: gets the pointer and shows lines; the picture of the map is put beneath it. camera: {view() column-major
   // world to camera, focal(width, height), near}. options: {background: [r, g, b], renderer: "webgl" | "processor",
-  // trained: focal length, pixels, of the pictures that taught the map}.
+  // trained: focal lengths, pixels, of the cameras whose pictures taught the map}.
   constructor(canvas, camera, options = {}) {
     Object.assign(this, {
       canvas,

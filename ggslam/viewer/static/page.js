@@ -41,7 +41,7 @@ class Viewer {
     this.camera = new OrbitCamera(this.canvas, scene.up || [0, -1, 0], scene.fov || 1, () => this.moved());
     this.map = new MapView(this.canvas, this.camera, {
       background: BACKGROUNDS[this.theme()],
-      trained: scene.trained_focal,
+      trained: scene.trained_focals,
     });
     this.edits = source.served ? new ServedEdits(this) : new LocalEdits(this);
     this.notes = new Notes(this, scene.annotations);

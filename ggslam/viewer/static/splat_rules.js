@@ -20,9 +20,15 @@ const SPLAT_RULES = Object.freeze({
 });
 
 // As low_pass_for of ggslam/rendering/types.py: the filter of pictures of a focal length, pixels, of a map that ones of
-// another taught (not known: 0).
+// others taught (not known: none).
 function lowPassFor(focal, trained) {
-  const square = trained ? Math.min(focal / trained, SPLAT_RULES.largestZoom) ** 2 : 1;
+  let zoom = 0;
+  for (const one of trained || []) {
+    const next = focal / one;
+    const nearer = Math.abs(Math.log(next)) - Math.abs(Math.log(zoom || Infinity));
+    if (nearer < 0 || (nearer === 0 && next < zoom)) zoom = next;
+  }
+  const square = zoom ? Math.min(zoom, SPLAT_RULES.largestZoom) ** 2 : 1;
   return SPLAT_RULES.lowPass * square + (1 - square) / 12;
 }
 
