@@ -80,6 +80,11 @@ CAPABILITIES = (
         "colours that depend on the view, fitted after training", {Mode.GPU: _OUT, Mode.PAGED: _OUT}, "sh_degree",
         lambda c: c.fits_view_colors,
     ),
+    Capability(
+        "training on frames in between where depth is exact",
+        {Mode.RIG: _OUT, Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}, "mapping.exposure.enabled",
+        lambda c: not c.mapping.exposure.enabled,
+    ),
     Capability("pruning hidden Gaussians where depth is noisy", {Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END}),
     Capability("checkpoints and `resume`", {Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}),
     Capability("repeating bit for bit", {Mode.GPU: _OUT, Mode.REALTIME: _OUT}),
