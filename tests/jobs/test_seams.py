@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes where maps of several runs meet."""
+"""Keyframes of earlier runs: where maps meet, and where a run starts in a map."""
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,8 +21,10 @@ from ggslam.native.loader import NativeContext
 from ggslam.rendering.exposure import identity_exposure
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import open_recording_of
+from ggslam.runs.starting import start_in_map
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.config import Config
+from ggslam.slam.slam import Slam
 
 
 def test_keyframes_at_seams_keep_their_exposures(room_run: RunFolder) -> None:
@@ -49,3 +53,14 @@ def test_a_joint_run_fits_its_colours_if_all_runs_do() -> None:
     gaussians = GaussianMap(2)
     assert joint_config([source(-1), source(-1)], gaussians).fits_view_colors
     assert joint_config([source(-1), source(1)], gaussians).sh_degree == 2
+
+
+def test_a_run_that_starts_in_a_map_knows_its_exposures(room_run: RunFolder, tmp_path: Path) -> None:
+    shutil.copytree(room_run.path, tmp_path / "run")
+    record, dark = room_run.keyframes(), identity_exposure() * [0.6, 1]
+    known = [k.model_copy(update={"exposure": dark}) for k in record.keyframes]
+    record.model_copy(update={"keyframes": known}).write(tmp_path / "run")
+    run = RunFolder.open(tmp_path / "run")
+    slam = Slam(open_recording_of(run).camera, run.config(), has_masks=True)
+    start_in_map(slam, run, growing=True)
+    assert np.array_equal([k.exposure for k in slam.mapper.keyframes], [dark] * len(known))
