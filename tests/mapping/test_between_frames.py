@@ -128,6 +128,20 @@ def test_a_run_that_goes_on_leaves_the_same_out(exact: Path) -> None:
     assert np.array_equal(other.mapper.map.means.numpy(), whole.mapper.map.means.numpy())
 
 
+@pytest.mark.parametrize("damage", ["nothing", "cut", "other size", "no number"])
+def test_states_with_frames_that_cannot_be_are_refused(exact: Path, damage: str) -> None:
+    slam = run(exact)
+    mapper, kept = slam.mapper, slam.mapper.between[0]
+    small = cv2.imencode(".jpg", np.zeros((60, 80, 3), np.uint8))[1].reshape(-1)
+    wrong = {"nothing": kept.color[:0], "cut": kept.color[:30], "other size": small}
+    if damage in wrong:
+        mapper.between[0] = replace(kept, color=wrong[damage])
+    else:
+        mapper.unfit = {len(mapper.between)}
+    with pytest.raises(FormatError, match="frames between keyframes"):
+        mapper.check()
+
+
 def test_none_are_kept_without_memory_or_where_depth_is_noisy(exact: Path, tmp_path: Path) -> None:
     with overridden(BetweenTuning, kept_bytes=0):
         assert not run(exact, "refine_iterations=0").mapper.between

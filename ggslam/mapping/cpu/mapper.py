@@ -75,6 +75,8 @@ class CpuMapper(Mapper):
         check_indices("keyframes that were left out", self.left_out, count)
         check_indices("frames between keyframes", (frame.keyframe for frame in self.between), count)
         check_indices("frames between keyframes that do not train", self.unfit, len(self.between))
+        for frame in self.between:
+            frame.check(self.keyframes[frame.keyframe])
         if len(self._pose_optimizers) != count:
             raise FormatError(f"optimisers of poses: expected {count}, found {len(self._pose_optimizers)}")
         self._exposures.check(count)
