@@ -249,9 +249,10 @@ class Mapper(ABC):
         return False
 
     def keep_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
-        """Keeps a frame that is no keyframe, while there is memory for it; arguments as the attributes of
-        `BetweenFrame`."""
-        if self.keeps_between and sum(kept.color.nbytes for kept in self.between) < BetweenTuning.kept_bytes:
+        """Keeps a frame that is no keyframe, while there is memory for it, if it can be compared with the map;
+        arguments as the attributes of `BetweenFrame`."""
+        wanted = self.keeps_between and self._is_plain(self.keyframes[keyframe])
+        if wanted and sum(kept.color.nbytes for kept in self.between) < BetweenTuning.kept_bytes:
             self.between.append(code_frame(frame, keyframe, T_keyframe_camera))
 
     def judge_between(self) -> None:  # noqa: B027

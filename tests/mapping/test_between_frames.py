@@ -142,6 +142,19 @@ def test_states_with_frames_that_cannot_be_are_refused(exact: Path, damage: str)
         mapper.check()
 
 
+def test_none_are_kept_beside_keyframes_in_which_something_moves(exact: Path) -> None:
+    sequence = open_sequence(exact)
+    slam = Slam(sequence.camera, load_config(None, FEW))
+    slam.step(sequence.frame(0))
+    mapper, (keyframe,) = slam.mapper, slam.mapper.keyframes
+    mapper.keep_between(sequence.frame(1), 0, np.eye(4))
+    assert [kept.frame_index for kept in mapper.between] == [1]
+    keyframe.moving = np.zeros(keyframe.color.shape[:2], bool)
+    keyframe.moving[40:60, 40:60] = True
+    mapper.keep_between(sequence.frame(2), 0, np.eye(4))
+    assert [kept.frame_index for kept in mapper.between] == [1]
+
+
 def test_none_are_kept_without_memory_or_where_depth_is_noisy(exact: Path, tmp_path: Path) -> None:
     with overridden(BetweenTuning, kept_bytes=0):
         assert not run(exact, "refine_iterations=0").mapper.between
