@@ -20,6 +20,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.system.array_forms import Form, MaybeNan, Pose
+from ggslam.system.images import claimed_size
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 
@@ -32,8 +33,16 @@ class BetweenTuning(Tuning):
     a phone 0.19, a Kinect 0.9."""
     jpeg_quality = 95
     """JPEG quality of kept images, of 100. A map trained on them is within 0.001 dB of one trained on the originals."""
+    header_bytes = 4096
+    """First bytes of a JPEG file in which its size is looked for."""
     kept_bytes = 40 << 20
     """Most bytes of kept images. Keyframes that come later have no frames beside them."""
+    most_gain = 0.02
+    """How much brighter or darker than the map a frame may be, as a natural logarithm. At one exposure frames of a
+    living room are within 0.006, all but a twentieth of those of a kitchen within 0.015."""
+    least_sharpness = 0.8
+    """Least contrast of a frame between neighbouring pixels, against the map's, as a share of its keyframe's. Of images
+    in focus it is 0.96 or more, blurred by 3 pixels 0.37."""
     own_every = 2
     """A keyframe is trained itself every so manyth of its visits, else a frame beside it, which teaches colours only: 3
     instead gains 0.04 dB, and depth is an eighth less accurate."""
@@ -66,21 +75,34 @@ class BetweenFrame:
     T_keyframe_camera: Pose
     color: Annotated[np.ndarray, Form("u1", None)]
 
+    def check(self, keyframe: Keyframe) -> None:
+        """Raises FormatError if its image does not claim to be of its keyframe's size: it may come from a file."""
+        if claimed_size(self.color[: BetweenTuning.header_bytes].tobytes()) != _size_of(keyframe):
+            raise _foreign()
+
     def view(self, keyframe: Keyframe) -> Keyframe:
         """The frame as a keyframe without depth, with the number of the one that it hangs on.
 
         Raises:
             FormatError: its image is not of the keyframe's size: it may come from a file.
         """
-        size = (keyframe.camera.height, keyframe.camera.width)
-        image = cv2.imdecode(self.color, cv2.IMREAD_COLOR) if len(self.color) else None
-        if image is None or image.shape[:2] != size:
-            raise FormatError("frames between keyframes: the image of one is not of this recording")
+        self.check(keyframe)
+        image = cv2.imdecode(self.color, cv2.IMREAD_COLOR)
+        if image is None or image.shape[1::-1] != _size_of(keyframe):
+            raise _foreign()
         return Keyframe(
             keyframe.index, self.frame_index, self.timestamp, keyframe.camera, cv2.cvtColor(image, cv2.COLOR_BGR2RGB),
-            np.zeros(size, np.uint16), inverse(keyframe.T_world_camera @ self.T_keyframe_camera),
+            np.zeros(image.shape[:2], np.uint16), inverse(keyframe.T_world_camera @ self.T_keyframe_camera),
             camera_number=keyframe.camera_number, depth_unit=keyframe.depth_unit,
         )  # fmt: skip
+
+
+def _size_of(keyframe: Keyframe) -> tuple[int, int]:
+    return keyframe.camera.width, keyframe.camera.height
+
+
+def _foreign() -> FormatError:
+    return FormatError("frames between keyframes: the image of one is not of this recording")
 
 
 def code_frame(frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> BetweenFrame:

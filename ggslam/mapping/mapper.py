@@ -149,6 +149,7 @@ class Mapper(ABC):
     keyframes: list[Keyframe]
     left_out: set[int]
     between: list[BetweenFrame]
+    unfit: set[int]
     _valid: dict[int, Mask | None]
 
     def __init__(
@@ -177,6 +178,8 @@ class Mapper(ABC):
         """Numbers of the keyframes that neither train the map nor have Gaussians in it any more."""
         self.between = []
         """Frames between keyframes for the final refinement."""
+        self.unfit = set()
+        """Places in `between` of those that it does not train on after all."""
         self._beside: dict[int, list[BetweenFrame]] = {}
         self._valid = {}
         self.extra_loss: ExtraLoss | None = None
@@ -246,18 +249,31 @@ class Mapper(ABC):
         return False
 
     def keep_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
-        """Keeps a frame that is no keyframe, while there is memory for it; arguments as the attributes of
-        `BetweenFrame`."""
-        if self.keeps_between and sum(kept.color.nbytes for kept in self.between) < BetweenTuning.kept_bytes:
+        """Keeps a frame that is no keyframe, while there is memory for it, if it can be compared with the map;
+        arguments as the attributes of `BetweenFrame`."""
+        wanted = self.keeps_between and self._is_plain(self.keyframes[keyframe])
+        if wanted and sum(kept.color.nbytes for kept in self.between) < BetweenTuning.kept_bytes:
             self.between.append(code_frame(frame, keyframe, T_keyframe_camera))
 
-    def _find_beside(self, numbers: Sequence[int]) -> dict[int, list[BetweenFrame]]:
-        """By the number of a keyframe the frames that are trained with it."""
-        found: dict[int, list[BetweenFrame]] = {}
-        for frame in self.between if self.keeps_between else ():
+    def judge_between(self) -> None:  # noqa: B027
+        """Before the final refinement: finds which frames between keyframes are not of the map's exposure, or much less
+        sharp than their keyframes; on the CPU."""
+
+    def _find_beside(self, numbers: Sequence[int]) -> dict[int, list[int]]:
+        """By the number of a keyframe the places in `between` of the frames that can be compared with the map."""
+        found: dict[int, list[int]] = {}
+        for place, frame in enumerate(self.between if self.keeps_between else ()):
             if frame.keyframe in numbers and self._is_plain(self.keyframes[frame.keyframe]):
-                found.setdefault(frame.keyframe, []).append(frame)
+                found.setdefault(frame.keyframe, []).append(place)
         return found
+
+    def _trained_beside(self, numbers: Sequence[int]) -> dict[int, list[BetweenFrame]]:
+        """By the number of a keyframe the frames that are trained with it; none: it is not there."""
+        fit = {
+            number: [self.between[place] for place in places if place not in self.unfit]
+            for number, places in self._find_beside(numbers).items()
+        }
+        return {number: frames for number, frames in fit.items() if frames}
 
     def _is_plain(self, keyframe: Keyframe) -> bool:
         """Whether frames after a keyframe can be compared with the map as they are."""
@@ -437,7 +453,7 @@ class Mapper(ABC):
         if self.is_live or not before:
             return round(MapperTuning.live_end_share * before)
         own = sum(self.keyframes[k].frame_index != FROM_EARLIER_RUN for k in self._all_numbers)
-        beside = self._find_beside(self._all_numbers)
+        beside = self._find_beside(self._all_numbers)  # fit or not, which is not known before
         share = end_share(self.keyframes[min(beside)].camera) if beside else MapperTuning.end_share
         return max(round(share * before), MapperTuning.min_visits * own)
 
@@ -568,7 +584,7 @@ class Mapper(ABC):
         `begin` steps were made before; between steps `progress` is told how many of how many are."""
         share, done = self._averaged_share, 0
         for numbers, steps in self._stages(iterations):
-            self._beside = self._find_beside(numbers)
+            self._beside = self._trained_beside(numbers)
             every = max(1, min(MapperTuning.average_every, int(share * steps) // MapperTuning.averaged_maps))
             for i in range(steps):
                 done += 1

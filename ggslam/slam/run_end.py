@@ -44,6 +44,7 @@ def refine(slam: RunState, progress: Callable[[int, int], None] | None = None) -
                 mapper.use_typical_exposure(at_end=True)
                 slam.color_poses.align_keyframes()
                 mapper.drop_hidden()
+                mapper.judge_between()
             mapper.refine(steps, note, begin)
         slam.color_poses.align_last(lambda: note(steps, steps))
     finally:  # an interrupted refinement counts for what it did

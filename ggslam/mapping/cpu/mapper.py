@@ -27,7 +27,7 @@ from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.settings import InsertionSettings, LossSettings, MapperSettings
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
-from ggslam.rendering.exposure import SeenAgain, exactly_without_exposure
+from ggslam.rendering.exposure import SeenAgain, change_of, exactly_without_exposure, relative_sharpness
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -74,6 +74,9 @@ class CpuMapper(Mapper):
         count = len(self.keyframes)
         check_indices("keyframes that were left out", self.left_out, count)
         check_indices("frames between keyframes", (frame.keyframe for frame in self.between), count)
+        check_indices("frames between keyframes that do not train", self.unfit, len(self.between))
+        for frame in self.between:
+            frame.check(self.keyframes[frame.keyframe])
         if len(self._pose_optimizers) != count:
             raise FormatError(f"optimisers of poses: expected {count}, found {len(self._pose_optimizers)}")
         self._exposures.check(count)
@@ -207,6 +210,29 @@ class CpuMapper(Mapper):
     def _look(keyframe: Keyframe, view: RenderBuffers) -> SeenAgain:
         """What a view of the map shows where a keyframe looks; good until the next rendering."""
         return SeenAgain(view.image.numpy(), view.alpha.numpy(), view.expected_depth.numpy(), keyframe.depth_m())
+
+    def judge_between(self) -> None:
+        self.unfit = set()
+        for number, places in self._find_beside(self._trainable()).items():
+            keyframe = self.keyframes[number]
+            usual = self._compare(keyframe)[1]
+            for place in places:
+                gain, sharpness = self._compare(self.between[place].view(keyframe))
+                if abs(np.log(gain)) > BetweenTuning.most_gain or sharpness < BetweenTuning.least_sharpness * usual:
+                    self.unfit.add(place)
+
+    def _compare(self, keyframe: Keyframe) -> tuple[float, float]:
+        """How much brighter (1: as bright) and sharper an image is than the map, where it looks at some, by a quarter
+        of the pixels."""
+        grid = grid_of_turn(0, keyframe.camera)
+        view, valid = self._render(keyframe, features=False, grid=grid), self.valid_of(keyframe)
+        alpha, depth, color = view.alpha.numpy(), view.expected_depth.numpy(), grid.color_of(keyframe.color)
+        shown = alpha if valid is None else np.where(grid.valid_of(valid), alpha, np.float32(0))
+        seen = SeenAgain(view.image.numpy(), shown, depth, depth)
+        exposure = seen.measure(color)
+        if exposure is None:
+            return 1.0, 1.0
+        return change_of(exposure), relative_sharpness(color, seen, exposure)
 
     def _show_labels(self, alpha: np.ndarray, depth: np.ndarray, stride: int = 2) -> MapLabels:
         """What the last rendering shows of the objects, looked at on every `stride`-th pixel and row."""
