@@ -66,16 +66,14 @@ def train_by_turns(
     """
     t, random, turn = FinishedMapTuning, np.random.default_rng(seed), list[int]()
     averaged = int(t.averaged_share * steps)
-    every = max(1, min(MapperTuning.average_every, averaged // MapperTuning.averaged_maps))
     for step in range(steps):
         turn = turn or random.permutation(np.array(numbers)).tolist()
-        keyframe, left = mapper.keyframes[turn.pop()], steps - 1 - step
+        keyframe = mapper.keyframes[turn.pop()]
         rising = min(1.0, (step + 1) / t.rising_steps)
         falling = mapper.settings.refine_decay ** (step / max(1, steps - 1))
         mapper.iterate(keyframe, rising * falling, settles=step >= MapperTuning.settling_from * steps)
         after_step(keyframe)
-        if left < averaged and left % every == 0:
-            mapper.average()
+        mapper.average(steps - 1 - step, averaged)
         progress(step + 1, steps)
     mapper.end_refinement()
 

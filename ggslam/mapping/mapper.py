@@ -468,9 +468,12 @@ class Mapper(ABC):
         self._step(keyframe, (rate_factor, rate_factor), ALL_PIXELS, self._is_identity_due(keyframe), settles)
         self._count_iteration()
 
-    def average(self) -> None:
-        """The map as it is joins those whose mean `end_refinement` makes of it."""
-        self._mean.add(self.map)
+    def average(self, left: int, averaged: float) -> None:
+        """After a step that `left` others follow, of which the last `averaged` count: now and then the map as it is
+        joins those whose mean `end_refinement` makes of it."""
+        every = max(1, min(MapperTuning.average_every, int(averaged) // MapperTuning.averaged_maps))
+        if left < averaged and left % every == 0:
+            self._mean.add(self.map)
 
     def _step(
         self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
@@ -585,16 +588,13 @@ class Mapper(ABC):
         share, done = self._averaged_share, 0
         for numbers, steps in self._stages(iterations):
             self._beside = self._trained_beside(numbers)
-            every = max(1, min(MapperTuning.average_every, int(share * steps) // MapperTuning.averaged_maps))
             for i in range(steps):
                 done += 1
                 if done > begin:
                     falling = self.settings.refine_decay ** (i / max(1, steps - 1))
                     settles = share > 0 and i >= MapperTuning.settling_from * steps
                     self._iterate_wholly(numbers, 1.0 if share else falling, falling, i / steps, settles)
-                    left = steps - 1 - i
-                    if left < share * steps and left % every == 0:
-                        self._mean.add(self.map)
+                    self.average(steps - 1 - i, share * steps)
                 if progress is not None and done > begin and (done % 20 == 0 or done == iterations):
                     progress(done, iterations)
             self._mean.move_into(self.map)
