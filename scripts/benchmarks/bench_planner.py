@@ -49,6 +49,8 @@ OCTOMAPS = {
     "as New College": ((250.0, 161.0, 33.0), 0.2, 120),
 }
 """Size in metres, voxel, and things in it, of generated places as large as the maps that OctoMap's paper measures."""
+HEIGHTS = {False: 0.0, True: 1.5}
+"""Metres above the floor of ways on OctoMaps, by whether they fly."""
 
 
 def main() -> None:
@@ -170,17 +172,27 @@ def octomaps() -> None:
 def _of_file(name: str, occupancy: OccupancyMap, path: Path, size: tuple[float, float, float], voxel: float) -> None:
     """Writes a map and plans on what is read; in space on the binary one only, which both kinds are the same for."""
     write_octomap(occupancy, path)
-    clearance = max(0.3, 1.5 * voxel)
+    clearance = clearance_of(voxel)
     for fly in (False, True) if path.suffix == ".bt" else (False,):
-        start = np.array([0.0, 0.0, 1.5 if fly else 0.0])
-        robot = Robot(height=0.6, radius=clearance)
         began = time.process_time()
-        plan_map = open_plan_map(MapRequest(path, robot, fly, clearance, PlanSettings(), start))
+        plan_map = open_octomap(path, voxel, fly)
         print(
             f"    {path.suffix}, {path.stat().st_size / 1e6:.1f} MB, read in {time.process_time() - began:.1f} s; "
-            f"{_paths(plan_map, clearance, size, float(start[2]))}",
+            f"{_paths(plan_map, clearance, size, HEIGHTS[fly])}",
             flush=True,
         )
+
+
+def clearance_of(voxel: float) -> float:
+    """Metres that ways on an OctoMap keep from obstacles."""
+    return max(0.3, 1.5 * voxel)
+
+
+def open_octomap(path: Path, voxel: float, fly: bool) -> PlanMap:
+    """An OctoMap's file, for ways on the floor or in space."""
+    clearance = clearance_of(voxel)
+    robot, start = Robot(height=0.6, radius=clearance), np.array([0.0, 0.0, HEIGHTS[fly]])
+    return open_plan_map(MapRequest(path, robot, fly, clearance, PlanSettings(), start))
 
 
 def fill_place(size: tuple[float, float, float], voxel: float, things: int) -> OccupancyMap:

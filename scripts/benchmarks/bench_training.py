@@ -15,13 +15,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
+from commands import usage_of
 
 from ggslam.evaluation.images import psnr, unit_range
 from ggslam.formats.splat_formats import read_splats
@@ -40,15 +39,7 @@ _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 def processor_seconds(words: list[object]) -> float:
     """Runs a command; the processor time that it and its threads used."""
-    process = subprocess.Popen(
-        [str(word) for word in words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    assert process.stdout is not None
-    said = process.stdout.read()
-    _, status, used = os.wait4(process.pid, 0)
-    if status:
-        sys.exit(f"{' '.join(str(word) for word in words)}\n{said[-2000:]}")
-    return used.ru_utime + used.ru_stime
+    return usage_of([str(word) for word in words]).processor_seconds
 
 
 def true_poses(folder: RunFolder) -> dict[int, np.ndarray]:

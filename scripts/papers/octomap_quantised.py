@@ -23,12 +23,10 @@ from rows import Paper, options
 
 from agreement import agreement  # isort: skip
 from bench_occupancy import Scan, load_scans, milliseconds  # isort: skip
-from bench_planner import OCTOMAPS, fill_place, plan_pairs  # isort: skip
-from ggslam.driving.plan_settings import PlanSettings
-from ggslam.driving.robot import Robot
-from ggslam.jobs.plan.map_files import MapRequest, open_plan_map
+from bench_planner import HEIGHTS, OCTOMAPS, clearance_of, fill_place, open_octomap, plan_pairs  # isort: skip
 from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import side_by_side, write_picture
+from ggslam.system.atomic import make_folder
 from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.occupancy_settings import OccupancySettings
 from ggslam.volumes.octomap_files import write_octomap
@@ -100,14 +98,11 @@ def add_paths(paper: Paper, quick: bool) -> None:
     name, (size, voxel, things) = next(iter(OCTOMAPS.items()))
     if quick:
         size, things = (12.0, 8.0, 3.0), 12
-    clearance = max(0.3, 1.5 * voxel)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.bt"
         write_octomap(fill_place(size, voxel, things), path)
-        for fly, height in ((False, 0.0), (True, 1.5)):
-            start, robot = np.array([0.0, 0.0, height]), Robot(height=0.6, radius=clearance)
-            plan_map = open_plan_map(MapRequest(path, robot, fly, clearance, PlanSettings(), start))
-            found = plan_pairs(plan_map, clearance, size, height)
+        for fly, height in HEIGHTS.items():
+            found = plan_pairs(open_octomap(path, voxel, fly), clearance_of(voxel), size, height)
             where = f"{'space' if fly else 'floor'}, {' x '.join(f'{s:g}' for s in size)} m, {100 * voxel:g} cm"
             paper.add(
                 "planning", where, "", f"{found.paths_per_s:.0f} paths/s",
@@ -118,7 +113,7 @@ def add_paths(paper: Paper, quick: bool) -> None:
 def main() -> None:
     arguments = options(__doc__).parse_args()
     quick, context = arguments.quick, NativeContext()
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    make_folder(arguments.out)
     paper = Paper(
         "octomap_quantised", "Voxel-quantised OctoMap",
         f"{context.threads} threads; frames of 640x480 at the recordings' true poses.",

@@ -9,6 +9,8 @@ import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from ggslam.system.atomic import make_folder, write_text
+
 ROOT = Path(__file__).parents[2]
 
 NOT_MADE = "–"
@@ -37,11 +39,9 @@ class Paper:
 
     def write(self, out: Path) -> None:
         """Keeps the rows as `out`/NAME.json, whole or not at all."""
-        out.mkdir(parents=True, exist_ok=True)
         path = out / f"{self.name}.json"
-        part = path.with_suffix(".part")
-        part.write_text(json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n")
-        part.replace(path)
+        make_folder(out)
+        write_text(path, json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n")
         print(path)
 
     def markdown(self) -> str:
