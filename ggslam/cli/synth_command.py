@@ -35,6 +35,8 @@ EPILOG = """
   ggslam synth demo/busy --movers walker,mug,door
 
   ggslam synth demo/fast --path turns --speed 3 --blur 0.4
+
+  ggslam synth demo/Replica/room0 --layout replica --size 1200x680 --frames 2000 --no-noise
 """
 
 
@@ -59,6 +61,30 @@ class PathName(str, Enum):
     walk = "walk"
 
 
+class LayoutName(str, Enum):
+    """How the recording lies in its folder."""
+
+    plain = "plain"
+    replica = "replica"
+
+
+LayoutOption = Annotated[
+    LayoutName,
+    typer.Option(
+        help="plain: rgb/, depth/, masks/, camera.yaml, poses.txt; replica: as Replica's recordings: results/, "
+        "traj.txt, cam_params.json, 90 degrees of view."
+    ),
+]
+SizeOption = Annotated[
+    str | None, typer.Option(metavar="WxH", help="Size of the images, like 1200x680; instead of --width and --height.")
+]
+BlurOption = Annotated[
+    float, typer.Option(help="Share of the time between two frames for which the shutter is open.", min=0, max=1)
+]
+RollingOption = Annotated[
+    float,
+    typer.Option(help="Share of the frame time between reading the first and the last row of an image.", min=0, max=1),
+]
 PathOption = Annotated[
     PathName | None,
     typer.Option(
@@ -102,19 +128,13 @@ def synth(
     ] = None,
     width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
     height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
+    size: SizeOption = None,
+    layout: LayoutOption = LayoutName.plain,
     seed: Annotated[int, typer.Option(help="Seed of textures, camera path and noise.", min=0)] = 0,
     path: PathOption = None,
     speed: Annotated[int, typer.Option(help="Factor on the camera's motion between two frames.", min=1)] = 1,
-    blur: Annotated[
-        float,
-        typer.Option(help="Share of the time between two frames for which the shutter is open.", min=0, max=1),
-    ] = 0.0,
-    rolling: Annotated[
-        float,
-        typer.Option(
-            help="Share of the frame time between reading the first and the last row of an image.", min=0, max=1
-        ),
-    ] = 0.0,
+    blur: BlurOption = 0.0,
+    rolling: RollingOption = 0.0,
     depth_delay: Annotated[
         float, typer.Option(help="Share of the frame time by which depth is later than colour.", min=-0.4, max=0.4)
     ] = 0.0,
@@ -141,7 +161,9 @@ def synth(
 
     if frames is None:
         frames = SynthTuning.frames_with_movers if movers is not None else SCENES[scene.value].frames
-    write = _writer(rig, rig_delay, changes, visit, movers, speed, Shutter(blur, rolling, depth_delay))
+    if size is not None:
+        width, height = _size_of(size)
+    write = _writer(rig, rig_delay, changes, visit, movers, speed, Shutter(blur, rolling, depth_delay), layout.value)
     cameras = f" by each of {rig}" if rig is not None else ""
     with progress_bar() as bar:
         task = bar.add_task("render", total=frames, info="")
@@ -155,9 +177,22 @@ def synth(
     )
 
 
+def _size_of(text: str) -> tuple[int, int]:
+    """Width and height.
+
+    Raises:
+        SequenceError: the text is not like 1200x680.
+    """
+    width, _, height = text.partition("x")
+    if not (width.isascii() and width.isdecimal() and height.isascii() and height.isdecimal()):
+        raise SequenceError(f"--size: expected WxH, like 1200x680, found '{text}'")
+    return int(width), int(height)
+
+
 def _writer(
-    rig: str | None, delay: float, changes: int | None, visit: int, movers: str | None, speed: int, shutter: Shutter
-) -> Callable[..., Path]:
+    rig: str | None, delay: float, changes: int | None, visit: int, movers: str | None, speed: int, shutter: Shutter,
+    layout: str,
+) -> Callable[..., Path]:  # fmt: skip
     """What writes the recording, with the options that the others do not have."""
     from ggslam.synthetic import write_synthetic_rig, write_synthetic_sequence
 
@@ -166,11 +201,13 @@ def _writer(
     if rig is None:
         moving = [] if movers is None else movers.split(",")
         return partial(
-            write_synthetic_sequence, changes=changes, visit=visit, movers=moving, speed=speed, shutter=shutter
-        )
+            write_synthetic_sequence, changes=changes, visit=visit, movers=moving, speed=speed, shutter=shutter,
+            layout=layout,
+        )  # fmt: skip
     asked = {
         "--changes": changes is not None, "--movers": movers is not None, "--speed": speed != 1,
         "--blur": shutter.blur, "--rolling": shutter.rolling, "--depth-delay": shutter.depth_delay,
+        "--layout": layout != "plain",
     }  # fmt: skip
     for option, given in asked.items():
         if given:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a generated recording in the plain folder layout."""
+"""Writes a generated recording."""
 
 from __future__ import annotations
 
@@ -10,19 +10,17 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final
 
-import cv2
 import numpy as np
-import yaml
 
 from ggslam import __version__
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import matrix_to_quaternion
 from ggslam.synthetic.changes import MadeChange, room_at_two_visits
 from ggslam.synthetic.exposure import Shutter
+from ggslam.synthetic.layouts import PLAIN, Layout, layout_named
 from ggslam.synthetic.movers import MovingScene, find_movers, movers_of
+from ggslam.synthetic.raycast import RayImages
 from ggslam.synthetic.scene import Scene
 from ggslam.synthetic.scenes import SCENES, SceneKind
 from ggslam.synthetic.sensor import disparity_distortion, noisy_color, noisy_depth
@@ -30,9 +28,6 @@ from ggslam.synthetic.trajectory import camera_path
 from ggslam.system.atomic import write_failure
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import FileTuning, read_untrusted
-
-DEPTH_SCALE: Final = 5000.0
-"""Units per metre of depth images, as in TUM recordings."""
 
 
 class SynthTuning(Tuning):
@@ -42,8 +37,6 @@ class SynthTuning(Tuning):
     """Largest distortion of depth, in steps of disparity."""
     frames_with_movers = 120
     """Frames of a recording with movers."""
-    focal = 0.75
-    """Focal length as a share of the image's width: 67 degrees of view."""
 
 
 CHANGES_FILE = "changes.json"
@@ -68,11 +61,12 @@ def write_synthetic_sequence(
     changes: int | None = None,
     visit: int = 1,
     movers: Sequence[str] = (),
+    layout: str = PLAIN.name,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Ray-casts a recording of a room, a house or a corridor: rgb/, depth/, masks/, camera.yaml and poses.txt; with
-    movers also movers.json.
+    """Ray-casts a recording of a room, a house or a corridor: images, masks, calibration and poses; with movers also
+    movers.json.
 
     The same arguments give the same recording. The folder appears only when it is complete.
 
@@ -96,6 +90,7 @@ def write_synthetic_sequence(
         visit: which of the two, 1 or 2; the second goes the other way round.
         movers: what moves while the room is recorded, of `MOVERS`: each rests, moves and rests again. Without them the
             same frames and seed give the same recording with nothing that moves.
+        layout: of the folder, see `LAYOUTS`: "plain", with 67 degrees of view, or "replica", with 90 degrees.
         overwrite: replaces a recording of this generator that is already there.
         progress: called with (frames done, frames).
 
@@ -105,7 +100,7 @@ def write_synthetic_sequence(
     Raises:
         SequenceError: impossible arguments, or the folder cannot be written.
     """
-    target, made = Path(folder), list[MadeChange]()
+    target, made, files = Path(folder), list[MadeChange](), layout_named(layout)
     if wanted := movers_of(movers):
         if scene != "room" or changes is not None:
             raise SequenceError("movers: only the room has things that move, and not at two visits")
@@ -114,12 +109,12 @@ def write_synthetic_sequence(
         scene, made = _scene_of_visit(scene, seed, changes, visit)
         trajectory = trajectory or "round"
     plan = plan_recording(
-        width, height, frames, seed, noise, trajectory, frame_rate, scene, depth_distortion, speed, shutter
-    )
+        width, height, frames, seed, noise, trajectory, frame_rate, scene, depth_distortion, speed, shutter, files
+    )  # fmt: skip
     poses = plan.poses
     if visit > 1:  # another hand, and the way back
         poses = _poses(plan.scene, len(poses), plan.trajectory, seed + 1, speed)[::-1].copy()
-    check_target(target, "camera.yaml", overwrite)
+    check_target(target, files.file, overwrite)
     moving = find_movers(plan.scene, plan.camera, poses, seed, wanted)
     plan = replace(plan, scene=moving.scene)
     with new_folder(target) as work:
@@ -151,6 +146,7 @@ class RecordingPlan:
         distortion: of its depth camera, steps of disparity.
         poses: T_world_camera, float64 [n, 4, 4].
         shutter: of its camera.
+        layout: of its folder.
     """
 
     scene: Scene
@@ -162,6 +158,7 @@ class RecordingPlan:
     distortion: float
     poses: np.ndarray
     shutter: Shutter = PLAIN_SHUTTER
+    layout: Layout = PLAIN
 
     @property
     def times(self) -> np.ndarray:
@@ -172,7 +169,7 @@ class RecordingPlan:
 def plan_recording(
     width: int, height: int, frames: int | None, seed: int, noise: bool, trajectory: str | None,
     frame_rate: float | None, scene: Scene | str, depth_distortion: float | None, speed: int = 1,
-    shutter: Shutter = PLAIN_SHUTTER,
+    shutter: Shutter = PLAIN_SHUTTER, layout: Layout = PLAIN,
 ) -> RecordingPlan:  # fmt: skip
     """What is to be recorded, of arguments as of `write_synthetic_sequence`.
 
@@ -188,10 +185,10 @@ def plan_recording(
     if speed < 1:
         raise SequenceError(f"speed: expected 1 or more, found {speed}")
     scene = scene if isinstance(scene, Scene) else kind.build(seed, frames * speed)
-    focal = SynthTuning.focal * width
+    focal = layout.focal * width
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     poses = _poses(scene, frames, trajectory, seed, speed)
-    return RecordingPlan(scene, camera, seed, noise, trajectory, frame_rate, distortion, poses, shutter)
+    return RecordingPlan(scene, camera, seed, noise, trajectory, frame_rate, distortion, poses, shutter, layout)
 
 
 def _poses(scene: Scene, frames: int, trajectory: str, seed: int, speed: int) -> np.ndarray:
@@ -294,7 +291,7 @@ def check_target(target: Path, file: str, overwrite: bool) -> None:
     if not any(target.iterdir()):
         return
     description = target / file
-    generated = description.is_file() and b"generator:" in read_untrusted(
+    generated = description.is_file() and b"ggslam synth " in read_untrusted(
         description, FileTuning.max_text_bytes, SequenceError
     )
     if not (overwrite and generated):
@@ -306,8 +303,7 @@ def _write_images(
     folder: Path, plan: RecordingPlan, poses: np.ndarray, number: int, progress: Callable[[int, int], None] | None,
     moving: MovingScene,
 ) -> None:  # fmt: skip
-    for name in ("rgb", "depth", "masks"):
-        (folder / name).mkdir()
+    plan.layout.make_folders(folder)
     offset = disparity_distortion(plan.camera, plan.distortion, plan.seed + number) if plan.distortion else 0.0
     for i, pose in enumerate(poses):
         images = moving.render(i, plan.camera, pose)
@@ -320,44 +316,20 @@ def _write_images(
         if plan.noise:
             rng = np.random.default_rng([plan.seed, 4, i, *([number] if number else [])])
             color, depth = noisy_color(color, rng), noisy_depth(depth, plan.camera, rng, offset)
-        raw = np.rint(np.minimum(depth * DEPTH_SCALE, 65535)).astype(np.uint16)
-        _write_png(folder / "rgb" / f"{i:06d}.png", cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
-        _write_png(folder / "depth" / f"{i:06d}.png", raw)
-        _write_png(folder / "masks" / f"{i:06d}.png", mask)
+        plan.layout.write_images(folder, i, RayImages(color, depth, mask))
         if progress is not None:
             progress(i + 1, len(poses))
 
 
-def _write_png(path: Path, image: np.ndarray) -> None:
-    done, content = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 3])
-    if not done:
-        raise SequenceError(f"{path}: image cannot be encoded")
-    path.write_bytes(content.tobytes())
-
-
 def _write_description(folder: Path, plan: RecordingPlan, poses: np.ndarray, times: np.ndarray) -> None:
-    camera = plan.camera
-    description = {
+    facts = {
         "generator": f"ggslam synth {__version__}",
         "seed": plan.seed,
         "noise": plan.noise,
         "trajectory": plan.trajectory,
         **({} if plan.shutter.is_plain else {"shutter": asdict(plan.shutter)}),
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "depth_scale": DEPTH_SCALE,
         "frame_rate": plan.frame_rate,
         **({"depth_distortion": plan.distortion} if plan.distortion and plan.noise else {}),
         "instances": dict(plan.scene.instance_names),
     }
-    (folder / "camera.yaml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
-    lines = ["# timestamp tx ty tz qx qy qz qw (camera to world)"]
-    for time, T in zip(times.tolist(), poses, strict=True):
-        w, x, y, z = matrix_to_quaternion(T[:3, :3])
-        numbers = (*T[:3, 3], x, y, z, w)
-        lines.append(f"{time:.6f} " + " ".join(f"{value:.9f}" for value in numbers))
-    (folder / "poses.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    plan.layout.write_description(folder, facts, plan.camera, poses, times.tolist())

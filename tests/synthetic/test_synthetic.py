@@ -265,3 +265,33 @@ def test_refusals(tmp_path: Path, recording: Path) -> None:
         write(tmp_path / "broken", frames=3, progress=fill)
     assert failure.value.exit_code == 1
     assert sorted(p.name for p in tmp_path.iterdir()) == ["full", "small"]  # nothing half-written
+
+
+def test_replicas_layout_is_read_as_replica_and_holds_the_scene(tmp_path: Path) -> None:
+    scene = small_scene()
+    folder = write_synthetic_sequence(tmp_path / "room0", frames=3, width=120, height=68, scene=scene, noise=False,
+                                      layout="replica")  # fmt: skip
+    assert {path.name for path in folder.iterdir()} == {"results", "semantic_instance", "traj.txt", "cam_params.json"}
+    sequence = open_sequence(folder)
+    assert sequence.format == "replica"
+    assert sequence.camera == Camera(120, 68, 60.0, 60.0, 59.5, 33.5)
+    caster, poses = RayCaster(scene), camera_path(scene, 3, "loop", 0)
+    for frame, pose in zip(sequence, poses, strict=True):
+        exact = caster.render(sequence.camera, pose)
+        assert frame.T_world_camera is not None and frame.mask is not None
+        np.testing.assert_allclose(frame.T_world_camera, pose, atol=1e-10)
+        np.testing.assert_allclose(frame.depth, exact.depth, atol=0.51 / 6553.5)
+        np.testing.assert_array_equal(frame.mask, exact.mask)
+        assert np.sqrt(np.mean((frame.color.astype(float) - exact.color) ** 2)) < 4  # JPEG
+
+
+def test_replicas_layout_is_replaced_only_where_it_was_generated(tmp_path: Path) -> None:
+    folder = tmp_path / "room0"
+    for seed in (0, 1):
+        write_synthetic_sequence(folder, frames=2, width=32, height=24, seed=seed, scene=small_scene(),
+                                 layout="replica", overwrite=True)  # fmt: skip
+    (folder / "cam_params.json").write_text('{"camera": {}}')
+    with pytest.raises(SequenceError, match="not empty"):
+        write_synthetic_sequence(folder, frames=2, layout="replica", overwrite=True)
+    with pytest.raises(SequenceError, match="layout: expected one of plain, replica, found 'tum'"):
+        write_synthetic_sequence(tmp_path / "other", layout="tum")
