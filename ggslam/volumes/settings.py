@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any, Literal
 
 from ggslam.geometry.scene_size import voxel_times
 from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
@@ -23,6 +24,11 @@ class TsdfLimits(Tuning):
     """Smallest `max_free_weight`."""
 
 
+Integrator = Literal["projection", "rays", "hybrid"]
+INTEGRATORS: tuple[Integrator, ...] = ("projection", "rays", "hybrid")
+"""In the compiled core's order."""
+
+
 @tuning_class(frozen=True)
 class TsdfTuning:
     """Numbers of fusing depth."""
@@ -40,6 +46,12 @@ class TsdfTuning:
     few frames; 0: they are averaged away."""
     decay: float = setting(0.95, 0.01, 1)
     """Factor on all weights per decay, see `decay_every`."""
+    integrator: Integrator = "projection"
+    """Where voxels near a surface have their depth from. projection: the image, at the voxel's projection; rays: the
+    mean of all pixels whose rays pass the voxel; hybrid: that mean of `least_rays` or more, else the projection. Rays
+    take several times as long and are nearer to the truth where voxels are larger than pixels and depth is noisy."""
+    least_rays: int = setting(2, 1, 10**6)
+    """Fewest rays of which `hybrid` takes the mean."""
 
 
 @settings_class(frozen=True)
@@ -81,8 +93,37 @@ class TsdfSettings(TsdfTuning):
             max(usual.max_weight / times**2, TsdfLimits.min_max_weight),
             max(usual.max_free_weight / times**2, TsdfLimits.min_max_free_weight),
         )
-        left = {n: v for n, v in zip(names, new, strict=True) if getattr(self, n) == getattr(usual, n)}
+        left: dict[str, Any] = {
+            n: v for n, v in zip(names, new, strict=True) if getattr(self, n) == getattr(usual, n)
+        }
         return replace(self, **left)
+
+    def numbers(self) -> dict[str, float]:
+        """The settings as numbers by their sorted names, for files; those of the integrator where it is not the usual
+        one."""
+        values = {field.name: getattr(self, field.name) for field in sorted(fields(self), key=lambda f: f.name)}
+        if self.integrator == TsdfSettings.integrator:
+            del values["integrator"], values["least_rays"]
+        else:
+            values["integrator"] = INTEGRATORS.index(self.integrator)
+        return {name: float(value) for name, value in values.items()}
+
+    @classmethod
+    def of_numbers(cls, numbers: dict[str, float]) -> TsdfSettings:
+        """The settings that `numbers` told.
+
+        Raises:
+            ValueError: there is no integrator of that number, or a count is no whole number.
+            ConfigError: others are impossible.
+        """
+        values: dict[str, Any] = dict(numbers)
+        for name in {"integrator", "least_rays"} & values.keys():
+            if values[name] not in range(10**6 if name == "least_rays" else len(INTEGRATORS)):
+                raise ValueError(f"{name} {values[name]:g}")
+            values[name] = int(values[name])
+        if "integrator" in values:
+            values["integrator"] = INTEGRATORS[values["integrator"]]
+        return cls(**values)
 
     @property
     def least_weight(self) -> float:

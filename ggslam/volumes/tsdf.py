@@ -22,7 +22,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame_checks import wrong_unit
 from ggslam.scene.origin import local_origin, moved_pose
 from ggslam.volumes.fusion_view import FusionView
-from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.settings import INTEGRATORS, TsdfSettings
 from ggslam.volumes.working_voxel import working_voxel
 
 SIDE: Final = 8
@@ -207,7 +207,7 @@ class TsdfMap:
             raise InputError(unit)
         numbers = FusionSettings(
             s.min_depth, s.max_depth, s.free_share, s.edge_voxels * s.voxel, s.clearing, s.max_free_weight,
-            int(self.points),
+            INTEGRATORS.index(s.integrator), s.least_rays, int(self.points),
         )  # fmt: skip
         if within is not None:
             low, high = (np.asarray(ends).astype(int).tolist() for ends in within)

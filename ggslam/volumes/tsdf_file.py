@@ -62,12 +62,12 @@ def tsdf_arrays(
         free_weight: [m].
         voxels: of the dense blocks.
     """
-    names = sorted(field.name for field in dataclasses.fields(TsdfSettings))
+    numbers = like.settings.numbers()
     place = {_ORIGIN: like.origin} if like.origin.any() else {}
     return {
         "version": np.array(_VERSION),
-        "setting_names": np.array(names),
-        "setting_values": np.array([getattr(like.settings, name) for name in names], float),
+        "setting_names": np.array(list(numbers)),
+        "setting_values": np.array(list(numbers.values()), float),
         "dense": dense,
         "free": free,
         "free_weight": free_weight,
@@ -138,7 +138,7 @@ def _settings(path: str | Path, arrays: dict[str, np.ndarray]) -> TsdfSettings:
         known = {field.name for field in dataclasses.fields(TsdfSettings)}
         if not known.issuperset(values) or not all(type(v) is float and math.isfinite(v) for v in values.values()):
             raise ValueError("its settings are no finite numbers of a TSDF")
-        return TsdfSettings(**values)
+        return TsdfSettings.of_numbers(values)
     except (KeyError, TypeError, ValueError, OverflowError, ConfigError) as error:
         raise FormatError(f"{path}: not {_CONTENT} written by ggslam: {error}") from None
 

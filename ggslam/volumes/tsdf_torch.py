@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from ggslam.errors import InputError
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.origin import local_origin, moved_pose
@@ -92,12 +93,17 @@ class TorchTsdf:
         settings: of the fusion.
         device: to work on.
         points: whether measured points are counted, as of a `TsdfMap`.
+
+    Raises:
+        InputError: the settings ask for another integrator than projection.
     """
 
     def __init__(
         self, settings: TsdfSettings | None = None, device: str | torch.device = "cpu", points: bool = True
     ) -> None:
         self.settings, self.points = settings or TsdfSettings(), points
+        if self.settings.integrator != "projection":
+            raise InputError(f"integrator: a device looks depth up by projection, not by {self.settings.integrator}")
         self.origin: np.ndarray | None = None
         """Where in the world blocks are counted from, as of a `TsdfMap`; None until the first view."""
         self.device = torch.device(device)

@@ -4,8 +4,9 @@
     python scripts/papers/gpu_mapping.py [--quick]
 
 Generated rooms with a Kinect's noise at true poses: fusion with colour and carving at voxels of 10, 5, 2 and 1 cm of
-images of 640x480 and 1280x720, the distance field after every frame where the camera's period has room for it; a rig
-of four cameras through `ggslam volumes`, points a second.
+images of 640x480 and 1280x720, the distance field after every frame where the camera's period has room for it; depth
+looked up by projection, gathered along rays, and both (hybrid): how far the map drawn at the frames' poses is from
+exact depth, and time; a rig of four cameras through `ggslam volumes`, points a second.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from rows import Paper, options
 from ggslam.scene.frame import Frame
 from ggslam.sequences.factory import open_sequence
 from ggslam.volumes.esdf import DistanceField
-from ggslam.volumes.settings import TsdfSettings
+from ggslam.volumes.raycast import render_depth
+from ggslam.volumes.settings import INTEGRATORS, TsdfSettings
 from ggslam.volumes.tsdf import TsdfMap
 
 SIZES = ((640, 480), (1280, 720))
@@ -76,6 +78,40 @@ def add_sizes(paper: Paper, folder: Path, size: tuple[int, int], count: int, vox
         )  # fmt: skip
 
 
+def add_integrators(paper: Paper, folder: Path, count: int, voxels: tuple[float, ...]) -> None:
+    """Rows of the three integrators, by turns on one recording, whose exact depth is known."""
+    words = ("--frames", count, "--size", "640x480")
+    noisy = list(open_sequence(made(folder / "noisy", *words)).stream(masks=False))
+    exact = list(open_sequence(made(folder / "exact", *words, "--no-noise")).stream(masks=False))
+    for voxel in voxels:
+        spent = {}
+        for kind in INTEGRATORS:
+            tsdf, began = TsdfMap(TsdfSettings(voxel=voxel, integrator=kind), points=False), time.process_time()
+            for frame in noisy:
+                assert frame.T_world_camera is not None
+                tsdf.integrate(frame.depth, frame.camera, frame.T_world_camera, frame.color)
+            spent[kind] = time.process_time() - began
+            errors, missing = drawn_errors(tsdf, exact[::5])
+            paper.add(
+                "integrators", f"{kind}, {100 * voxel:g} cm", "",
+                f"median {np.median(errors):.2f} mm, 90 % {np.percentile(errors, 90):.1f} mm from exact depth",
+                f"{1e3 * spent[kind] / count:.0f} ms of processor time a frame, "
+                f"{spent[kind] / spent['projection']:.1f} times projection's; {100 * missing:.1f} % of pixels empty",
+            )  # fmt: skip
+
+
+def drawn_errors(tsdf: TsdfMap, frames: list[Frame]) -> tuple[np.ndarray, float]:
+    """Distances, mm, of depth drawn from a map at the poses of frames to their own, and the share that is missing."""
+    errors, missing, all_pixels = [], 0, 0
+    for frame in frames:
+        assert frame.T_world_camera is not None
+        drawn = render_depth(tsdf, frame.camera, frame.T_world_camera).depth
+        there = (frame.depth > tsdf.settings.min_depth) & (frame.depth < tsdf.settings.max_depth)
+        errors.append(1e3 * np.abs(drawn - frame.depth)[there & (drawn > 0)])
+        missing, all_pixels = missing + np.count_nonzero(there & (drawn <= 0)), all_pixels + np.count_nonzero(there)
+    return np.concatenate(errors), missing / all_pixels
+
+
 def add_rig(paper: Paper, folder: Path, count: int, voxel: float) -> None:
     """Four cameras at once."""
     rig = made(folder / "rig", "--frames", count, "--width", 640, "--height", 480, "--rig", "front,left,back,right")
@@ -97,6 +133,7 @@ def main() -> None:
         folder, quick = Path(made_here), arguments.quick
         for size in SIZES[:1] if quick else SIZES:
             add_sizes(paper, folder, size, 6 if quick else 60, (0.05,) if quick else VOXELS)
+        add_integrators(paper, folder, 6 if quick else 60, (0.05,) if quick else VOXELS)
         add_rig(paper, folder, 3 if quick else 30, 0.05)
     paper.write(arguments.out)
 

@@ -22,6 +22,7 @@ struct VoxelArrays {
 // Numbers of the fusion. Distances in metres.
 struct FusionSettings {
   float min_depth, max_depth, free_share, edge, clearing, max_free_weight;
+  int32_t integrator, least_rays;    // where voxels near the surface have their depth from, see tsdf_rays.hpp
   int32_t points;                    // whether measured points are counted
   int32_t bounded, low[3], high[3];  // where `bounded`, blocks from `low` to below `high` alone are looked at
 };

@@ -7,7 +7,8 @@
 #include <limits>
 
 #include "common/context.hpp"
-#include "volumes/tsdf_scratch.hpp"
+#include "volumes/tsdf_listed_blocks.hpp"
+#include "volumes/tsdf_rays.hpp"
 
 GGSLAM_DECLARE_KERNEL(void tsdf_prepare_depth(const float* depth, int width, int height, int row, float min_depth,
                                               float farthest, float* out, volumes::DepthTile* tiles, int32_t* valid))
@@ -157,45 +158,16 @@ std::size_t make_blocks(Tsdf& map, const FusionSettings& settings, FusionScratch
   return first;
 }
 
-// Where the octants of a block are marked; as long as one block follows another of a few, the table is not asked.
-class MarkedBlocks {
- public:
-  MarkedBlocks(const Tsdf& map, FusionScratch& scratch, const Vec3i& corner)
-      : map_(map), scratch_(scratch), corner_(corner) {}
-
-  // Null: the block is not listed. `x`, `y`, `z`: blocks from the corner.
-  uint8_t* octants(int32_t x, int32_t y, int32_t z) {
-    Place& place = places_[(x + 3 * y + 5 * z) & (kPlaces - 1)];
-    if (place.known && place.x == x && place.y == y && place.z == z) return place.octants;
-    const int64_t found = map_.find({corner_[0] + x, corner_[1] + y, corner_[2] + z});
-    const int32_t n = found < 0 ? -1 : scratch_.update_of_row[found];
-    place = {true, x, y, z, n < 0 ? nullptr : scratch_.octants.data() + static_cast<std::size_t>(n) * kVoxels};
-    if (n >= 0) __atomic_store_n(&scratch_.marked[n], 1, __ATOMIC_RELAXED);
-    return place.octants;
-  }
-
- private:
-  static constexpr int kPlaces = 64;
-  struct Place {
-    bool known = false;
-    int32_t x, y, z;
-    uint8_t* octants;
-  };
-  const Tsdf& map_;
-  FusionScratch& scratch_;
-  const Vec3i corner_;
-  Place places_[kPlaces];
-};
-
 // Marks the octants of a row's points.
-void mark_row(const OctantRow& row, bool alone, MarkedBlocks& blocks) {
+void mark_row(const OctantRow& row, bool alone, ListedBlocks& blocks, FusionScratch& scratch) {
   for (int begin = 0; begin < row.width; begin += 64)
     for (uint64_t fresh = row.fresh[begin / 64]; fresh != 0; fresh &= fresh - 1) {
       const int u = begin + __builtin_ctzll(fresh);
       const int32_t x = row.out[0][u], y = row.out[1][u], z = row.out[2][u];
-      uint8_t* octants = blocks.octants(x >> 4, y >> 4, z >> 4);
-      if (octants == nullptr) continue;
-      octants += (x >> 1 & 7) + (y >> 1 & 7) * kSide + (z >> 1 & 7) * kSide * kSide;
+      const int32_t n = blocks.find(x >> 4, y >> 4, z >> 4);
+      if (n < 0) continue;
+      __atomic_store_n(&scratch.marked[n], 1, __ATOMIC_RELAXED);
+      uint8_t* const octants = scratch.octants.data() + static_cast<std::size_t>(n) * kVoxels + (x >> 1 & 7) + (y >> 1 & 7) * kSide + (z >> 1 & 7) * kSide * kSide;
       const auto bit = static_cast<uint8_t>(1 << ((x & 1) + 2 * (y & 1) + 4 * (z & 1)));
       if (alone)
         *octants |= bit;
@@ -232,9 +204,7 @@ void mark_points(const Tsdf& map, const FusionInput& in, const FusionSettings& s
   constexpr int kOctants = 2 * kSide;  // along the edge of a block
   scratch.octants.resize(std::max(scratch.octants.size(), scratch.updates.size() * kVoxels), 0);
   scratch.marked.assign(scratch.updates.size(), 0);
-  scratch.update_of_row.resize(std::max(scratch.update_of_row.size(), map.size()), -1);
-  for (std::size_t n = 0; n < scratch.updates.size(); ++n)
-    scratch.update_of_row[scratch.updates[n].row] = static_cast<int32_t>(n);
+  const ListedRows rows(map, scratch);
   const Mat3d axes = Mat3d::from(in.rotation).transpose();
   const double octant = 0.5 * map.voxel;
   const Vec3d position = -1.0 / (kOctants * octant) * (axes * Vec3d::from(in.translation));
@@ -245,8 +215,8 @@ void mark_points(const Tsdf& map, const FusionInput& in, const FusionSettings& s
   const auto kernel = GGSLAM_DISPATCH(context.isa, tsdf_octants_of_row);
   const bool alone = context.pool.size() == 1;
   context.pool.parallel_for(in.height, 32, [&](std::size_t begin, std::size_t end, int) {
-    MarkedBlocks blocks(map, scratch, corner);
-    OctantRows rows(in.width);
+    ListedBlocks blocks(map, scratch, corner);
+    OctantRows turns(in.width);
     OctantRow row = common;
     for (std::size_t v = begin; v < end; ++v) {
       row.depth = scratch.images.depth.data() + v * in.width;
@@ -255,12 +225,11 @@ void mark_points(const Tsdf& map, const FusionInput& in, const FusionSettings& s
         row.first[a] = static_cast<float>((axes(a, 0) * (-in.cx / in.fx) + axes(a, 1) * y + axes(a, 2)) / octant);
         row.step[a] = static_cast<float>(axes(a, 0) / in.fx / octant);
       }
-      rows.next(row);
+      turns.next(row);
       kernel(row);
-      mark_row(row, alone, blocks);
+      mark_row(row, alone, blocks, scratch);
     }
   });
-  for (const FusionScratch::Update& update : scratch.updates) scratch.update_of_row[update.row] = -1;
 }
 
 void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings& settings, Context& context,
@@ -274,6 +243,7 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
   view.fx = in.fx, view.fy = in.fy, view.cx = in.cx, view.cy = in.cy;
   view.truncation = map.truncation, view.voxel = map.voxel, view.edge = settings.edge;
   view.clearing = settings.clearing, view.max_depth = settings.max_depth;
+  view.rays_alone = settings.integrator == kRays, view.least_rays = settings.least_rays;
   view.weight_scale = kFullWeight / map.max_weight;
   view.max_free_weight = settings.max_free_weight * view.weight_scale;
   const Mat3d rotation = Mat3d::from(in.rotation);
@@ -287,6 +257,8 @@ void update_blocks(const Tsdf& map, const FusionInput& in, const FusionSettings&
       cast<float>(rotation * p + Vec3d::from(in.translation)).to(own.origin);
       own.points = map.points(map.block(update.row));
       own.octants = own.points != nullptr && scratch.marked[n] ? scratch.octants.data() + n * kVoxels : nullptr;
+      const bool rays = settings.integrator == kRays || (settings.integrator == kHybrid && scratch.passed[n]);
+      own.rays = rays ? scratch.rays.data() + n * kVoxels : nullptr;
       update.flags = kernel(own, *update.voxels);
     }
   });
@@ -326,6 +298,7 @@ void fuse(Tsdf& map, const FusionInput& in, const FusionSettings& settings, Cont
   for (std::size_t first = 0; first < scratch.candidates.size();) {
     first = make_blocks(map, settings, scratch, stats, first);
     if (map.counts_points()) mark_points(map, in, settings, context, scratch);
+    if (settings.integrator != kProjection) cast_rays(map, in, settings, context, scratch);
     update_blocks(map, in, settings, context, scratch);
     finish_blocks(map, scratch, stats);
     stats.updated += scratch.updates.size();

@@ -130,6 +130,8 @@ class CandidateSearch {
 // What happened to a block's voxels; bits.
 enum : unsigned { kChanged = 1, kInBand = 2, kAllFree = 4, kNoneSeen = 8 };
 
+struct RaySum;
+
 // A block to be updated, for the kernel.
 struct VoxelUpdate {
   const float* depth;
@@ -146,6 +148,9 @@ struct VoxelUpdate {
   float max_free_weight;   // in 65535ths of the largest
   PointBlock* points;      // of the block; null: not counted
   uint8_t* octants;        // [kVoxels], those of the block that the view has points in, which are cleared; null: none
+  RaySum* rays;            // [kVoxels], what rays told the block, which is cleared; null: nothing
+  bool rays_alone;         // voxels near the surface that no ray passed stay as they are
+  int32_t least_rays;      // that count; fewer: the depth at the voxel's projection does
 };
 
 // A row of the depth image as octants of voxels from a corner of blocks: at depth z of column u they are floor(origin + z

@@ -2,6 +2,7 @@
 #include "common/context.hpp"
 #include "common/guard.hpp"
 #include "abi/core/volumes.hpp"
+#include "volumes/tsdf_rays.hpp"
 #include "volumes/tsdf_scratch.hpp"
 
 namespace {
@@ -24,6 +25,8 @@ void check_settings(const ggslam::volumes::FusionSettings& settings) {
   using namespace ggslam;
   check_range("min_depth", settings.min_depth, 0.0f, 1e6f), check_range("max_depth", settings.max_depth, 0.0f, 1e6f);
   check_range("free_share", settings.free_share, 0.0f, 1.0f), check_range("clearing", settings.clearing, 0.0f, 1.0f);
+  check_range("integrator", settings.integrator, volumes::kProjection, volumes::kHybrid);
+  check_range("least_rays", settings.least_rays, 1, 1 << 20);
   check_range("edge", settings.edge, 0.0f, 1e6f);
   check_range("max_free_weight", settings.max_free_weight, 0.0f, 1e6f);
 }

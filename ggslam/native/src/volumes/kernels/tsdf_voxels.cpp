@@ -4,7 +4,7 @@
 #include <cstring>
 
 #include "volumes/kernels/voxel_vectors.hpp"
-#include "volumes/tsdf_fusion.hpp"
+#include "volumes/tsdf_scratch.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 namespace {
@@ -109,6 +109,26 @@ void interpolate(const VoxelUpdate& t, Group& g) {
   const Float x = u - to_float(u0), y = v - to_float(v0);
   const Float top = a + x * (b - a), bottom = c + x * (d - c);
   g.distance = select(smooth, top + y * (bottom - top) - g.z, g.distance);
+}
+
+// Takes the mean of what rays told the voxels, which is then forgotten. Where the nearest pixel looks past a voxel, or
+// ends before it, it is left to that: rays of a thin thing's pixels would widen it by half a voxel.
+void gather_rays(const VoxelUpdate& t, Work& w) {
+  const float unit = t.truncation / volumes::RaySum::kUnits;
+  for (int n = 0; n < kGroups; ++n) {
+    Group& g = w.groups[n];
+    volumes::RaySum* const sums = t.rays + n * kLanes;
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const volumes::RaySum sum = sums[lane];
+      const float distance = g.distance[lane];
+      if (!(distance < t.truncation && distance >= -t.truncation)) continue;
+      if (sum.count >= (t.rays_alone ? 1 : t.least_rays))
+        g.distance[lane] = unit * static_cast<float>(sum.distance) / static_cast<float>(sum.count);
+      else if (t.rays_alone)
+        g.distance[lane] = kNothing;
+    }
+    std::fill(sums, sums + kLanes, volumes::RaySum{});
+  }
 }
 
 // Clears voxels that the view surely looks through, with all pixels around and by more than the depth is wrong: they lose a
@@ -270,6 +290,7 @@ unsigned tsdf_fuse_block(const VoxelUpdate& t, VoxelBlock& block) {
   Work w;
   project(t, w);
   for (int n = 0; n < w.near.count; ++n) interpolate(t, w.groups[w.near.group[n]]);
+  if (t.rays != nullptr) gather_rays(t, w);
   Mask changed{};
   for (int n = 0; n < w.seen.count; ++n) average(t, w, w.seen.group[n], block, changed);
   const bool points = t.octants != nullptr;
