@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,7 +32,9 @@ EPILOG = """
 
   ggslam encode house.grid house.ggc --workers 4
 
-  ggslam encode runs/kitchen study/ --sweep both
+  ggslam encode scan.pcd scan.bin --voxel 0.01 --geometry-qp 8
+
+  ggslam encode runs/kitchen study/ --sweep all
 """
 
 
@@ -64,7 +67,9 @@ class Sweep(str, Enum):
 
     qp = "qp"
     geometry = "geometry"
+    geometry_qp = "geometry-qp"
     both = "both"
+    all = "all"
 
 
 Slicing = Annotated[
@@ -73,6 +78,17 @@ Slicing = Annotated[
         help="How slices are cut: equal numbers of points, equal intervals of the longest axis, or octree cubes."
     ),
 ]
+GeometryQp = Annotated[
+    int,
+    typer.Option(
+        help="Quantiser of the positions within the octree; adding 8 doubles the step, 0: lossless.", min=0, max=96
+    ),
+]
+Varied = Annotated[
+    Sweep | None,
+    typer.Option(help="Write a study, with tables, plots and pictures: over QPs of colours (qp), geometry scales "
+                 "(geometry), QPs of positions (geometry-qp), the first two (both) or all of them."),
+]  # fmt: skip
 Source = Annotated[
     Path,
     typer.Argument(metavar="INPUT", help="PLY or PCD file, file of Gaussians (3DGS .ply, .sog, .spz, ...), folder that "
@@ -96,6 +112,7 @@ def encode(
     ] = 22,
     chroma_offset: Annotated[int, typer.Option(help="Added to --qp for chroma.", min=-51, max=51)] = 0,
     geometry_scale: Annotated[float, typer.Option(help="Resolution of the positions; 0.5: half.", min=1e-6)] = 1.0,
+    geometry_qp: GeometryQp = 0,
     voxel: Annotated[
         float | None, typer.Option(help="Voxel size in metres; default: the cloud's own grid, else --bits.", min=1e-9)
     ] = None,
@@ -112,9 +129,7 @@ def encode(
     ids: Annotated[
         bool, typer.Option("--ids/--no-ids", help="Also code object ids and other whole numbers, without loss.")
     ] = True,
-    sweep: Annotated[
-        Sweep | None, typer.Option(help="Write a study over QPs or geometry scales: tables, plots, pictures.")
-    ] = None,
+    sweep: Varied = None,
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw a study's plots.")] = True,
     engine: options.CellEngine = options.EngineName.local,
     workers: options.CellWorkers = None,
@@ -132,11 +147,12 @@ def encode(
     if of_store != is_store(source):
         raise ConfigError(f"a grid store becomes a .ggc, and nothing else does: found {source} and {out}")
     settings = CodecSettings(
-        qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, voxel_size=voxel, geometry_bits=bits,
-        slices=slices, split="cube" if split is Split.by_octree else split.value, threads=threads,
+        qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, geometry_qp=geometry_qp,
+        voxel_size=voxel, geometry_bits=bits, slices=slices, threads=threads,
+        split="cube" if split is Split.by_octree else split.value,
     )  # fmt: skip
     if sweep is not None:
-        _study(source, out, settings, ["qp", "geometry"] if sweep is Sweep.both else [sweep.value], plots)
+        _study(source, out, settings, _kinds(sweep), plots)
         return
     if of_store:
         return _encode_store(source, out, settings, rate, (engine, workers, address))
@@ -216,8 +232,8 @@ def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None,
                 raise ConfigError(f"--{option} goes with --preset pointcloud; the quality of --preset splat is --rate")
     elif "rate" in given:
         raise ConfigError("--rate goes with --preset splat; the quality of --preset pointcloud is --qp")
-    if sweep is not None and given & {"qp", "geometry_scale"}:
-        raise ConfigError("--qp and --geometry-scale are what --sweep varies")
+    if sweep is not None and given & {"qp", "geometry_scale", "geometry_qp"}:
+        raise ConfigError("--qp, --geometry-scale and --geometry-qp are what --sweep varies")
     if sweep is not None and "ids" in given:
         raise ConfigError("--sweep codes no ids: leave --ids and --no-ids out")
     if sweep is None and "plots" in given:
@@ -244,7 +260,15 @@ def _rate(size: int, points: int) -> str:
     return f"{8 * size / points:.3f}"
 
 
-def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], plots: bool) -> None:
+def _kinds(sweep: Sweep) -> Sequence[str]:
+    """The sweeps of a study."""
+    from ggslam.coding.study import SWEEPS
+
+    several = {Sweep.both: SWEEPS[:2], Sweep.all: SWEEPS}
+    return several.get(sweep, (sweep.value.replace("-", "_"),))
+
+
+def _study(source: Path, out: Path, settings: CodecSettings, kinds: Sequence[str], plots: bool) -> None:
     from ggslam.coding.study import sweep_steps
     from ggslam.jobs.encode.coding import study_cloud
     from ggslam.jobs.encode.study import write_study
@@ -255,7 +279,7 @@ def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], p
         task = bar.add_task("sweep", total=len(steps), info="")
 
         def show(row: StudyRow) -> None:
-            bar.update(task, advance=1, info=f"QP {row.step.qp} scale {row.step.geometry_scale:g}")
+            bar.update(task, advance=1, info=row.step.words())
 
         study = write_study(cloud, steps, settings, out, plots, show)
     columns = ["step", "points", "bits", "Y dB", "D1 dB", "D2 dB", "enc. s", "dec. s", "J"]
@@ -268,10 +292,8 @@ def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], p
 
 
 def _study_cells(row: StudyRow) -> list[str]:
-    step = row.step
-    name = f"QP {step.qp}" if step.sweep == "qp" else f"scale {step.geometry_scale:g}"
     return [
-        name, str(row.decoded_points), _rate(row.total_bytes, row.input_points), f"{row.color.y:.2f}",
+        row.step.words(), str(row.decoded_points), _rate(row.total_bytes, row.input_points), f"{row.color.y:.2f}",
         f"{row.d1:.2f}", f"{row.d2:.2f}", f"{row.encode_s:.2f}", f"{row.decode_s:.2f}",
         "-" if row.joules is None else f"{row.joules:.1f}",
     ]  # fmt: skip
