@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,6 +18,7 @@ from ggslam.system.plurals import quantity
 if TYPE_CHECKING:
     from ggslam.coding import CodecSettings, CodingReport
     from ggslam.coding.study import StudyRow
+    from ggslam.jobs.run.encoding import EncodeRequest
 
 EPILOG = """
 [bold]Examples[/]
@@ -136,7 +137,6 @@ def encode(
     address: options.CellAddress = None,
 ) -> None:
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
-    from ggslam.coding import CodecSettings
     from ggslam.jobs.encode.coded_cells import is_cells_file
     from ggslam.jobs.encode.coding import encode_file
     from ggslam.jobs.submaps.stores import is_store
@@ -146,11 +146,7 @@ def encode(
     _refuse_ignored(context, Preset.splat if contained or of_store else preset, sweep, of_store)
     if of_store != is_store(source):
         raise ConfigError(f"a grid store becomes a .ggc, and nothing else does: found {source} and {out}")
-    settings = CodecSettings(
-        qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, geometry_qp=geometry_qp,
-        voxel_size=voxel, geometry_bits=bits, slices=slices, threads=threads,
-        split="cube" if split is Split.by_octree else split.value,
-    )  # fmt: skip
+    settings = _settings(context.params)
     if sweep is not None:
         _study(source, out, settings, _kinds(sweep), plots)
         return
@@ -163,6 +159,51 @@ def encode(
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {done.path}", highlight=False, markup=False)
+
+
+def _settings(values: Mapping[str, Any]) -> CodecSettings:
+    """What the options of this command say of the codec."""
+    from ggslam.coding import CodecSettings
+
+    split = _word(values["split"])
+    return CodecSettings(
+        qp=values["qp"], chroma_offset=values["chroma_offset"], geometry_scale=values["geometry_scale"],
+        geometry_qp=values["geometry_qp"], voxel_size=values["voxel"], geometry_bits=values["bits"],
+        slices=values["slices"], threads=values["threads"], split="cube" if split == "octree" else split,
+    )  # fmt: skip
+
+
+def _word(value: Enum | str) -> Any:
+    """The value of a choice, which typer keeps as a word until the command is called."""
+    return value.value if isinstance(value, Enum) else value
+
+
+def run_encoding(context: typer.Context, out: Path, words: Sequence[str]) -> EncodeRequest:
+    """What `ggslam encode RUN OUT` with options would code a run as that is still to be made.
+
+    Args:
+        context: of another command.
+        out: the file.
+        words: options of this command, as "qp=28" or "no-ids".
+
+    Raises:
+        ConfigError: options that are none, or not for a run.
+    """
+    from ggslam.jobs.run.encoding import EncodeRequest
+    from ggslam.runs.map_container import is_container
+
+    parted = [word.partition("=") for word in words]
+    typed = [part for name, sign, value in parted for part in (f"--{name}", *([value] if sign else []))]
+    group = context.parent
+    command = None if group is None else group.command.get_command(group, "encode")  # type: ignore[attr-defined]
+    assert command is not None
+    own = command.make_context("encode", ["RUN", str(out), *typed], parent=group)
+    values = own.params
+    if values["sweep"] is not None:
+        raise ConfigError("--encode-with: --sweep writes a study, which is made of a finished run")
+    preset = Preset(_word(values["preset"]))
+    _refuse_ignored(own, Preset.splat if is_container(out) else preset, None, False)
+    return EncodeRequest(out, _settings(values), preset.value, _word(values["rate"]), values["ids"])
 
 
 def _encode_store(
