@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +18,7 @@ from ggslam.system.plurals import quantity
 if TYPE_CHECKING:
     from ggslam.coding import CodecSettings, CodingReport
     from ggslam.coding.study import StudyRow
+    from ggslam.jobs.run.encoding import EncodeRequest
 
 EPILOG = """
 [bold]Examples[/]
@@ -31,7 +33,9 @@ EPILOG = """
 
   ggslam encode house.grid house.ggc --workers 4
 
-  ggslam encode runs/kitchen study/ --sweep both
+  ggslam encode scan.pcd scan.bin --voxel 0.01 --geometry-qp 8
+
+  ggslam encode runs/kitchen study/ --sweep all
 """
 
 
@@ -64,7 +68,9 @@ class Sweep(str, Enum):
 
     qp = "qp"
     geometry = "geometry"
+    geometry_qp = "geometry-qp"
     both = "both"
+    all = "all"
 
 
 Slicing = Annotated[
@@ -73,6 +79,17 @@ Slicing = Annotated[
         help="How slices are cut: equal numbers of points, equal intervals of the longest axis, or octree cubes."
     ),
 ]
+GeometryQp = Annotated[
+    int,
+    typer.Option(
+        help="Quantiser of the positions within the octree; adding 8 doubles the step, 0: lossless.", min=0, max=96
+    ),
+]
+Varied = Annotated[
+    Sweep | None,
+    typer.Option(help="Write a study, with tables, plots and pictures: over QPs of colours (qp), geometry scales "
+                 "(geometry), QPs of positions (geometry-qp), the first two (both) or all of them."),
+]  # fmt: skip
 Source = Annotated[
     Path,
     typer.Argument(metavar="INPUT", help="PLY or PCD file, file of Gaussians (3DGS .ply, .sog, .spz, ...), folder that "
@@ -96,6 +113,7 @@ def encode(
     ] = 22,
     chroma_offset: Annotated[int, typer.Option(help="Added to --qp for chroma.", min=-51, max=51)] = 0,
     geometry_scale: Annotated[float, typer.Option(help="Resolution of the positions; 0.5: half.", min=1e-6)] = 1.0,
+    geometry_qp: GeometryQp = 0,
     voxel: Annotated[
         float | None, typer.Option(help="Voxel size in metres; default: the cloud's own grid, else --bits.", min=1e-9)
     ] = None,
@@ -112,16 +130,13 @@ def encode(
     ids: Annotated[
         bool, typer.Option("--ids/--no-ids", help="Also code object ids and other whole numbers, without loss.")
     ] = True,
-    sweep: Annotated[
-        Sweep | None, typer.Option(help="Write a study over QPs or geometry scales: tables, plots, pictures.")
-    ] = None,
+    sweep: Varied = None,
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw a study's plots.")] = True,
     engine: options.CellEngine = options.EngineName.local,
     workers: options.CellWorkers = None,
     address: options.CellAddress = None,
 ) -> None:
     """Encode a point cloud or a Gaussian map as an MPEG G-PCC stream (ISO/IEC 23090-9), in parallel slices."""
-    from ggslam.coding import CodecSettings
     from ggslam.jobs.encode.coded_cells import is_cells_file
     from ggslam.jobs.encode.coding import encode_file
     from ggslam.jobs.submaps.stores import is_store
@@ -131,12 +146,9 @@ def encode(
     _refuse_ignored(context, Preset.splat if contained or of_store else preset, sweep, of_store)
     if of_store != is_store(source):
         raise ConfigError(f"a grid store becomes a .ggc, and nothing else does: found {source} and {out}")
-    settings = CodecSettings(
-        qp=qp, chroma_offset=chroma_offset, geometry_scale=geometry_scale, voxel_size=voxel, geometry_bits=bits,
-        slices=slices, split="cube" if split is Split.by_octree else split.value, threads=threads,
-    )  # fmt: skip
+    settings = _settings(context.params)
     if sweep is not None:
-        _study(source, out, settings, ["qp", "geometry"] if sweep is Sweep.both else [sweep.value], plots)
+        _study(source, out, settings, _kinds(sweep), plots)
         return
     if of_store:
         return _encode_store(source, out, settings, rate, (engine, workers, address))
@@ -147,6 +159,51 @@ def encode(
     for note in done.notes:
         console.print(f"note: {note}", highlight=False, markup=False)
     console.print(f"wrote {done.path}", highlight=False, markup=False)
+
+
+def _settings(values: Mapping[str, Any]) -> CodecSettings:
+    """What the options of this command say of the codec."""
+    from ggslam.coding import CodecSettings
+
+    split = _word(values["split"])
+    return CodecSettings(
+        qp=values["qp"], chroma_offset=values["chroma_offset"], geometry_scale=values["geometry_scale"],
+        geometry_qp=values["geometry_qp"], voxel_size=values["voxel"], geometry_bits=values["bits"],
+        slices=values["slices"], threads=values["threads"], split="cube" if split == "octree" else split,
+    )  # fmt: skip
+
+
+def _word(value: Enum | str) -> Any:
+    """The value of a choice, which typer keeps as a word until the command is called."""
+    return value.value if isinstance(value, Enum) else value
+
+
+def run_encoding(context: typer.Context, out: Path, words: Sequence[str]) -> EncodeRequest:
+    """What `ggslam encode RUN OUT` with options would code a run as that is still to be made.
+
+    Args:
+        context: of another command.
+        out: the file.
+        words: options of this command, as "qp=28" or "no-ids".
+
+    Raises:
+        ConfigError: options that are none, or not for a run.
+    """
+    from ggslam.jobs.run.encoding import EncodeRequest
+    from ggslam.runs.map_container import is_container
+
+    parted = [word.partition("=") for word in words]
+    typed = [part for name, sign, value in parted for part in (f"--{name}", *([value] if sign else []))]
+    group = context.parent
+    command = None if group is None else group.command.get_command(group, "encode")  # type: ignore[attr-defined]
+    assert command is not None
+    own = command.make_context("encode", ["RUN", str(out), *typed], parent=group)
+    values = own.params
+    if values["sweep"] is not None:
+        raise ConfigError("--encode-with: --sweep writes a study, which is made of a finished run")
+    preset = Preset(_word(values["preset"]))
+    _refuse_ignored(own, Preset.splat if is_container(out) else preset, None, False)
+    return EncodeRequest(out, _settings(values), preset.value, _word(values["rate"]), values["ids"])
 
 
 def _encode_store(
@@ -216,8 +273,8 @@ def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None,
                 raise ConfigError(f"--{option} goes with --preset pointcloud; the quality of --preset splat is --rate")
     elif "rate" in given:
         raise ConfigError("--rate goes with --preset splat; the quality of --preset pointcloud is --qp")
-    if sweep is not None and given & {"qp", "geometry_scale"}:
-        raise ConfigError("--qp and --geometry-scale are what --sweep varies")
+    if sweep is not None and given & {"qp", "geometry_scale", "geometry_qp"}:
+        raise ConfigError("--qp, --geometry-scale and --geometry-qp are what --sweep varies")
     if sweep is not None and "ids" in given:
         raise ConfigError("--sweep codes no ids: leave --ids and --no-ids out")
     if sweep is None and "plots" in given:
@@ -244,7 +301,15 @@ def _rate(size: int, points: int) -> str:
     return f"{8 * size / points:.3f}"
 
 
-def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], plots: bool) -> None:
+def _kinds(sweep: Sweep) -> Sequence[str]:
+    """The sweeps of a study."""
+    from ggslam.coding.study import SWEEPS
+
+    several = {Sweep.both: SWEEPS[:2], Sweep.all: SWEEPS}
+    return several.get(sweep, (sweep.value.replace("-", "_"),))
+
+
+def _study(source: Path, out: Path, settings: CodecSettings, kinds: Sequence[str], plots: bool) -> None:
     from ggslam.coding.study import sweep_steps
     from ggslam.jobs.encode.coding import study_cloud
     from ggslam.jobs.encode.study import write_study
@@ -255,7 +320,7 @@ def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], p
         task = bar.add_task("sweep", total=len(steps), info="")
 
         def show(row: StudyRow) -> None:
-            bar.update(task, advance=1, info=f"QP {row.step.qp} scale {row.step.geometry_scale:g}")
+            bar.update(task, advance=1, info=row.step.words())
 
         study = write_study(cloud, steps, settings, out, plots, show)
     columns = ["step", "points", "bits", "Y dB", "D1 dB", "D2 dB", "enc. s", "dec. s", "J"]
@@ -268,10 +333,8 @@ def _study(source: Path, out: Path, settings: CodecSettings, kinds: list[str], p
 
 
 def _study_cells(row: StudyRow) -> list[str]:
-    step = row.step
-    name = f"QP {step.qp}" if step.sweep == "qp" else f"scale {step.geometry_scale:g}"
     return [
-        name, str(row.decoded_points), _rate(row.total_bytes, row.input_points), f"{row.color.y:.2f}",
+        row.step.words(), str(row.decoded_points), _rate(row.total_bytes, row.input_points), f"{row.color.y:.2f}",
         f"{row.d1:.2f}", f"{row.d2:.2f}", f"{row.encode_s:.2f}", f"{row.decode_s:.2f}",
         "-" if row.joules is None else f"{row.joules:.1f}",
     ]  # fmt: skip

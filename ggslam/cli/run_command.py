@@ -21,6 +21,7 @@ from ggslam.cli.summary import print_scores, print_verdict
 from ggslam.errors import ConfigError, TrackingLostError
 
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
+    from ggslam.jobs.run.encoding import EncodeRequest
     from ggslam.jobs.run.pipeline import RunOutcome, RunRequest
     from ggslam.runs.recordings import SequenceRequest
 
@@ -46,6 +47,8 @@ EPILOG = """
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
 
   ggslam run --resume runs/kitchen
+
+  ggslam run data/redkitchen --scale 0.5 --encode kitchen.bin --encode-with slices=4
 """
 
 _SHORTCUTS = {
@@ -55,7 +58,8 @@ _SHORTCUTS = {
 """Settings that have options of their own, with their parameters."""
 _MODEL = "masks.model"
 """Setting that whoever goes on with a run has to know, if it has one."""
-_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate", "strict"}
+_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate", "strict",
+                "encode", "encode_with"}  # fmt: skip
 """Options that change nothing of what a run computes."""
 
 
@@ -134,6 +138,16 @@ CheckpointEvery = Annotated[
         help="Save a checkpoint every FRAMES frames; 0: never. Default: as often as costs 1 % of the time.",
     ),
 ]
+EncodeTo = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Also code the run, as `ggslam encode RUN FILE` does afterwards, byte for byte. "
+                 "Slices are coded beside scoring, for no point is final before the last refinement ends. With "
+                 "--resume name it again."),
+]
+EncodeWith = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=VALUE", help="Option of `ggslam encode` for --encode, as qp=28 or no-ids; repeatable."),
+]
 Strict = Annotated[
     bool, typer.Option("--strict", help="Exit with code 3 if the verdict is bad or something seems wrong.")
 ]
@@ -178,6 +192,7 @@ def run(
     strict: Strict = False,
     resume: Resume = None,
     checkpoint_every: CheckpointEvery = None,
+    encode: EncodeTo = None, encode_with: EncodeWith = None,
     help_settings: settings_help.HelpSettings = False, help_setting: settings_help.HelpSetting = None,
 ) -> None:  # fmt: skip
     """Track the camera, build the map, write a run folder and score it."""
@@ -185,8 +200,9 @@ def run(
     from ggslam.runs.recordings import SequenceRequest
 
     watched = _Watched(log, (host, port) if view else None, strict)
+    coded_as = _encode_request(context, encode, encode_with)
     if resume is not None:
-        return _go_on(context, resume, sequence, checkpoint_every, evaluate, settings, loss, watched)
+        return _go_on(context, resume, sequence, checkpoint_every, evaluate, settings, loss, coded_as, watched)
     reading = SequenceRequest(
         _recording(sequence), format_name, start, stop, stride, scale, masks, depth_scale,
         "skip" if skip_bad_frames else "error", depth_camera, min_confidence, tuple(topics or ()), pose_convention,
@@ -196,8 +212,20 @@ def run(
     request = replace(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
         map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check, loss=loss,
+        encode=coded_as,
     )  # fmt: skip
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
+
+
+def _encode_request(context: typer.Context, out: Path | None, words: list[str] | None) -> EncodeRequest | None:
+    """What the run is to be coded as. Raises ConfigError for options that are none."""
+    from ggslam.cli.encode_command import run_encoding
+
+    if out is None:
+        if words:
+            raise ConfigError("--encode-with goes with --encode")
+        return None
+    return run_encoding(context, out, words or [])
 
 
 def _recording(sequence: Path | None) -> Path:
@@ -220,7 +248,7 @@ def overrides_of(parameters: Mapping[str, Any]) -> list[str]:
 
 def _go_on(
     context: typer.Context, run: Path, recording: Path | None, checkpoint_every: int | None, evaluate: bool,
-    settings: list[str] | None, loss: str | None, watched: _Watched,
+    settings: list[str] | None, loss: str | None, coded_as: EncodeRequest | None, watched: _Watched,
 ) -> None:  # fmt: skip
     """Goes on with a run that was cut off."""
     from ggslam.jobs.run.pipeline import resume
@@ -229,6 +257,7 @@ def _go_on(
     given = refuse_other_options(context, ["loss", *(["settings"] if len(models) == len(settings or []) else [])])
     model = models[-1] if models else None
     again = partial(resume, run, recording=recording, checkpoint_every=checkpoint_every, model=model, loss=loss)
+    again = partial(again, encode=coded_as)
     again = partial(again, evaluate=evaluate) if "evaluate" in given else again
     _run_and_show(again, run.resolve().name, watched)
 
@@ -293,6 +322,8 @@ def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) 
             wait_for_interrupt(lambda: console.print(text, highlight=False, markup=False))
     if outcome.error is not None:
         raise outcome.error
+    if outcome.encode_failure is not None:
+        raise outcome.encode_failure
     if failure := _failure(outcome):
         raise TrackingLostError(f"{failure}; what there is was saved to {outcome.folder.path}")
     if watched.strict and (outcome.verdicts or (outcome.verdict is not None and outcome.verdict.grade == "bad")):
@@ -307,6 +338,8 @@ def _print(outcome: RunOutcome) -> None:
         console.print(f"[yellow]{verdict.severity}:[/] {escape(verdict.text)}", highlight=False)
     if outcome.verdict is not None:
         print_verdict(outcome.verdict)
+    if outcome.encoded:
+        console.print(outcome.encoded, highlight=False, markup=False, soft_wrap=True)
     if _failure(outcome):
         return
     for hint in next_commands(outcome.folder.path) if outcome.error is None else go_on_command(outcome.folder.path):

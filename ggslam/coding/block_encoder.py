@@ -25,6 +25,7 @@ from ggslam.coding.encoder import checked_points, encode_cloud, parameter_units,
 from ggslam.coding.geometry_syntax import GeometryParameters
 from ggslam.coding.geometry_tools import GeometrySample, geometry_parameters
 from ggslam.coding.parallel_slices import in_order
+from ggslam.coding.position_quantiser import PositionQuantiser
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.settings import CodecSettings
 from ggslam.coding.slice_encoder import CloudToCode, CodedSlice, encode_slice
@@ -142,7 +143,7 @@ class _Spool:
     def geometry(self, grid: Quantization) -> GeometryParameters:
         """The parameter set of all slices."""
         assert grid.size is not None
-        sample = GeometrySample(self.count, grid.size)
+        sample = GeometrySample(self.count, grid.size, PositionQuantiser(self.settings.geometry_qp))
         for rows in self.blocks():
             sample.add(grid.of(np.ascontiguousarray(rows[_POINTS])))
         return geometry_parameters(self.settings, sample)
@@ -205,7 +206,7 @@ def _encode_whole(cloud: _Spool, out: Path) -> CodingReport:
 
 def _encode_cut(cloud: _Spool, cut: _Cut, coded: IO[bytes], out: Path) -> CodingReport:
     plans, grid = plan_summaries(cloud.summaries, cloud.settings), cloud.quantization()
-    sequence = sequence_parameters(grid, [plan for plan, _ in plans])
+    sequence = sequence_parameters(grid, [plan for plan, _ in plans], PositionQuantiser(cloud.settings.geometry_qp))
     geometry = cloud.geometry(grid)
     shared = CloudToCode(np.empty((0, 3)), {}, None, plans, sequence, geometry, grid, cloud.settings, False)
 

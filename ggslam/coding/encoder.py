@@ -14,6 +14,7 @@ from ggslam.coding.cloud import CodingReport, EncodedCloud, PointCloud
 from ggslam.coding.container import UnitType, unit_bytes
 from ggslam.coding.geometry_tools import GeometrySample, geometry_parameters
 from ggslam.coding.parallel_slices import in_order
+from ggslam.coding.position_quantiser import PositionQuantiser
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.coding.settings import CodecSettings
@@ -53,10 +54,11 @@ def encode_cloud(
         settings.shift,
     )  # fmt: skip
     assert quantization.size is not None
-    sample = GeometrySample(len(points), quantization.size)
+    quantiser = PositionQuantiser(settings.geometry_qp)
+    sample = GeometrySample(len(points), quantization.size, quantiser)
     sample.add(quantization.of(points))
     numbers = assign_slices(points, quantization, settings)
-    sequence = sequence_parameters(quantization, [plan for plan, _ in plans])
+    sequence = sequence_parameters(quantization, [plan for plan, _ in plans], quantiser)
     geometry = geometry_parameters(settings, sample)
     cloud = CloudToCode(points, arrays, numbers, plans, sequence, geometry, quantization, settings, reconstruct)
     count = 1 if numbers is None else int(numbers.max()) + 1
@@ -81,11 +83,15 @@ def checked_points(points: np.ndarray) -> np.ndarray:
     return points
 
 
-def sequence_parameters(quantization: Quantization, plans: list[CodedAttribute]) -> SequenceParameters:
+def sequence_parameters(
+    quantization: Quantization, plans: list[CodedAttribute], quantiser: PositionQuantiser
+) -> SequenceParameters:
     """The set that all slices share."""
     resolution, _ = quantization.resolution()
+    assert quantization.size is not None
+    x, y, z = (side + quantiser.reach for side in quantization.size)
     return SequenceParameters(
-        tuple(plan.description for plan in plans), False, quantization.origin, 0, quantization.size,
+        tuple(plan.description for plan in plans), False, quantization.origin, 0, (x, y, z),
         resolution, quantization.metres, frame_counter_bits=1,
     )  # fmt: skip
 

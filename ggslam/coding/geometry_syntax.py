@@ -45,7 +45,7 @@ class GeometryParameters:
     `direct_mode`: 0 to 3, points may be coded directly where they are sparse (IDCM).
     `partial_splits`: a level may split its nodes along some axes only (quadtree and binary tree: QTBT).
     `planes`: the planar mode, with thresholds; `direct_rate` of 32 candidates may be direct beside it.
-    `scaling`: positions may be coded with a quantiser.
+    `scaling`: positions may be coded with a quantiser, in steps of 2^(qp / 8) (8 + qp % 8) / 8 of a voxel.
     """
 
     unique_points: bool = True
@@ -77,7 +77,7 @@ class GeometryParameters:
         return not any(others)
 
     def write(self) -> bytes:
-        """The payload of the unit, of a set without predictive geometry, direct mode and scaling."""
+        """The payload of the unit, of a set without predictive geometry and direct mode."""
         w = BitWriter()
         w.u(4, self.geometry_id)
         w.u(4, self.sequence_id)
@@ -97,7 +97,12 @@ class GeometryParameters:
         if self.planes:
             for threshold in self.plane_thresholds:
                 w.ue(threshold)
-        w.u(3, 0)  # no angular mode, scaling, extension
+        w.flag(False)  # no angular mode
+        w.flag(self.scaling)
+        if self.scaling:
+            w.ue(self.base_qp)
+            w.u(2, self.qp_shift)
+        w.flag(False)  # no extension
         return w.data()
 
     @staticmethod
@@ -207,6 +212,8 @@ class GeometryHeader:
             for split in self.axes:
                 w.u(3, split)
         w.ue(0)  # one arithmetic codeword
+        if geometry.scaling:
+            w.se(self.qp_offset)
         return w.data()
 
     def footer(self) -> bytes:

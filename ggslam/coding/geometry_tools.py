@@ -7,6 +7,7 @@ The reference decoder takes the first set of a stream for all slices, so there i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Final
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from ggslam.coding.geometry_syntax import ALL_AXES, MAX_DEPTH, GeometryParameters
 from ggslam.coding.grid_points import GridPoints
+from ggslam.coding.position_quantiser import PositionQuantiser
 from ggslam.coding.settings import CodecSettings
 from ggslam.coding.slice_coder import SliceCoder
 from ggslam.system.tuning import Tuning
@@ -44,9 +46,11 @@ class GeometrySample:
     Args:
         count: points of the whole cloud.
         size: of its grid, voxels.
+        quantiser: of its positions.
     """
 
-    def __init__(self, count: int, size: Sequence[int]) -> None:
+    def __init__(self, count: int, size: Sequence[int], quantiser: PositionQuantiser) -> None:
+        self._quantiser = quantiser
         self._one_in = 1 << max(0, (count // GeometryTuning.sample).bit_length() - 1)
         self._cube_bits = max(2, (max(size) - 1).bit_length() - GeometryTuning.cube_bits)
         self._codes: list[np.ndarray] = []
@@ -57,9 +61,10 @@ class GeometrySample:
 
     @cached_property
     def voxels(self) -> np.ndarray:
-        """Occupied voxels of the sample, int32 [N, 3]."""
+        """Occupied voxels of the sample, or steps of its quantiser, int32 [N, 3]."""
         codes, mask = np.unique(np.concatenate(self._codes)).astype(np.int64), (1 << MAX_DEPTH) - 1
-        return np.stack([codes >> 2 * MAX_DEPTH, codes >> MAX_DEPTH & mask, codes & mask], 1).astype(np.int32)
+        voxels = np.stack([codes >> 2 * MAX_DEPTH, codes >> MAX_DEPTH & mask, codes & mask], 1).astype(np.int32)
+        return voxels if self._quantiser.qp == 0 else np.unique(self._quantiser.steps(voxels), axis=0)
 
     @cached_property
     def voxels_per_cube(self) -> float:
@@ -77,7 +82,8 @@ class GeometrySample:
         bits = [int(value).bit_length() for value in voxels.max(0)]
         coder = SliceCoder()
         coder.build(voxels, max(1, *bits))
-        sizes = [len(coder.encode_geometry(tools, split_axes(bits))) for tools in (without, with_planes)]
+        plain = (replace(tools, scaling=False) for tools in (without, with_planes))
+        sizes = [len(coder.encode_geometry(tools, split_axes(bits))) for tools in plain]
         return sizes[1] < (1 - GeometryTuning.planes_gain) * sizes[0]
 
 
@@ -107,14 +113,19 @@ def geometry_parameters(settings: CodecSettings, sample: GeometrySample) -> Geom
 
 
 def _parameters(settings: CodecSettings, boundary: int, planes: bool) -> GeometryParameters:
-    near = boundary > 0
+    near, qp = boundary > 0, settings.geometry_qp
     return GeometryParameters(
         settings.duplicates == "merge", boundary, near and settings.adjacent_child,
         settings.intra_prediction_size if near else 0, partial_splits=planes, planes=planes,
-        plane_thresholds=PLANE_THRESHOLDS if planes else (0, 0, 0),
+        plane_thresholds=PLANE_THRESHOLDS if planes else (0, 0, 0), scaling=qp > 0, base_qp=qp,
     )  # fmt: skip
 
 
-def levels_of(parameters: GeometryParameters, bits: Sequence[int]) -> tuple[int, ...]:
-    """The axes that the levels of a slice with sides of 2^bits split."""
-    return split_axes(bits) if parameters.partial_splits else (ALL_AXES,) * max(1, *bits)
+def tree_sides(parameters: GeometryParameters, bits: Sequence[int]) -> list[int]:
+    """Logarithms of the sides of the tree over a slice with sides of 2^bits."""
+    return list(bits) if parameters.partial_splits else [max(1, *bits)] * 3
+
+
+def levels_of(parameters: GeometryParameters, sides: Sequence[int]) -> tuple[int, ...]:
+    """The axes that the levels of a tree with these `tree_sides` split."""
+    return split_axes(sides) if parameters.partial_splits else (ALL_AXES,) * max(sides)

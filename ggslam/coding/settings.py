@@ -57,6 +57,9 @@ class CodecSettings:
     """Added to `qp` for components 1 and 2."""
     geometry_scale: float = setting(1.0, 1e-6, 1e6)
     """Voxels per input voxel, along an axis: 0.5 codes positions at half the resolution."""
+    geometry_qp: int = setting(0, 0, 96)
+    """Quantiser parameter of the positions within the octree: steps of 2^(qp / 8) (8 + qp % 8) / 8 of a voxel, whole
+    divisions (1 at 0, 2 at 8, 4 at 16), from each slice's lowest corner; decoded points stay on the grid."""
     voxel_size: float | None = setting(None, 1e-12, 1e12, "m")
     """Edge of an input voxel; None: 1 for integer positions, else from `geometry_bits`."""
     unit: float | None = setting(None, 1e-12, 1e12, "m")

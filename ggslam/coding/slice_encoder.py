@@ -15,8 +15,9 @@ from ggslam.coding.attribute_values import CodedAttribute
 from ggslam.coding.cloud import SliceReport
 from ggslam.coding.container import UnitType, unit_bytes
 from ggslam.coding.geometry_syntax import GeometryHeader, GeometryParameters
-from ggslam.coding.geometry_tools import levels_of
+from ggslam.coding.geometry_tools import levels_of, tree_sides
 from ggslam.coding.native_settings import raht_settings
+from ggslam.coding.position_quantiser import PositionQuantiser
 from ggslam.coding.quantization import Quantization
 from ggslam.coding.sequence_parameters import SequenceParameters
 from ggslam.coding.settings import CodecSettings
@@ -59,8 +60,9 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
     origin = np.array([grid[:, axis].min() for axis in range(3)], np.int32)
     for axis in range(3):
         grid[:, axis] -= origin[axis]
-    geometry = cloud.geometry
-    axes = levels_of(geometry, [int(grid[:, axis].max()).bit_length() for axis in range(3)])
+    geometry, quantiser = cloud.geometry, PositionQuantiser(settings.geometry_qp)
+    sides = tree_sides(geometry, quantiser.bits([int(grid[:, axis].max()) for axis in range(3)]))
+    axes, grid = levels_of(geometry, sides), quantiser.restore(grid, sides)
     header = GeometryHeader(number, (int(origin[0]), int(origin[1]), int(origin[2])), axes, len(grid))
     depth = header.depth
     coder = SliceCoder()

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sweeps over quantisers: the size and quality of a cloud at each setting.
 
-Two sweeps, as codec papers report them: the quantiser parameter of the colours at lossless geometry, and the scale of
-the geometry at the finest colours that the transform has (quantiser parameter 4 without conversion to Y, Cb, Cr: about
-58 dB). Both start from the cloud on its grid: one point per voxel with the mean colour.
+Three sweeps, as codec papers report them: the quantiser parameter of the colours at lossless geometry, and the scale of
+the geometry and its quantiser within the octree at the finest colours that the transform has (quantiser parameter 4
+without conversion to Y, Cb, Cr: about 58 dB). All start from the cloud on its grid: one point per voxel with the mean
+colour.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from ggslam.system.tuning import Tuning
 
 Result = TypeVar("Result")
 
+SWEEPS: Final = ("qp", "geometry", "geometry_qp")
+"""What a sweep varies: quantiser of colours, scale of the grid, quantiser of positions within the octree."""
+
 
 class StudyTuning(Tuning):
     """What a study of rates measures."""
@@ -41,6 +45,8 @@ class StudyTuning(Tuning):
     """Quantisers of attributes."""
     scales = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0)
     """Scales of the grid."""
+    geometry_qps = (24, 20, 16, 12, 8, 4, 2, 0)
+    """Quantisers of positions within the octree: steps of 8, 6, 4, 3, 2, 1.5, 1.25 and 1 voxel."""
 
 
 @dataclass(frozen=True)
@@ -60,11 +66,24 @@ class GridCloud:
 
 @dataclass(frozen=True)
 class SweepStep:
-    """One point of a sweep; `sweep` is "qp" or "geometry"."""
+    """One point of a sweep; `sweep` is one of `SWEEPS`."""
 
     sweep: str
     qp: int
     geometry_scale: float
+    geometry_qp: int = 0
+
+    @property
+    def lossless(self) -> bool:
+        """Whether positions stay as they are."""
+        return self.geometry_scale == 1 and self.geometry_qp == 0
+
+    def words(self) -> str:
+        """What is varied, and its value."""
+        return {
+            "qp": f"QP {self.qp}", "geometry": f"scale {self.geometry_scale:g}",
+            "geometry_qp": f"geometry QP {self.geometry_qp}",
+        }[self.sweep]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -119,13 +138,17 @@ def on_grid(points: np.ndarray, colors: np.ndarray, settings: CodecSettings) -> 
 
 
 def sweep_steps(
-    kinds: Sequence[str], qps: Sequence[int] = StudyTuning.qps, scales: Sequence[float] = StudyTuning.scales
-) -> list[SweepStep]:
-    """The steps of the sweeps `kinds`, of "qp" and "geometry"."""
-    steps = [SweepStep("qp", qp, 1.0) for qp in qps] if "qp" in kinds else []
-    return steps + (
-        [SweepStep("geometry", StudyTuning.finest_qp, scale) for scale in scales] if "geometry" in kinds else []
-    )
+    kinds: Sequence[str], qps: Sequence[int] = StudyTuning.qps, scales: Sequence[float] = StudyTuning.scales,
+    geometry_qps: Sequence[int] = StudyTuning.geometry_qps,
+) -> list[SweepStep]:  # fmt: skip
+    """The steps of the sweeps `kinds`, of `SWEEPS`."""
+    finest = StudyTuning.finest_qp
+    steps = {
+        "qp": [SweepStep("qp", qp, 1.0) for qp in qps],
+        "geometry": [SweepStep("geometry", finest, scale) for scale in scales],
+        "geometry_qp": [SweepStep("geometry_qp", finest, 1.0, qp) for qp in geometry_qps],
+    }
+    return [step for sweep in SWEEPS if sweep in kinds for step in steps[sweep]]
 
 
 def run_sweep(
@@ -172,10 +195,13 @@ def _measure(call: Callable[[], Result]) -> tuple[Result, float]:
 
 def _settings(settings: CodecSettings, step: SweepStep) -> CodecSettings:
     color = settings.attribute("color")
-    if step.sweep == "geometry":  # Y, Cb, Cr of 8 bits are no finer than 50 dB
+    if step.sweep != "qp":  # Y, Cb, Cr of 8 bits are no finer than 50 dB
         color = replace(color, color_space="identity", chroma_offset=0)
     attributes = {"color": replace(color, qp=step.qp)}
-    return replace(settings, voxel_size=None, box=None, geometry_scale=step.geometry_scale, attributes=attributes)
+    return replace(
+        settings, voxel_size=None, box=None, geometry_scale=step.geometry_scale, geometry_qp=step.geometry_qp,
+        attributes=attributes,
+    )  # fmt: skip
 
 
 class _Quality:
@@ -191,7 +217,7 @@ class _Quality:
     def of(self, decoded: PointCloud, step: SweepStep) -> tuple[ColorQuality, float, float]:
         """Colours, D1 and D2; with the geometry whole, point by point."""
         cloud, points, colors = self._cloud, decoded.points, decoded.attributes["color"]
-        rows = matching_rows(cloud.grid, np.rint(points).astype(np.int32)) if step.geometry_scale == 1 else None
+        rows = matching_rows(cloud.grid, np.rint(points).astype(np.int32)) if step.lossless else None
         if rows is not None:
             return color_quality(cloud.colors, colors[rows]), np.inf, np.inf
         pair = CloudPair(cloud.grid, points)

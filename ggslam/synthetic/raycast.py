@@ -15,7 +15,7 @@ from ggslam.scene.poses import inverse
 from ggslam.synthetic.lighting import LightMaps, bake, bake_further
 from ggslam.synthetic.materials import Material
 from ggslam.synthetic.scene import FACES, Kind, Scene, Shape
-from ggslam.synthetic.surfaces import face_sizes, intersect, locate
+from ggslam.synthetic.surfaces import face_sizes, intersect, locate, surface_points
 from ggslam.system.tuning import Tuning
 
 
@@ -109,8 +109,27 @@ class RayCaster:
         v = ((np.arange(fine.height) - fine.cy) / fine.fy).astype(np.float32)
         light = self._shade(u, v, *self._trace(u, v, T_shape_camera), T_shape_camera, 1 / fine.fx)
         light = cv2.resize(light, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        color = (1 - np.exp(-RaycastTuning.exposure * light)) ** (1 / 2.2)
-        return RayImages(np.rint(255 * color).astype(np.uint8), depth, mask)
+        return RayImages(_expose(light), depth, mask)
+
+    def surface(self, number: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        """Points of a shape's surface, float64 [n, 3], and their colours uint8 [n, 3].
+
+        Args:
+            number: of the shape.
+            spacing: between points, metres, about.
+        """
+        shape, points, colors = self._shapes[number], [], []
+        T_world_shape = inverse(self._T_shape_world[number])
+        for face, sides in enumerate(face_sizes(shape)):
+            columns, rows = (max(1, int(np.ceil(side / spacing))) for side in sides)
+            grid = np.mgrid[:rows, :columns].reshape(2, -1) + 0.5
+            v, u = grid[0] / rows, grid[1] / columns
+            own, _ = surface_points(shape, face, u, v)
+            of = np.full(len(own), self._first_face[number] + face)
+            light = self._light_of_faces(of, *(x.astype(np.float32) for x in (u, v, np.full(len(own), spacing))))
+            points.append(own @ T_world_shape[:3, :3].T + T_world_shape[:3, 3])
+            colors.append(_expose(light))
+        return np.concatenate(points), np.concatenate(colors)
 
     def measure(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Depth and mask of one view, as in `RayImages`, without the cost of light and colour."""
@@ -190,6 +209,11 @@ class RayCaster:
             texture = _look_up(material, pyramid[min(wanted, len(pyramid) - 1)], s[chosen], t[chosen])
             light[chosen] = texture * (material.emission if material.emission else light[chosen])
         return light
+
+
+def _expose(light: np.ndarray) -> np.ndarray:
+    """Colour uint8 that a camera makes of linear light."""
+    return np.rint(255 * (1 - np.exp(-RaycastTuning.exposure * light)) ** (1 / 2.2)).astype(np.uint8)
 
 
 def _look_up(material: Material, image: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -81,6 +81,21 @@ def walker(setting: Setting) -> Mover:
     return Mover("person", what, number, False, root, numbers, np.stack(tracks, 1), {"root": root, **parts})
 
 
+def person_in_stride(rng: np.random.Generator, swing: float) -> list[Shape]:
+    """Shapes of a person at the origin who looks along x, with legs apart.
+
+    Args:
+        rng: chooses the clothes.
+        swing: of the left leg to the back, radians; the other limbs go with it.
+    """
+    figure, shapes = _figure(1, rng), []
+    for name, joint in _JOINTS.items():
+        part = translation(np.array(joint)) @ turn(np.array([_SWINGS[name] * swing]), 1)[0]
+        local = part @ translation(-np.array(joint))
+        shapes += [replace(shape, T_world_shape=local @ shape.T_world_shape) for shape in figure[name]]
+    return shapes
+
+
 def _figure(number: int, rng: np.random.Generator) -> dict[str, list[Shape]]:
     """Shapes of each part of a person who stands at the origin and looks along x."""
     make = MaterialMaker(rng)

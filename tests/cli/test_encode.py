@@ -174,13 +174,17 @@ def test_streams_of_others_are_listed(shared_data: Path) -> None:
 
 
 def test_a_sweep_writes_a_study(ggslam: Ggslam, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ggslam.coding.study.sweep_steps.__defaults__", ((10, 40), (0.5, 1.0)))
+    monkeypatch.setattr("ggslam.coding.study.sweep_steps.__defaults__", ((10, 40), (0.5, 1.0), (8,)))
     write_points(tmp_path, voxel_cloud())
-    code, out, err = ggslam("encode", tmp_path / "points.ply", tmp_path / "study", "--sweep", "both", "--no-plots")
-    assert code == 0 and "QP 40" in out and "scale 0.5" in out, err
+    code, out, err = ggslam("encode", tmp_path / "points.ply", tmp_path / "study", "--sweep", "all", "--no-plots")
+    assert code == 0 and "QP 40" in out and "scale 0.5" in out and "geometry QP 8" in out, err
     record = json.loads((tmp_path / "study" / "study.json").read_text())
-    assert len(record["rows"]) == 4 and record["points"] == 1600 and record["voxels_per_unit"] == pytest.approx(50)
+    assert [row["sweep"] for row in record["rows"]] == ["qp"] * 2 + ["geometry"] * 2 + ["geometry_qp"]
+    assert record["points"] == 1600 and record["voxels_per_unit"] == pytest.approx(50)
     assert (tmp_path / "study" / "clouds_qp.png").is_file()
+    for sweep, kinds in (("both", {"qp", "geometry"}), ("geometry-qp", {"geometry_qp"})):
+        assert ggslam("encode", tmp_path / "points.ply", tmp_path / sweep, "--sweep", sweep, "--no-plots")[0] == 0
+        assert {row["sweep"] for row in json.loads((tmp_path / sweep / "study.json").read_text())["rows"]} == kinds
 
 
 def test_the_cloud_s_own_voxel_size_loses_nothing(ggslam: Ggslam, tmp_path: Path) -> None:

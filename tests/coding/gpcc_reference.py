@@ -172,3 +172,91 @@ def _inverse_block(children: dict[int, int], dc: np.ndarray, stream: object) -> 
         elif right:
             values[low], values[high] = None, values[low]
     return {octant: values[octant] for octant in children}
+
+
+class SiblingTreeDecoder:
+    """Positions of a tree that splits all axes, with contexts from siblings only, one point a leaf, and quantisers.
+
+    Args:
+        data: the payload.
+        tables: of the standard.
+    """
+
+    def __init__(self, data: bytes, tables: dict) -> None:
+        self._coder, self._tables = ArithmeticDecoder(data, tables["entropy_lut_256"]), tables
+        self._single, self._occupancy = Probability(), [Probability() for _ in range(32)]
+        self._maps = [[127] * size for size in (9, 18, 35, 68, 69, 134, 135, 136)]
+        self._has_offset, self._sign, self._prefix = Probability(), Probability(), Probability()
+        self.qps: list[int] = []
+        """Quantisers of the nodes that have one, in the order of the stream."""
+
+    def positions(self, depth: int, slice_qp: int | None) -> np.ndarray:
+        """int64 [N, 3], in the order of the stream; `slice_qp` None: the stream has no quantisers."""
+        nodes = [((0, 0, 0), 0, 1, 0)]  # position, octant, occupancy of the parent, quantiser
+        known, where, found = slice_qp is None, 0, []
+        for size in range(depth, 0, -1):
+            here = not known and self._coder.bypass() == 1
+            if here:
+                known, where = True, size
+            below = []
+            for position, octant, siblings, qp in nodes:
+                if here:
+                    qp = slice_qp + self._offset()
+                    self.qps.append(qp)
+                left = size - qp // 8
+                occupancy = 1 if left <= 0 else self._occupied(octant, siblings if size < depth else 0)
+                for child in (octant for octant in range(8) if occupancy >> octant & 1):
+                    if left <= 1:
+                        leaf = [v >> -min(left - 1, 0) for v in _child(position, child)]
+                        found.append([self._restored(v, where, qp) for v in leaf])
+                    else:
+                        below.append((_child(position, child), child, occupancy, qp))
+            nodes = below
+        return np.array(found)
+
+    @staticmethod
+    def _restored(value: int, side: int, qp: int) -> int:
+        """The low bits, those below the node that told the quantiser, are steps of 2^(qp / 8) (1 + qp % 8 / 8)."""
+        shift = qp // 8
+        coded = max(side - shift, 0)
+        high, low = value >> coded, value % (1 << coded)
+        eighths = low * (8 + qp % 8) * 2**shift
+        return high * 2**side + min((eighths + 4) // 8, 2**side - 1)
+
+    def _offset(self) -> int:
+        if not self._coder.decode(self._has_offset):
+            return 0
+        order, value = 0, 1
+        while self._coder.decode(self._prefix):
+            value += 1 << order
+            order += 1
+        value += sum(self._coder.bypass() << bit for bit in range(order - 1, -1, -1))
+        return -value if self._coder.decode(self._sign) else value
+
+    def _occupied(self, octant: int, siblings: int) -> int:
+        pattern = 0
+        for axis, (upper, lower) in enumerate(((1, 2), (8, 4), (32, 16))):
+            bit = 4 >> axis
+            if siblings >> (octant ^ bit) & 1:
+                pattern |= lower if octant & bit else upper
+        if pattern == 0 and self._coder.decode(self._single):
+            return 1 << (self._coder.bypass() << 2 | self._coder.bypass() << 1 | self._coder.bypass())
+        kind = self._tables["neigh64to6"][pattern]
+        kinds = [kind] * 4 + [self._tables["neigh9to5"][kind]] * 2 + [self._tables["neigh9to3"][kind]]
+        order = self._tables["octant_permutation_per_pattern"][str(pattern)]
+        zeros, occupancy, before = 6 if pattern == 0 else 7, 0, 0
+        for bin_ in range(8):
+            place = before.bit_count() if pattern == 0 else before + bin_ + 1
+            if pattern and bin_ < 7:
+                place += kinds[bin_] - 1 << bin_
+            bit = 1 if zeros == 0 else self._bin(bin_, place)
+            zeros -= 1 - bit
+            before |= bit << bin_
+            occupancy |= bit << [int(c) for c in order].index(self._tables["occ_bit_order"][bin_])
+        return occupancy
+
+    def _bin(self, bin_: int, place: int) -> int:
+        entry, delta = self._maps[bin_][place], self._tables["ctx_evolve_delta"]
+        bit = self._coder.decode(self._occupancy[entry >> 3])
+        self._maps[bin_][place] += delta[(255 - entry) >> 4] if bit else -delta[entry >> 4]
+        return bit

@@ -37,6 +37,15 @@ def test_the_reference_encoders_streams_decode_exactly(gpcc_data: Path, name: st
     assert digest_of((folder / f"{name}.bin").read_bytes()) == expected["sha256"]
 
 
+@pytest.mark.parametrize(("name", "digest"), [
+    ("random", "0409be22650c2838b35a8f16e127db5cc2f738bd587db2f308902e67aa5a11b9"),
+    ("by_density", "c035b5c0e24de58e253979819d57804d87b443c3869bfe575ebdfecd04f8dbfb"),
+])  # fmt: skip
+def test_quantisers_of_single_nodes_are_read(name: str, digest: str) -> None:
+    """Of the reference encoder: nodes of 16 voxels a side with quantisers of their own; by density with planes."""
+    assert digest_of((Path(__file__).parent / "data" / f"geometry_qp_{name}.bin").read_bytes()) == digest
+
+
 def test_streams_of_the_first_version_are_still_read() -> None:
     """One slice of 96,000 points with ids, its place in the world in private data."""
     data = (Path(__file__).parent / "data" / "first_version.bin").read_bytes()

@@ -115,6 +115,36 @@ def user_data(stream: Path) -> dict:
     raise AssertionError("no user data")
 
 
+@pytest.mark.parametrize("planes", [False, True])
+@pytest.mark.parametrize(("qp", "slices"), [(1, 1), (8, 3), (13, 1), (29, 2), (50, 1)])
+def test_quantised_positions_decode_there(
+    tmc3: str, tmp_path: Path, surface: tuple[np.ndarray, np.ndarray], qp: int, slices: int, planes: bool
+) -> None:
+    settings = CodecSettings(geometry_qp=qp, slices=slices, planes=planes, qp=28)
+    (tmp_path / "a.bin").write_bytes(encode_cloud(surface[0], {"color": surface[1]}, settings).data)
+    assert np.array_equal(reference_decodes(tmc3, tmp_path / "a.bin"), our_rows(tmp_path / "a.bin", "color"))
+
+
+@pytest.mark.parametrize("planes", [0, 1])
+@pytest.mark.parametrize("direct", [0, 1])
+@pytest.mark.parametrize("method", [0, 1, 2])
+@pytest.mark.parametrize(("qp", "node"), [(3, 4), (12, 6), (17, 8)])
+def test_their_quantised_positions_decode_here(
+    tmc3: str, tmp_path: Path, surface: tuple[np.ndarray, np.ndarray], qp: int, node: int, method: int, direct: int,
+    planes: int,
+) -> None:  # fmt: skip
+    """One quantiser, random ones and those by density, told by nodes of 16 to 256 voxels a side."""
+    write_point_cloud(tmp_path / "a.ply", surface[0].astype(np.float32), {"color": surface[1]})
+    run(tmc3, "--mode=0", f"--uncompressedDataPath={tmp_path / 'a.ply'}", *TOOLS, "--neighbourAvailBoundaryLog2=8",
+        f"--inferredDirectCodingMode={direct}", f"--qtbtEnabled={planes}", f"--planarEnabled={planes}",
+        "--positionQuantisationEnabled=1", f"--positionBaseQp={qp}", f"--positionIdcmQp={qp}",
+        f"--positionQuantisationOctreeSizeLog2={node}", f"--positionQuantisationMethod={method}",
+        f"--compressedStreamPath={tmp_path / 'b.bin'}", f"--reconstructedDataPath={tmp_path / 'theirs.ply'}",
+        "--outputBinaryPly=1", "--convertPlyColourspace=1", "--colourMatrix=1", "--qp=22", "--bitdepth=8",
+        "--attribute=color")  # fmt: skip
+    assert np.array_equal(sorted_rows(tmp_path / "theirs.ply"), our_rows(tmp_path / "b.bin", "color"))
+
+
 @pytest.mark.parametrize("high", [200, 4000, 60000])
 def test_reflectance_arrives_there(tmc3: str, tmp_path: Path, voxels: VoxelCloud, high: int) -> None:
     values = (np.arange(len(voxels.grid)) % 97 * high // 97).astype(np.uint16)

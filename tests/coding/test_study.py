@@ -13,7 +13,7 @@ import pytest
 
 from ggslam.coding import CodecSettings
 from ggslam.coding.energy import EnergyMeter
-from ggslam.coding.study import GridCloud, on_grid, run_sweep, sweep_steps
+from ggslam.coding.study import SWEEPS, GridCloud, on_grid, run_sweep, sweep_steps
 from ggslam.errors import ConfigError
 from ggslam.jobs.encode.study import write_study
 
@@ -64,6 +64,18 @@ def test_sweeps_move_the_right_way(cloud: GridCloud) -> None:
         list(run_sweep(cloud, sweep_steps(["geometry"], scales=[2.0]), CodecSettings(), EnergyMeter()))
 
 
+def test_the_quantiser_of_positions_is_swept_beside_the_scale(cloud: GridCloud) -> None:
+    """Doubling the step halves the grid: the same points, as far off, in about as many bytes."""
+    steps = sweep_steps(["geometry", "geometry_qp"], scales=[0.25, 0.5], geometry_qps=[16, 8, 3, 0])
+    assert [step.words() for step in steps][1:3] == ["scale 0.5", "geometry QP 16"]
+    rows = [row for row, _ in run_sweep(cloud, steps, CodecSettings(threads=1), EnergyMeter())]
+    for scaled, quantised in ((rows[0], rows[2]), (rows[1], rows[3])):
+        assert scaled.decoded_points == quantised.decoded_points and scaled.d1 == pytest.approx(quantised.d1)
+        assert abs(scaled.geometry_bytes - quantised.geometry_bytes) < 16
+    sizes, errors = ([getattr(row, name) for row in rows[2:]] for name in ("geometry_bytes", "d1"))
+    assert sizes == sorted(sizes) and errors == sorted(errors) and errors[-1] == np.inf > errors[-2]
+
+
 def test_tables_and_pictures(cloud: GridCloud, tmp_path: Path) -> None:
     steps, seen = sweep_steps(["qp", "geometry"], [10, 34], [0.5]), []
     settings = CodecSettings(slices=2, threads=1)
@@ -88,9 +100,12 @@ def test_tables_and_pictures(cloud: GridCloud, tmp_path: Path) -> None:
 
 
 def test_plots(cloud: GridCloud, tmp_path: Path) -> None:
-    study = write_study(cloud, sweep_steps(["qp", "geometry"], [10, 34], [0.5]), CodecSettings(threads=1), tmp_path)
+    steps = sweep_steps(SWEEPS, [10, 34], [0.5], [8, 16])
+    study = write_study(cloud, steps, CodecSettings(threads=1), tmp_path)
+    assert (tmp_path / "cloud_geometry_qp_08.png").is_file()
     names = {path.name for path in study.files}
-    for name in ("rate_distortion_qp", "rate_distortion_geometry", "time_qp", "time_geometry"):
+    for name in ("rate_distortion_qp", "rate_distortion_geometry", "time_qp", "time_geometry",
+                 "rate_distortion_geometry_qp", "time_geometry_qp"):  # fmt: skip
         assert {f"{name}.png", f"{name}.svg"} <= names
         picture = cv2.imread(str(tmp_path / f"{name}.png"))
         assert picture.std() > 5 and (tmp_path / f"{name}.svg").read_text().count("<path") >= 2

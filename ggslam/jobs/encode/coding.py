@@ -46,6 +46,8 @@ from ggslam.system.atomic import make_folder, write_bytes
 from ggslam.system.untrusted_files import read_untrusted
 
 PRESETS = ("pointcloud", "splat")
+_RUN_FILES = {"pointcloud": "points.ply", "splat": "map.ply"}
+"""What is coded of a run."""
 Box = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner, metres."""
 
@@ -92,12 +94,26 @@ def encode_file(
         ConfigError: impossible settings.
         RunFolderError: the output cannot be written, or the folder is not a run.
     """
-    notes: list[str] = []
     path = _input_file(source, preset)
     _refuse_itself(path, out)
+    return _encode(path, out, settings, preset, rate, ids, own=path != source)
+
+
+def encode_saved_run(
+    run: Path, out: Path, settings: CodecSettings, preset: str = "pointcloud", rate: str = "r03", ids: bool = True
+) -> Encoded:
+    """`encode_file` of a run's folder that is saved but not complete yet, as before it is scored."""
+    return _encode(run / _RUN_FILES[preset], out, settings, preset, rate, ids, own=True)
+
+
+def _encode(
+    path: Path, out: Path, settings: CodecSettings, preset: str, rate: str, ids: bool, own: bool
+) -> Encoded:  # fmt: skip
+    """Codes a file; `own`: it is a run's."""
+    notes: list[str] = []
     try:
         if preset == "splat":
-            report = _encode_splats(path, out, settings, rate, ids, notes, own=path != source)
+            report = _encode_splats(path, out, settings, rate, ids, notes, own)
         else:
             report = _encode_points(path, out, settings, ids, notes)
     except (ConfigError, FormatError) as error:
@@ -250,7 +266,7 @@ def _input_file(source: Path, preset: str) -> Path:
         raise ConfigError(f"preset: expected one of {', '.join(PRESETS)}, found '{preset}'")
     if not source.is_dir() or (not (source / MARKER).is_file() and splat_format(source) is not None):
         return source
-    return RunFolder.open(source).path / ("map.ply" if preset == "splat" else "points.ply")
+    return RunFolder.open(source).path / _RUN_FILES[preset]
 
 
 def coded_points(cloud: ColoredCloud, settings: CodecSettings) -> tuple[np.ndarray, CodecSettings]:

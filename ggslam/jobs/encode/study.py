@@ -18,7 +18,7 @@ import numpy as np
 from ggslam.coding.cloud import PointCloud
 from ggslam.coding.energy import EnergyMeter
 from ggslam.coding.settings import CodecSettings
-from ggslam.coding.study import GridCloud, StudyRow, SweepStep, run_sweep
+from ggslam.coding.study import SWEEPS, GridCloud, StudyRow, SweepStep, run_sweep
 from ggslam.reporting.cloud_pictures import CloudView, contact_sheet, draw_cloud, view_of
 from ggslam.reporting.pictures import write_picture
 from ggslam.reporting.plot_files import write_sheet
@@ -89,8 +89,10 @@ def write_tables(
 
 
 def step_name(step: SweepStep) -> str:
-    """`qp_22` or `scale_0.5`."""
-    return f"qp_{step.qp:02d}" if step.sweep == "qp" else f"scale_{step.geometry_scale:.4g}"
+    """`qp_22`, `scale_0.5` or `geometry_qp_08`."""
+    if step.sweep == "geometry":
+        return f"scale_{step.geometry_scale:.4g}"
+    return f"qp_{step.qp:02d}" if step.sweep == "qp" else f"geometry_qp_{step.geometry_qp:02d}"
 
 
 class _Pictures:
@@ -113,9 +115,8 @@ class _Pictures:
         size = 1 / (self._cloud.quantization.scale * step.geometry_scale)
         picture = draw_cloud(self._place(decoded.points), decoded.attributes["color"], self._view, size)
         write_picture(self._folder / f"cloud_{step_name(step)}.png", picture)
-        setting = f"QP {step.qp}" if step.sweep == "qp" else f"scale {step.geometry_scale:g}"
         quality = f"Y {row.color.y:.1f} dB" if step.sweep == "qp" else f"D1 {row.d1:.1f} dB"
-        caption = f"{setting}: {8 * row.total_bytes / row.input_points:.2f} bits a point, {quality}"
+        caption = f"{step.words()}: {8 * row.total_bytes / row.input_points:.2f} bits a point, {quality}"
         self._drawn.setdefault(step.sweep, [self._original]).append((picture, caption))
 
     def sheets(self) -> list[Path]:
@@ -130,7 +131,7 @@ class _Pictures:
 
 def _draw_plots(folder: Path, rows: Sequence[StudyRow]) -> list[Path]:
     written = []
-    for sweep in ("qp", "geometry"):
+    for sweep in SWEEPS:
         table = [row.values() for row in rows if row.step.sweep == sweep]
         if table:
             written += write_sheet(folder / f"rate_distortion_{sweep}", _rate_plots(table, sweep))
@@ -140,9 +141,9 @@ def _draw_plots(folder: Path, rows: Sequence[StudyRow]) -> list[Path]:
 
 def _rate_plots(table: list[dict[str, Any]], sweep: str) -> list[Plot]:
     groups = [("colour, Y U V", ["psnr_y", "psnr_u", "psnr_v"]), ("colour, R G B", ["psnr_r", "psnr_g", "psnr_b"])]
-    if sweep == "geometry":
+    if sweep != "qp":
         groups = [("geometry", ["d1", "d2"]), *groups]
-    rate = "geometry_bpp" if sweep == "geometry" else "color_bpp"
+    rate = "color_bpp" if sweep == "qp" else "geometry_bpp"
     plots = []
     for title, names in groups:
         used = rate if title == "geometry" or sweep == "qp" else "total_bpp"
@@ -153,7 +154,10 @@ def _rate_plots(table: list[dict[str, Any]], sweep: str) -> list[Plot]:
 
 
 def _time_plot(table: list[dict[str, Any]], sweep: str) -> Plot:
-    key, label = ("qp", "QP") if sweep == "qp" else ("geometry_scale", "geometry scale")
+    key, label = {
+        "qp": ("qp", "QP"), "geometry": ("geometry_scale", "geometry scale"),
+        "geometry_qp": ("geometry_qp", "geometry QP"),
+    }[sweep]  # fmt: skip
     x = [row[key] for row in table]
     curves = _series({name: [row[f"{name}_s"] for row in table] for name in ("encode", "decode")}, x)
     return Plot("time", "time", label, "seconds", curves, from_zero=True)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
@@ -16,6 +17,7 @@ from ggslam.jobs.eval.run import score_run
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.report.pages import write_report
 from ggslam.jobs.run.checkpointing import Checkpointing, start_record
+from ggslam.jobs.run.encoding import EncodeRequest, RunEncoding
 from ggslam.jobs.run.health import doubt_movers, judge
 from ggslam.jobs.run.map_fit import MapFit, located_views, measure_fit
 from ggslam.jobs.run.named_loss import NamedLoss
@@ -51,7 +53,7 @@ class RunRequest:
     """A whole run; with `map` in the map of an earlier one, which grows unless `localize_only`. Its state is saved
     after every `checkpoint_every` frames: 0: never; None: as often as it hardly takes time. `check`: look at the
     recording's depth first, and refuse what is certainly wrong with it. `loss`: a loss of the user's own, see
-    `named_loss`; it is run."""
+    `named_loss`; it is run. `encode`: what to code the finished run as."""
 
     sequence: SequenceRequest
     out: Path | None = None
@@ -64,13 +66,15 @@ class RunRequest:
     checkpoint_every: int | None = None
     check: bool = True
     loss: str | None = None
+    encode: EncodeRequest | None = None
 
 
 @dataclass
 class RunOutcome:
     """A finished run, or what was saved of one that stopped early (`error` says why). If it could not be saved as it
     should be, `failure` says so, and where it is. `verdicts` tell what seems wrong with it or its recording, `verdict`
-    how good it is; None: that could not be told."""
+    how good it is; None: that could not be told. `encoded`: a line on the stream that was asked for, `encode_failure`:
+    why there is none."""
 
     folder: RunFolder
     result: SlamResult
@@ -79,6 +83,8 @@ class RunOutcome:
     failure: GgslamError | None = None
     verdicts: list[Verdict] = field(default_factory=list)
     verdict: RunVerdict | None = None
+    encoded: str = ""
+    encode_failure: GgslamError | None = None
 
     def headline(self) -> str:
         """One line for people."""
@@ -124,6 +130,8 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     out = request.out if request.out is not None else Path("runs") / sequence.name
     if earlier is not None and out.resolve() in ancestors(earlier):
         raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
+    if request.encode is not None:
+        request.encode.check(out)
     observer = observer or SilentObserver()
     for note in settings_notes(config, request.config, request.overrides):
         observer.note(note)
@@ -137,7 +145,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
 def resume(
     run: Path, observer: Observer | None = None, follower: Follower | None = None, *, recording: Path | None = None,
     evaluate: bool | None = None, checkpoint_every: int | None = None, model: str | None = None,
-    loss: str | None = None,
+    loss: str | None = None, encode: EncodeRequest | None = None,
 ) -> RunOutcome:  # fmt: skip
     """Goes on with a run that was cut off, from its newest checkpoint. A synchronous run on the CPU becomes what it
     would have become, bit for bit.
@@ -152,17 +160,21 @@ def resume(
         model: the model of masks that the run was begun with, if it was with one: it is run like a program, and the
             folder may come from somebody else.
         loss: name of the user's own loss that the run was begun with, likewise. What it remembers is not saved.
+        encode: what to code the finished run as; a run does not remember what it was to be coded as.
 
     Raises:
         GgslamError: there is nothing to go on from; the recording is another one; the run was made with another
             version; `model` or `loss` is not the run's.
     """
     folder = RunFolder.open_unfinished(run)
+    if encode is not None:
+        encode.check(folder.path)
     with stop_on_request() as stop, folder_lock(folder.path):
         found = Resumption.of(folder, recording, evaluate, model, loss)
         asked = RunRequest(
             found.request, folder.path, evaluate=found.start.evaluate if evaluate is None else evaluate,
             localize_only=found.start.localize_only, checkpoint_every=checkpoint_every, loss=loss,
+            encode=encode,
         )  # fmt: skip
         own = None if loss is None else NamedLoss.load(loss)
         observer = observer or SilentObserver()
@@ -218,7 +230,8 @@ class _Run:
             reason = result.frames[0].reason if result.frames else "no frame could be read"
             raise error if error is not None else SequenceError(f"{sequence.path}: could not start a map: {reason}")
         outcome = self._save(result, error)
-        self._look_at(outcome)
+        with self._coding_beside(outcome):
+            self._look_at(outcome)
         if error is None and outcome.failure is None:
             checkpoints.remove()
         return outcome
@@ -283,6 +296,24 @@ class _Run:
         except Exception as error:
             self.observer.note(f"the run could not be judged: {error!r}")
             return None
+
+    @contextmanager
+    def _coding_beside(self, outcome: RunOutcome) -> Iterator[None]:
+        """The run is coded within the block, if it ended and that was asked for."""
+        request, reason = self.request.encode, outcome.error or outcome.failure
+        if request is None or reason is not None:
+            if request is not None:
+                self.observer.note(f"{request.out}: not written: the run did not end, or was not saved as a whole")
+            yield
+            return
+        encoding = RunEncoding(request, outcome.folder)
+        try:
+            yield
+        finally:
+            try:
+                outcome.encoded = encoding.wait()
+            except GgslamError as error:
+                outcome.encode_failure = error
 
     def _frames_stay(self) -> bool:
         """Whether the frames of the run can be read again."""

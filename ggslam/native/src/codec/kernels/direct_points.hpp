@@ -47,6 +47,15 @@ inline std::int32_t scaled_position(std::int32_t position, std::uint32_t mask, i
   return static_cast<std::int32_t>((static_cast<std::int64_t>(position) - low) << shift | scaled);
 }
 
+// The position of a tree of sides of 2^side whose scaled position is the nearest, shifted so that its highest bit stays
+// where it would be without a step.
+inline std::int32_t quantised_position(std::int32_t position, int side, int qp) {
+  const int shift = qp >> 3;
+  const std::int64_t step = static_cast<std::int64_t>(8 + (qp & 7)) << shift;
+  const std::int64_t most = (std::int64_t{1} << std::max(0, side - shift)) - 1;
+  return static_cast<std::int32_t>(std::min((8 * std::int64_t{position} + step / 2) / step, most) << shift);
+}
+
 inline std::int32_t shifted(std::int32_t value, int bits) { return bits >= 0 ? value << bits : value >> -bits; }
 
 // What two points' positions begin with, along one axis, until they differ. `equal`: they are the same along the axes

@@ -111,7 +111,7 @@ class TreeWalk {
     axes_above_ = level_ > 0 ? s_.axes[level_ - 1] : 7;
     for (int axis = 0; axis < 3; ++axis) key_bits_ -= (axes_ & axis_bit(axis)) != 0;
     largest_ = std::max({here_[0], here_[1], here_[2]});
-    qp_here_ = !qp_known_ && coder_.bypass(0);
+    qp_here_ = !qp_known_ && coder_.bypass(1);  // the encoder's: the root has it
     direct_mask_ = direct_mask(s_.direct_mode, s_.planes != 0, s_.direct_rate);
     const int turn = level_ & 31;
     if (turn != 0) direct_mask_ = direct_mask_ >> turn | direct_mask_ << (32 - turn);
@@ -189,7 +189,7 @@ class TreeWalk {
   }
 
   std::uint8_t code_qp() {
-    int offset = 0;
+    int offset = 0;  // the encoder's
     if (coder_.code(0, rest_.qp_offset)) {
       offset = 1 + static_cast<int>(std::min<std::uint32_t>(code_exp_golomb(coder_, 0, 0, rest_.qp_rest), 1 << 16));
       if (coder_.code(0, rest_.qp_sign)) offset = -offset;
@@ -301,16 +301,22 @@ class TreeWalk {
 }  // namespace
 }  // namespace codec
 
-// Sorted keys of points [count, 3]: the bits of their positions level by level, from the top.
+// Sorted keys of points [count, 3]: the bits of their positions level by level, from the top; where positions are scaled,
+// those of the nearest step, without the levels that it leaves out.
 void tree_keys(const std::int32_t* points, std::size_t count, const gpcc::TreeSettings& settings,
                std::vector<std::uint64_t>& keys) {
   keys.assign(count, 0);
-  int bits[3] = {};
+  int bits[3] = {}, sides[3] = {};
+  for (int level = 0; level < settings.levels; ++level)
+    for (int axis = 0; axis < 3; ++axis) sides[axis] += (settings.axes[level] & codec::axis_bit(axis)) != 0;
+  const int qp = settings.scaling ? settings.slice_qp : 0;
   for (int level = settings.levels - 1, place = 0; level >= 0; --level)
     for (int axis = 2; axis >= 0; --axis) {
       if (!(settings.axes[level] & codec::axis_bit(axis))) continue;
-      for (std::size_t i = 0; i < count; ++i)
-        keys[i] |= static_cast<std::uint64_t>(points[3 * i + axis] >> bits[axis] & 1) << place;
+      for (std::size_t i = 0; i < count; ++i) {
+        const std::int32_t position = codec::quantised_position(points[3 * i + axis], sides[axis], qp);
+        keys[i] |= static_cast<std::uint64_t>(position >> bits[axis] & 1) << place;
+      }
       ++bits[axis];
       ++place;
     }
