@@ -323,7 +323,7 @@ def _study(source: Path, out: Path, settings: CodecSettings, kinds: Sequence[str
             bar.update(task, advance=1, info=row.step.words())
 
         study = write_study(cloud, steps, settings, out, plots, show)
-    columns = ["step", "points", "bits", "Y dB", "D1 dB", "D2 dB", "enc. s", "dec. s", "J"]
+    columns = ["step", "points", "bits", "Y dB", "D1 dB", "D2 dB", "enc. s", "dec. s", "enc. cpu s", "J"]
     title = f"{quantity(len(cloud.grid), 'point')}; bits per point of these"
     console.print(table(title, columns, [_study_cells(row) for row in study.rows]))
     for note in study.notes:
@@ -336,5 +336,5 @@ def _study_cells(row: StudyRow) -> list[str]:
     return [
         row.step.words(), str(row.decoded_points), _rate(row.total_bytes, row.input_points), f"{row.color.y:.2f}",
         f"{row.d1:.2f}", f"{row.d2:.2f}", f"{row.encode_s:.2f}", f"{row.decode_s:.2f}",
-        "-" if row.joules is None else f"{row.joules:.1f}",
+        f"{row.encode_cpu_s:.2f}", "-" if row.joules is None else f"{row.joules:.1f}",
     ]  # fmt: skip

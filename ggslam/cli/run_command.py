@@ -42,6 +42,8 @@ EPILOG = """
 
   ggslam run realsense: --stop 900 --record data/desk --out runs/desk
 
+  ggslam run data/redkitchen --scale 0.5 --energy
+
   ggslam run --help-settings
 
   ggslam run data/second_visit --map runs/kitchen --localize-only --out runs/visit
@@ -58,7 +60,7 @@ _SHORTCUTS = {
 """Settings that have options of their own, with their parameters."""
 _MODEL = "masks.model"
 """Setting that whoever goes on with a run has to know, if it has one."""
-_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate", "strict",
+_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate", "strict", "energy",
                 "encode", "encode_with"}  # fmt: skip
 """Options that change nothing of what a run computes."""
 
@@ -151,6 +153,9 @@ EncodeWith = Annotated[
 Strict = Annotated[
     bool, typer.Option("--strict", help="Exit with code 3 if the verdict is bad or something seems wrong.")
 ]
+Energy = Annotated[
+    bool, typer.Option("--energy", help="Tell the joules that each part uses; without sensors, processor seconds.")
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in the output folder.")]
 
 
@@ -190,6 +195,7 @@ def run(
     evaluate: Evaluate = True,
     overwrite: Overwrite = False,
     strict: Strict = False,
+    energy: Energy = False,
     resume: Resume = None,
     checkpoint_every: CheckpointEvery = None,
     encode: EncodeTo = None, encode_with: EncodeWith = None,
@@ -199,7 +205,7 @@ def run(
     from ggslam.jobs.run.pipeline import execute
     from ggslam.runs.recordings import SequenceRequest
 
-    watched = _Watched(log, (host, port) if view else None, strict)
+    watched = _Watched(log, (host, port) if view else None, strict, energy)
     coded_as = _encode_request(context, encode, encode_with)
     if resume is not None:
         return _go_on(context, resume, sequence, checkpoint_every, evaluate, settings, loss, coded_as, watched)
@@ -212,7 +218,7 @@ def run(
     request = replace(
         _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
         map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check, loss=loss,
-        encode=coded_as,
+        energy=energy, encode=coded_as,
     )  # fmt: skip
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
 
@@ -257,7 +263,7 @@ def _go_on(
     given = refuse_other_options(context, ["loss", *(["settings"] if len(models) == len(settings or []) else [])])
     model = models[-1] if models else None
     again = partial(resume, run, recording=recording, checkpoint_every=checkpoint_every, model=model, loss=loss)
-    again = partial(again, encode=coded_as)
+    again = partial(again, energy=watched.energy, encode=coded_as)
     again = partial(again, evaluate=evaluate) if "evaluate" in given else again
     _run_and_show(again, run.resolve().name, watched)
 
@@ -297,11 +303,12 @@ def _request(reading: SequenceRequest, record: Path | None) -> RunRequest:
 @dataclass(frozen=True)
 class _Watched:
     """Where a run is logged, and the host and port of the page that shows it; None: not. Whether verdicts are
-    failures."""
+    failures, and whether energy is counted."""
 
     log: str | None
     address: tuple[str, int] | None
     strict: bool
+    energy: bool = False
 
 
 def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) -> None:
@@ -334,6 +341,8 @@ def _print(outcome: RunOutcome) -> None:
     console.print(f"{outcome.folder.path}: {outcome.headline()}", highlight=False, markup=False)
     if outcome.metrics is not None and not _failure(outcome):  # scores of the few frames that were located mislead
         print_scores(outcome.metrics)
+    if outcome.energy is not None:
+        console.print(outcome.energy.text(), highlight=False, markup=False)
     for verdict in outcome.verdicts:
         console.print(f"[yellow]{verdict.severity}:[/] {escape(verdict.text)}", highlight=False)
     if outcome.verdict is not None:

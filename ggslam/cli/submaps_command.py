@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 import json
+import secrets
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ggslam.cli import options
 from ggslam.cli.console import console, progress_bar, table
 from ggslam.cli.observer import ProgressObserver
+from ggslam.errors import ConfigError
 from ggslam.system.json_files import json_ready
 from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
@@ -29,6 +32,10 @@ EPILOG = """
   ggslam submaps data/kitchen_again --out kitchen.grid --visit tuesday --poses localized/kitchen_again/trajectory.txt
 
   ggslam submaps kitchen.grid --since tuesday
+
+  ggslam submaps campus.grid --serve 0.0.0.0:7000 --token SECRET
+
+  ggslam submaps robot1.grid --send server:7000 --token SECRET
 
   ggslam submaps scans/monday --out campus.grid --set submaps.partial_radius=40
 """
@@ -79,6 +86,19 @@ SensorRange = Annotated[
 ]
 
 
+Serve = Annotated[
+    str | None,
+    typer.Option(metavar="[HOST:]PORT", help="Take cells over TCP into the grid store SOURCE until Ctrl-C."),
+]
+Send = Annotated[
+    str | None, typer.Option(metavar="HOST:PORT", help="Send cells of the grid store SOURCE to a --serve.")
+]
+Token = Annotated[
+    str | None,
+    typer.Option(envvar="GGSLAM_TOKEN", help="Secret of --serve and --send; without one --serve makes one up."),
+]
+
+
 def submaps(
     source: SourcePath,
     out: Annotated[Path | None, typer.Option(metavar="STORE", help="Grid store to make, or to add a visit to.")] = None,
@@ -107,17 +127,24 @@ def submaps(
     columns: options.Columns = None,
     body: options.Body = None, body_frame: options.BodyFrame = None,
     overrides: options.Settings = None,
+    serve: Serve = None, send: Send = None, token: Token = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print what is in the store as JSON.")] = False,
 ) -> None:  # fmt: skip
-    """Make a grid store, add a visit to one, or list its cells, parts, visits, objects and what changed."""
+    """Make a grid store, add a visit to one, list its cells, parts, visits, objects and what changed, or send it."""
     from ggslam.jobs.submaps.fill import SubmapsRequest, list_store
     from ggslam.jobs.submaps.settings import store_overrides
     from ggslam.runs.recordings import SequenceRequest
 
+    given = {"spacing": spacing, "axes": axes, "voxel": voxel, "radius": radius, "refresh": refresh,
+             "sensor_range": sensor_range}  # fmt: skip
+    settings = {**store_overrides(overrides), **{name: v for name, v in given.items() if v is not None}}
+    if (serve is not None) + (send is not None) + (out is not None) > 1:
+        raise ConfigError("--serve, --send, --out: choose one")
+    if serve is not None:
+        return _serve(source, serve, token, settings)
+    if send is not None:
+        return _send(source, send, token)
     if out is not None:
-        given = {"spacing": spacing, "axes": axes, "voxel": voxel, "radius": radius, "refresh": refresh,
-                 "sensor_range": sensor_range}  # fmt: skip
-        settings = {**store_overrides(overrides), **{name: v for name, v in given.items() if v is not None}}
         reading = SequenceRequest(
             source, format=format_name, start=start, stop=stop, stride=stride, scale=scale, depth_scale=depth_scale,
             camera=camera, intrinsics=intrinsics,
@@ -128,6 +155,38 @@ def submaps(
         typer.echo(json.dumps(json_ready(listing.to_dict()), indent=1))
     else:
         _print(listing)
+
+
+def _serve(path: Path, address: str, token: str | None, settings: Mapping[str, Any]) -> None:
+    """Takes cells into a store, which is made if there is none, until Ctrl-C."""
+    from ggslam.jobs.submaps.cell_server import CellServer, address_of
+    from ggslam.jobs.submaps.stores import open_or_create
+    from ggslam.jobs.view.serve import wait_for_interrupt
+    from ggslam.submaps.settings import SubmapSettings
+
+    def tell(text: str) -> None:
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    secret = secrets.token_hex(8) if token is None else token
+    with (
+        open_or_create(path, SubmapSettings(**settings)) as store,
+        CellServer(store, *address_of(address), secret, tell) as server,
+    ):
+        at, shown = ":".join(map(str, server.address)), "" if token is not None else f" with --token {secret}"
+        wait_for_interrupt(lambda: tell(f"{path} takes cells at {at}{shown} (Ctrl-C ends)"))
+
+
+def _send(path: Path, address: str, token: str | None) -> None:
+    from ggslam.jobs.submaps.cell_server import address_of, send_store
+
+    host, port = address_of(address)
+    if token is None:
+        raise ConfigError("--send needs --token: the server's")
+    sent = send_store(path, host, port, token)
+    console.print(
+        f"{quantity(sent.written, 'cell')} written, {sent.kept} of the server's kept, {sent.bytes / 1e6:.1f} MB",
+        highlight=False,
+    )
 
 
 def _make(request: SubmapsRequest) -> None:

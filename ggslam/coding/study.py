@@ -20,12 +20,12 @@ import numpy as np
 from ggslam.coding.cloud import PointCloud
 from ggslam.coding.decoder import decode_cloud
 from ggslam.coding.encoder import encode_cloud
-from ggslam.coding.energy import EnergyMeter
 from ggslam.coding.metrics import CloudPair, ColorQuality, color_quality, matching_rows
 from ggslam.coding.quantization import Quantization, choose_quantization
 from ggslam.coding.settings import CodecSettings
 from ggslam.errors import ConfigError
 from ggslam.geometry.normals import estimate_normals
+from ggslam.system.energy import EnergyMeter
 from ggslam.system.tuning import Tuning
 
 Result = TypeVar("Result")
@@ -89,8 +89,8 @@ class SweepStep:
 @dataclass(frozen=True)
 class StudyRow:
     """What came out at one step. Bytes of geometry and colour include the headers of their units; rates are bits per
-    point of the cloud on its grid; PSNR in dB, infinite where nothing was lost; joules of an encoding (what the whole
-    machine used meanwhile), None if they cannot be read."""
+    point of the cloud on its grid; PSNR in dB, infinite where nothing was lost; seconds of this process's threads on a
+    processor and joules of an encoding: what the whole machine used meanwhile, None if they cannot be read."""
 
     step: SweepStep
     slices: int
@@ -105,6 +105,7 @@ class StudyRow:
     d2: float
     encode_s: float
     decode_s: float
+    encode_cpu_s: float
     joules: float | None
 
     def values(self) -> dict[str, Any]:
@@ -115,7 +116,8 @@ class StudyRow:
             size = getattr(self, f"{part}_bytes")
             out |= {f"{part}_bytes": size, f"{part}_bpp": 8 * size / self.input_points}
         out |= {f"psnr_{name}": value for name, value in self.color.values().items()}
-        return out | {name: getattr(self, name) for name in ("d1", "d2", "encode_s", "decode_s", "joules")}
+        rest = ("d1", "d2", "encode_s", "decode_s", "encode_cpu_s", "joules")
+        return out | {name: getattr(self, name) for name in rest}
 
 
 def on_grid(points: np.ndarray, colors: np.ndarray, settings: CodecSettings) -> GridCloud:
@@ -171,15 +173,18 @@ def run_sweep(
     encode_cloud(cloud.grid[:1], {"color": cloud.colors[:1]}, settings)  # what happens once only is not timed
     for step in steps:
         with meter.measure() as energy:
+            cpu_s = -time.process_time()
             encode = partial(encode_cloud, cloud.grid, {"color": cloud.colors}, _settings(settings, step))
             encoded, encode_s = _measure(encode)
+            cpu_s += time.process_time()
         decoded, decode_s = _measure(partial(decode_cloud, encoded.data, settings.threads))
         joules = None if energy.joules is None else energy.joules / StudyTuning.repeats
         color, d1, d2 = quality.of(decoded, step)
         report = encoded.report
         yield StudyRow(
             step, len(report.slices), settings.split, len(cloud.grid), len(decoded), report.geometry_bytes,
-            report.attribute_bytes["color"], report.total_bytes, color, d1, d2, encode_s, decode_s, joules,
+            report.attribute_bytes["color"], report.total_bytes, color, d1, d2, encode_s, decode_s,
+            cpu_s / StudyTuning.repeats, joules,
         ), decoded  # fmt: skip
 
 

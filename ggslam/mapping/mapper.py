@@ -36,6 +36,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse, orthonormalize
 from ggslam.system.array_forms import Mask
 from ggslam.system.savable import savable
+from ggslam.system.spent import part
 from ggslam.system.tuning import Tuning
 
 
@@ -498,7 +499,8 @@ class Mapper(ABC):
         grad_features = None
         if learns and identity is not None:
             masked = keyframe if grid.is_whole else MaskOnGrid.of(keyframe, grid)
-            grad_features = identity.step(self.map, self._rasterizer, masked, view)
+            with part("objects"):
+                grad_features = identity.step(self.map, self._rasterizer, masked, view)
         times.identity += watch.lap()
         if self.extra_loss is not None:
             grad_features = add_extra_loss(self.extra_loss, view, keyframe, loss, grad_features)

@@ -14,10 +14,12 @@ from ggslam.slam.result import SlamResult
 from ggslam.slam.run_state import RunState
 from ggslam.slam.saved_places import saved_places_to_bytes
 from ggslam.submaps.gaussian_cells import GaussianCells
+from ggslam.system.spent import part
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.still_camera import still_notes
 
 
+@part("final refinement")
 def refine(slam: RunState, progress: Callable[[int, int], None] | None = None) -> None:
     """The last optimisation steps of a run that has seen all frames.
 
@@ -57,7 +59,8 @@ def result_of(slam: RunState) -> SlamResult:
     slam.times.loops = slam.loops.seconds if slam.loops is not None else 0.0
     slam.mapper.end_refinement()
     slam.join_parts()
-    objects = slam.objects.finalize(slam.mapper, pager) if slam.growing else slam.objects.learned
+    with part("objects"):
+        objects = slam.objects.finalize(slam.mapper, pager) if slam.growing else slam.objects.learned
     cells = None if pager is None else pager.move_all_out()
     gaussians = parts.gaussians()
     return SlamResult(

@@ -33,6 +33,7 @@ from ggslam.slam.schedules import NewKeyframe
 from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
 from ggslam.system.savable import savable
+from ggslam.system.spent import part
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
@@ -94,11 +95,12 @@ class Slam(RunState):
 
         # 1. Clean the frames: no depth that hangs between two surfaces, was taken at another time than the colour, or
         #    shows what is fixed to the camera.
-        cleaned = [self.clean(frame) for frame in frames]
+        with part("tracking"):
+            cleaned = [self.clean(frame) for frame in frames]
 
         # 2. Track: follow what closed loops have corrected, then align the frames' points to the map (G-ICP). A lost
         #    camera is looked for at all known places, or begins a new part of the map.
-        with self.schedule.beside_mapping():
+        with part("tracking"), self.schedule.beside_mapping():
             located = self.track(cleaned)
 
         # 3. Decide whether the frames become keyframes: those that show enough that the map does not, and one every
@@ -108,7 +110,8 @@ class Slam(RunState):
 
         # 4. to 7. Map the keyframes and train: `map_keyframe` and `train`, at once or in another thread.
         new = [*located.early, *((located.frames[k], located.tracked[k]) for k in chosen)]
-        self.schedule.map(self, [NewKeyframe(*one, self.moves_followed) for one in new], len(frames))
+        with part("mapping"):
+            self.schedule.map(self, [NewKeyframe(*one, self.moves_followed) for one in new], len(frames))
 
         self.times.stop()
         seconds = (time.perf_counter() - start) / len(frames)
@@ -148,7 +151,8 @@ class Slam(RunState):
         #    place: the graph of keyframe poses is optimised, and the map moves with its keyframes.
         chain.after_insertion(self.removal, frame)
         if self.loops is not None:
-            correction = self.loops.add(frame, tracking)
+            with part("loops"):
+                correction = self.loops.add(frame, tracking)
             if correction is not None:
                 self.corrections.apply(correction, self.loops)
                 self.filters.loop_closed()

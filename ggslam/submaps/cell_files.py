@@ -39,6 +39,11 @@ _CELL = re.compile(r"(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})", re.ASCII)
 _PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
+def is_part_name(name: str) -> bool:
+    """Whether a part of a cell may be called so: a plain file name."""
+    return _PART.fullmatch(name) is not None
+
+
 class CellFiles:
     """Reads, writes and clears the folder `cells` of a store."""
 
@@ -66,7 +71,7 @@ class CellFiles:
             ValueError: the name of a part is no plain file name.
         """
         for parts in versions.values():
-            if bad := [name for name in parts if not _PART.fullmatch(name)]:
+            if bad := [name for name in parts if not is_part_name(name)]:
                 raise ValueError(f"not a name for a part of a cell: {bad[0]!r}")
         written, folders = [], {self.folder: None}
         path = self.folder

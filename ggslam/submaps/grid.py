@@ -37,6 +37,7 @@ from ggslam.submaps.cell_records import CellChange, CellRecord, CellWrite, PartR
 from ggslam.submaps.index import CellIndex
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder, write_failure
+from ggslam.system.untrusted_files import read_untrusted_text
 
 INDEX, CELLS = "index.sqlite", "cells"
 _LOCK = "lock"
@@ -336,6 +337,21 @@ class GridStore:
     def _sweep_all(self) -> None:
         for key in self._files.cells():
             self._sweep(key)
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a process has the store at `path` open for writing, as far as the number in its lock tells."""
+    try:
+        process = int(read_untrusted_text(path / _LOCK))
+    except (FormatError, ValueError):  # nobody ever wrote, or the last one has ended
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def check_same_grid(path: Path, own: SubmapSettings, wanted: SubmapSettings) -> None:

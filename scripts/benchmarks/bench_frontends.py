@@ -42,7 +42,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, so3_log
 from ggslam.sequences.factory import open_sequence
 from ggslam.tracking.edges_planes.extraction import ScanFeatures
-from ggslam.tracking.edges_planes.settings import LIDAR, FeatureTrackerSettings
+from ggslam.tracking.edges_planes.settings import LIDAR, ExtractionSettings, FeatureTrackerSettings
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp import GicpTarget, align
 from ggslam.tracking.gicp_tracker import GicpTracker
@@ -112,7 +112,9 @@ def run_recording(path: Path, arguments: argparse.Namespace) -> None:
         if arguments.stop and frame.index >= arguments.stop:
             break
         frames.append(frame)
-    features = with_budget(FeatureTrackerSettings(device=arguments.device), arguments.budget_ms)
+    extraction = ExtractionSettings(segment_angle_deg=arguments.segments)
+    features = FeatureTrackerSettings(device=arguments.device, extraction=extraction)
+    features = with_budget(features, arguments.budget_ms)
     runs = []
     for name, tracker in (
         ("gicp", GicpTracker(sequence.camera, context=context)),
@@ -254,6 +256,7 @@ def main() -> None:
     parser.add_argument("--scale", type=float, default=0.5, help="image size (default 0.5)")
     parser.add_argument("--stop", type=int, default=0, help="frames of each recording; 0: all")
     parser.add_argument("--budget-ms", type=float, default=10.0, help="of edges and planes per frame (0: no limit)")
+    parser.add_argument("--segments", type=float, default=0.0, help="angle of scan segments, degrees (0: none)")
     parser.add_argument("--threads", type=int, default=None, help="of G-ICP")
     parser.add_argument("--torch-threads", type=int, default=1, help="of edges and planes (default 1)")
     parser.add_argument("--device", default="cpu", help="of edges and planes: cpu or cuda")

@@ -4,185 +4,40 @@
     python scripts/papers/embedded.py [--data FOLDER] [--quick]
 
 Figure 4: milliseconds of odometry by 100 frames over 1,000 frames, straight on and turning, generated, with the sizes
-of both local maps; edges and planes beside G-ICP. Table 1: people, drawn as MPEG's are not to be had. Figure 7: quality
-and size over the quantiser of colours, the scale of the geometry and its quantiser within the octree, of a recording's
-voxels, down to where next to nothing is left. Parallel slices, the energy of coding where it can be read, a run that
-codes itself.
+of both local maps; edges and planes, with and without scan segments, beside G-ICP; and its plot. Table 1: people,
+drawn as MPEG's are not to be had. Figure 7: quality and size over the quantiser of colours, the scale of the geometry
+and its quantiser within the octree, of a recording's voxels, down to where next to nothing is left. Parallel slices,
+the energy of coding where it can be read, a run that codes itself, and two clients that send the cells of their maps
+to one server.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
-import numpy as np
 import torch
 
 import find_benchmarks  # noqa: F401  # isort: skip
+from embedded_clients import add_clients
+from embedded_coding import PEOPLE_QPS, add_coding, add_person, add_run
+from embedded_odometry import add_odometry
+from gpu_mapping import made
 from rows import Paper, options
 
-from bench_frontends import WINDOW, Run, track_frames  # isort: skip
-from gpcc_clouds import Cloud, person, voxelise  # isort: skip
-from gpu_mapping import made  # isort: skip
-from timing import seconds  # isort: skip
-from ggslam.coding import encode_cloud
-from ggslam.coding.energy import EnergyMeter
-from ggslam.coding.quantization import Quantization
+from gpcc_clouds import person, voxelise  # isort: skip
 from ggslam.coding.settings import CodecSettings
-from ggslam.coding.study import SWEEPS, GridCloud, StudyRow, StudyTuning, on_grid, run_sweep, sweep_steps
-from ggslam.evaluation.trajectory import score_trajectory
-from ggslam.jobs.encode.coding import encode_file
-from ggslam.jobs.run.encoding import EncodeRequest
-from ggslam.jobs.run.pipeline import RunRequest, execute
-from ggslam.native.loader import NativeContext
-from ggslam.runs.recordings import SequenceRequest
-from ggslam.scene.frame import Frame
+from ggslam.coding.study import on_grid
+from ggslam.reporting.plot_files import write_sheet
 from ggslam.sequences.factory import open_sequence
-from ggslam.tracking.edges_planes.tracker import FeatureTracker
-from ggslam.tracking.gicp_tracker import GicpTracker
+from ggslam.system.atomic import make_folder
 
-PEOPLE_QPS = (22, 34)
-COARSE_SCALES, COARSE_QPS = (1 / 256, 1 / 128, 1 / 64, 1 / 32), (64, 56, 48, 40)
-"""The coarse end of figure 7: steps of 256, 128, 64 and 32 voxels."""
-WORDS = {"geometry": "the geometry's scale", "geometry_qp": "the geometry's QP"}
-CHEAP = ["identity.enabled=false", "refine_iterations=60"]
-FEW = 1000
-TURNS = {
-    True: "errors are taken both ways and the worse counts: of so few decoded points that is chance",
-    False: "steps that are no whole voxels are rounded: some planes of voxels move by one, others stay, and it depends "
-    "on the room whether its walls are among them",
-}
-"""Why a coarser geometry measures better, of few decoded points and of many."""
 WAYS = {
     "straight on": ("--scene", "corridor"),
     "turning": ("--path", "turns"),
 }
-
-
-def add_odometry(paper: Paper, name: str, frames: list[Frame]) -> None:
-    """Rows of one way: both front-ends, a row for every 100 frames, then the whole."""
-    context = NativeContext()
-    features = FeatureTracker(frames[0].camera, context=context)
-    sizes: list[tuple[int, int]] = []
-
-    def watched() -> Iterator[Frame]:
-        for n, frame in enumerate(frames):
-            if n and n % WINDOW == 0:
-                sizes.append(map_sizes(features))
-            yield frame
-        sizes.append(map_sizes(features))
-
-    runs = {"edges and planes": track_frames(watched(), features, context)}
-    runs["G-ICP"] = track_frames(frames, GicpTracker(frames[0].camera, context=context), context)
-    for number, (edges, planes) in enumerate(sizes):
-        texts = [f"{window_ms(run, number):.1f} ms {front_end}" for front_end, run in runs.items()]
-        paper.add(
-            "figure 4", f"{name}, frames {WINDOW * number} to {min(len(frames), WINDOW * (number + 1)) - 1}", "",
-            ", ".join(texts), f"local maps: {edges} voxels of edges, {planes} of planes",
-        )  # fmt: skip
-    for front_end, run in runs.items():
-        found = score_trajectory(run.poses, run.truth)
-        error = "" if found is None else f"{100 * found.ate_rmse_m:.2f} cm ATE"
-        paper.add("odometry", f"{name}, {front_end}", "", error, f"{len(frames)} frames, {run.lost} lost")
-
-
-def map_sizes(tracker: FeatureTracker) -> tuple[int, int]:
-    """Voxels of edges and of planes in the local map."""
-    features = tracker.local_map.features
-    return len(features.surfaces(edges=True)), len(features.surfaces(edges=False))
-
-
-def window_ms(run: Run, number: int) -> float:
-    """Mean milliseconds a frame of one window."""
-    return float(np.mean(run.wall_ms[max(1, WINDOW * number) : WINDOW * (number + 1)]))
-
-
-def add_person(paper: Paper, cloud: Cloud, qps: Sequence[int]) -> None:
-    """A row of table 1 for each quantiser of colours, at lossless geometry."""
-    on = GridCloud(cloud.grid, cloud.colors, Quantization(1.0))
-    for row, _ in run_sweep(on, sweep_steps(("qp",), qps), CodecSettings(), EnergyMeter()):
-        bits = {"geometry": row.geometry_bytes, "colours": row.color_bytes}
-        parts = " + ".join(f"{8 * size / row.input_points:.2f} of {part}" for part, size in bits.items())
-        paper.add(
-            "table 1", f"{cloud.name} (drawn, for MPEG's people), 10 bits, {row.step.words()}", "",
-            f"{8 * row.total_bytes / row.input_points:.2f} bits a point, {parts}; Y {row.color.y:.2f} dB",
-            f"{row.input_points} points; {row.encode_s:.2f} s to code, {row.decode_s:.2f} s to decode",
-        )  # fmt: skip
-
-
-def add_coding(paper: Paper, name: str, cloud: GridCloud, quick: bool) -> None:
-    """Rows of the codec."""
-    meter = EnergyMeter()
-    if meter.note:
-        paper.add("energy", name, "", "", meter.note)
-    whole = (StudyTuning.qps, (*COARSE_SCALES, *StudyTuning.scales), (*COARSE_QPS, *StudyTuning.geometry_qps))
-    steps = sweep_steps(SWEEPS, *(((22,), (0.5, *COARSE_SCALES[:2]), (8, *COARSE_QPS[:2])) if quick else whole))
-    rows = []
-    for row, _ in run_sweep(cloud, steps, CodecSettings(), meter):
-        rows.append(row)
-        energy = "" if row.joules is None else f"; {row.joules:.1f} J"
-        paper.add(
-            "figure 7", f"{name}, {row.step.words()}", "",
-            f"{8 * row.total_bytes / row.input_points:.4g} bits a point, " + quality(row),
-            f"{row.encode_s:.2f} s to code, {row.decode_s:.2f} s to decode{energy}",
-        )  # fmt: skip
-    for sweep in SWEEPS[1:]:
-        add_turns(paper, name, [row for row in rows if row.step.sweep == sweep])
-    colors = {"color": cloud.colors}
-    one, four = (
-        min(seconds(partial(encode_cloud, cloud.grid, colors, CodecSettings(qp=22, slices=n)), 1 if quick else 5))
-        for n in (1, 4)
-    )
-    paper.add(
-        "slices", f"{name}, four in parallel, QP 22", "43 % less time", f"{100 * (1 - four / one):.0f} % less time",
-        f"{os.cpu_count()} processors; {one:.2f} s in one slice",
-    )  # fmt: skip
-
-
-def add_run(paper: Paper, folder: Path, name: str, recording: Path, frames: int) -> None:
-    """A row of a run that codes itself, held against coding it afterwards."""
-    asked = EncodeRequest(folder / "beside.bin", CodecSettings(slices=4))
-    reading = SequenceRequest(recording, stop=frames, scale=0.5)
-    outcome = execute(RunRequest(reading, folder / "run", encode=asked, checkpoint_every=0, overrides=CHEAP))
-    encode_file(outcome.folder.path, folder / "after.bin", asked.settings)
-    same = asked.out.read_bytes() == (folder / "after.bin").read_bytes()
-    words = outcome.encoded.replace(str(asked.out), "").replace(": ,", ":")
-    paper.add("run --encode", f"{name}, {frames} frames, 4 slices", "", words,
-              f"{'the same bytes as' if same else 'OTHER BYTES THAN'} `encode` afterwards")  # fmt: skip
-
-
-def quality(row: StudyRow) -> str:
-    """What is left of a cloud."""
-    color = row.color
-    if row.step.sweep == "qp":
-        return f"Y {color.y:.2f} dB"
-    return (
-        f"D1 {row.d1:.2f}, D2 {row.d2:.2f}, Y {color.y:.2f}, U {color.u:.2f}, V {color.v:.2f} dB, "
-        f"{row.decoded_points} points, {8 * row.total_bytes / row.decoded_points:.3g} bits a decoded point"
-    )
-
-
-def add_turns(paper: Paper, name: str, rows: list[StudyRow]) -> None:
-    """A row for each measure that gets better where the geometry gets coarser."""
-    by_size = sorted(rows, key=lambda row: row.total_bytes)
-    for measure in ("d1", "d2", "psnr_y", "psnr_u", "psnr_v"):
-        pairs = [
-            (coarse, fine)
-            for coarse, fine in itertools.pairwise(by_size)
-            if coarse.values()[measure] > fine.values()[measure]
-        ]
-        turns = [
-            f"{coarse.values()[measure]:.2f} dB at {coarse.step.words()} ({coarse.decoded_points} points) over "
-            f"{fine.values()[measure]:.2f} at {fine.step.words()} ({fine.decoded_points})"
-            for coarse, fine in pairs
-        ]
-        why = "; ".join(TURNS[few] for few in sorted({coarse.decoded_points < FEW for coarse, _ in pairs}))
-        what = f"{name}, {measure.removeprefix('psnr_').upper()} over {WORDS[rows[0].step.sweep]}"
-        paper.add("figure 7, where it is not monotone", what, "", "; ".join(turns) or "monotone", why)
 
 
 def main() -> None:
@@ -191,12 +46,21 @@ def main() -> None:
     quick = arguments.quick
     conditions = f"{os.cpu_count()} processors; generated recordings of 320x240 with a Kinect's noise."
     paper = Paper("embedded", "SLAM and coding on embedded systems (JBE 2025)", conditions)
-    with tempfile.TemporaryDirectory() as folder:
-        for name, words in WAYS.items():
-            path = made(Path(folder, name.replace(" ", "_")), *words, "--frames", 40 if quick else 1000)
-            add_odometry(paper, name, list(open_sequence(path).stream(masks=False)))
-            if name == "straight on":
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(len(WAYS)) as pool:
+        count = ("--frames", 40 if quick else 1000)
+        made_ways = {
+            name: pool.submit(made, Path(folder, name.replace(" ", "_")), *words, *count)
+            for name, words in WAYS.items()
+        }
+        wait(made_ways.values())  # before anything is timed
+        for name, path in ((name, future.result()) for name, future in made_ways.items()):
+            plots = add_odometry(paper, name, list(open_sequence(path).stream(masks=False)))
+            make_folder(arguments.out)
+            if "corridor" in WAYS[name]:
+                add_clients(paper, path, 40 if quick else 400)
                 add_run(paper, Path(folder), name, path, 10 if quick else 60)
+            for file in write_sheet(arguments.out / f"embedded_figure_4_{path.name}", plots):
+                print(file)
     for seed in range(1 if quick else 4):
         add_person(paper, person(seed), PEOPLE_QPS[: 1 if quick else None])
     recording = arguments.data / "livingroom"

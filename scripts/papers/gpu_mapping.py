@@ -38,9 +38,13 @@ PERIOD_MS = 1e3 / 30
 
 def made(folder: Path, *words: object) -> Path:
     """A recording that `ggslam synth` writes."""
-    command = [sys.executable, "-m", "ggslam", "synth", folder, *words]
-    subprocess.run([str(word) for word in command], check=True, capture_output=True)
+    run_command("synth", folder, *words)
     return folder
+
+
+def run_command(*words: object) -> None:
+    """Runs a command of `ggslam`."""
+    subprocess.run([sys.executable, "-m", "ggslam", *map(str, words)], check=True, capture_output=True)
 
 
 def fuse(frames: list[Frame], voxel: float, with_field: bool) -> tuple[np.ndarray, np.ndarray, TsdfMap]:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from ggslam.coding.cloud import PointCloud
-from ggslam.coding.energy import EnergyMeter
 from ggslam.coding.settings import CodecSettings
 from ggslam.coding.study import SWEEPS, GridCloud, StudyRow, SweepStep, run_sweep
 from ggslam.reporting.cloud_pictures import CloudView, contact_sheet, draw_cloud, view_of
@@ -25,6 +24,7 @@ from ggslam.reporting.plot_files import write_sheet
 from ggslam.reporting.plots import Plot, Series
 from ggslam.system.atomic import make_folder, write_text
 from ggslam.system.csv_text import csv_text
+from ggslam.system.energy import EnergyMeter
 from ggslam.system.json_files import write_json
 from ggslam.system.plurals import quantity
 

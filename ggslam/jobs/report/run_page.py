@@ -219,7 +219,22 @@ def _time(run: RunData) -> Html:
     ]  # fmt: skip
     listed = p.table(["stage", "seconds", "ms a frame", "%", ""], rows, text_columns=(4,))
     course = p.figures(time_plots([run])) if run.steps else p.tag("p", _NO_STEPS)
-    return p.join([bar, listed, course])
+    return p.join([bar, listed, *_energy(run), course])
+
+
+def _energy(run: RunData) -> list[Html]:
+    """What the parts used, if that was counted."""
+    energy = None if run.timing is None else run.timing.energy
+    if energy is None:
+        return []
+    words = f"Energy of the whole machine ({energy.source})." if energy.source else f"{energy.note.capitalize()}."
+    known = ["J"][: energy.source is not None]
+    rows = [
+        [name, f"{used.seconds:.2f}", f"{used.cpu_s:.2f}", *[f"{used.joules or 0:.1f}" for _ in known]]
+        for name, used in [*energy.parts.items(), ("in all", energy.whole)]
+    ]
+    note = p.tag("p", f"{words} What is in one part is in no other.", class_="note")
+    return [note, p.table(["part", "seconds", "processor seconds", *known], rows)]
 
 
 def _map(run: RunData) -> Html:

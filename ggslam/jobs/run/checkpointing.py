@@ -22,6 +22,7 @@ from ggslam.sequences import Sequence
 from ggslam.sequences.sequence import SkippedFrame
 from ggslam.slam.config import Config, config_to_dict
 from ggslam.slam.slam import Slam
+from ggslam.system.spent import part
 from ggslam.system.tuning import Tuning
 
 
@@ -72,6 +73,7 @@ class Checkpointing:
             and CheckpointIntervalTuning.share * passed > _size_of(slam) / self._bytes_a_second
         )
 
+    @part("checkpoints")
     def save(self, slam: Slam) -> None:
         """Saves the state between two steps. If that fails it is said, once, and the run goes on."""
         if not slam.mapper.keyframes:

@@ -31,6 +31,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import SequenceRequest, describe, open_recording_of
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.metrics import MetricsRecord
+from ggslam.runs.records.timing import EnergyRecord, TimingRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.runs.starting import ancestors
 from ggslam.runs.writing import REPORT_FILE, RunToWrite
@@ -41,9 +42,11 @@ from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.config import Config, load_config, settings_notes
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import reason_against_saving
+from ggslam.system.energy import EnergyMeter
 from ggslam.system.folder_lock import folder_lock
 from ggslam.system.interrupts import StopRequest, stop_on_request
 from ggslam.system.plurals import quantity
+from ggslam.system.spent import Spent, part
 
 T = TypeVar("T")
 
@@ -53,7 +56,7 @@ class RunRequest:
     """A whole run; with `map` in the map of an earlier one, which grows unless `localize_only`. Its state is saved
     after every `checkpoint_every` frames: 0: never; None: as often as it hardly takes time. `check`: look at the
     recording's depth first, and refuse what is certainly wrong with it. `loss`: a loss of the user's own, see
-    `named_loss`; it is run. `encode`: what to code the finished run as."""
+    `named_loss`; it is run. `energy`: count what each part uses. `encode`: what to code the finished run as."""
 
     sequence: SequenceRequest
     out: Path | None = None
@@ -67,14 +70,15 @@ class RunRequest:
     check: bool = True
     loss: str | None = None
     encode: EncodeRequest | None = None
+    energy: bool = False
 
 
 @dataclass
 class RunOutcome:
     """A finished run, or what was saved of one that stopped early (`error` says why). If it could not be saved as it
     should be, `failure` says so, and where it is. `verdicts` tell what seems wrong with it or its recording, `verdict`
-    how good it is; None: that could not be told. `encoded`: a line on the stream that was asked for, `encode_failure`:
-    why there is none."""
+    how good it is; None: that could not be told. `energy`: what each part used, if that was asked for. `encoded`: a
+    line on the stream that was asked for, `encode_failure`: why there is none."""
 
     folder: RunFolder
     result: SlamResult
@@ -85,6 +89,7 @@ class RunOutcome:
     verdict: RunVerdict | None = None
     encoded: str = ""
     encode_failure: GgslamError | None = None
+    energy: EnergyRecord | None = None
 
     def headline(self) -> str:
         """One line for people."""
@@ -145,7 +150,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
 def resume(
     run: Path, observer: Observer | None = None, follower: Follower | None = None, *, recording: Path | None = None,
     evaluate: bool | None = None, checkpoint_every: int | None = None, model: str | None = None,
-    loss: str | None = None, encode: EncodeRequest | None = None,
+    loss: str | None = None, energy: bool = False, encode: EncodeRequest | None = None,
 ) -> RunOutcome:  # fmt: skip
     """Goes on with a run that was cut off, from its newest checkpoint. A synchronous run on the CPU becomes what it
     would have become, bit for bit.
@@ -160,6 +165,7 @@ def resume(
         model: the model of masks that the run was begun with, if it was with one: it is run like a program, and the
             folder may come from somebody else.
         loss: name of the user's own loss that the run was begun with, likewise. What it remembers is not saved.
+        energy: count what each part uses from now on.
         encode: what to code the finished run as; a run does not remember what it was to be coded as.
 
     Raises:
@@ -174,7 +180,7 @@ def resume(
         asked = RunRequest(
             found.request, folder.path, evaluate=found.start.evaluate if evaluate is None else evaluate,
             localize_only=found.start.localize_only, checkpoint_every=checkpoint_every, loss=loss,
-            encode=encode,
+            energy=energy, encode=encode,
         )  # fmt: skip
         own = None if loss is None else NamedLoss.load(loss)
         observer = observer or SilentObserver()
@@ -199,9 +205,17 @@ class _Run:
     fit: MapFit | None = None
     saw_all: bool = False
     told: list[str] = field(default_factory=list)
+    spent: Spent | None = None
 
     def run(self, resumption: Resumption | None) -> RunOutcome:
         """From the first frame, or from where it was, to the report."""
+        if not self.request.energy:
+            return self._run(resumption)
+        self.spent = Spent(EnergyMeter())
+        with self.spent.count_parts("reading and the rest"):
+            return self._run(resumption)
+
+    def _run(self, resumption: Resumption | None) -> RunOutcome:
         folder, sequence, observer = self.folder, self.sequence, self.observer
         for warning in sequence.warnings:
             observer.note(warning)
@@ -275,7 +289,8 @@ class _Run:
             run = RunToWrite(
                 self.config, described, result, told, names, wanted, verdicts, loss=self.request.loss
             )  # fmt: skip
-            folder, failure = save_somewhere(self.folder, run)
+            with part("writing"):
+                folder, failure = save_somewhere(self.folder, run)
             if (folder.path / "map.ply").is_file():
                 self.fit = self._or_note(lambda: self._fit(result, folder))
         finally:
@@ -332,11 +347,16 @@ class _Run:
             if kept is None:
                 self.observer.note("not scored: the frames of a live camera are kept with `record` only")
             else:
-                outcome.metrics = score_run(self.folder, kept, self.observer)
+                with part("scoring"):
+                    outcome.metrics = score_run(self.folder, kept, self.observer)
         outcome.verdict = self._or_note(lambda: self._verdict(outcome))
         if outcome.verdict is not None:
             with self.folder.change_files(RunVerdict.FILE):
                 outcome.verdict.write(self.folder.path)
+        if self.spent is not None:
+            outcome.energy = EnergyRecord.of_spent(self.spent)
+            with self.folder.change_files(TimingRecord.FILE):
+                self.folder.timing().model_copy(update={"energy": outcome.energy}).write(self.folder.path)
         write_report(self.folder, kept)
 
     def _verdict(self, outcome: RunOutcome) -> RunVerdict:

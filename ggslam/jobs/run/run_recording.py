@@ -26,6 +26,7 @@ def run_recording(
     evaluate: bool = True,
     overwrite: bool = False,
     check: bool = True,
+    energy: bool = False,
     observer: Observer | None = None,
     **selection: Any,
 ) -> RunOutcome:
@@ -41,6 +42,7 @@ def run_recording(
         evaluate: score the run.
         overwrite: replace a run that is there.
         check: look at the recording's depth first, and refuse what is certainly wrong with it.
+        energy: count what each part of the run uses, into timing.json.
         observer: receives progress updates; see `ggslam.jobs.progress.Observer`.
         selection: start, stop, stride, scale and the other arguments of `open_sequence`, of a recording named by path.
 
@@ -59,5 +61,6 @@ def run_recording(
     request = RunRequest(
         sequence, None if out is None else Path(out), None if config is None else str(config), list(overrides),
         evaluate, overwrite, None if map is None else Path(map), localize_only, check=check,
+        energy=energy,
     )  # fmt: skip
     return execute(request, observer)

@@ -29,6 +29,7 @@ from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.slam import Slam
 from ggslam.system.interrupts import StopRequest
 from ggslam.system.plurals import quantity
+from ggslam.system.spent import part
 from ggslam.system.staging import new_staging
 
 Follower = Callable[[Slam, Frame, StepReport], None]
@@ -112,7 +113,8 @@ class SlamLoop:
         self._between_steps = self.config.realtime_fps == 0
         if self.config.realtime_fps > 0:
             paced = RealtimeSlam(slam, self.config.realtime_fps, live=isinstance(sequence, LiveSequence))
-            paced.run(frames, lambda *step: self._report(slam, *step))
+            with part("tracking and mapping, side by side", whole=True):
+                paced.run(frames, lambda *step: self._report(slam, *step))
             return
         for together in by_instant(frames):
             self._between_steps = False

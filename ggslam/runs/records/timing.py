@@ -10,6 +10,7 @@ from ggslam.runs.records.record import Number, NumberOrNone, Record, RecordFile
 from ggslam.slam.result import SlamResult
 from ggslam.system.plurals import quantity, word_for
 from ggslam.system.process_memory import peak_memory_mb
+from ggslam.system.spent import Spent
 
 
 class MappingTimes(Record):
@@ -25,9 +26,47 @@ class MappingTimes(Record):
     keyframes: int = 0
 
 
+class UsedRecord(Record):
+    """See `system.spent.Used`; `joules` is null where they cannot be read."""
+
+    seconds: Number = 0.0
+    cpu_s: Number = 0.0
+    joules: NumberOrNone = None
+
+
+class EnergyRecord(Record):
+    """What a run used, in all and part by part: what is in one part is in no other. `source` says what was read (null:
+    nothing), `note` why nothing could be."""
+
+    source: str | None = None
+    note: str = ""
+    whole: UsedRecord = UsedRecord()
+    parts: dict[str, UsedRecord] = {}
+
+    @staticmethod
+    def of_spent(spent: Spent) -> EnergyRecord:
+        """Of what was counted so far."""
+        known = bool(spent.meter.source)
+        parts = {name: {**asdict(used), **({} if known else {"joules": None})} for name, used in spent.so_far().items()}
+        whole = {key: sum(used[key] for used in parts.values()) for key in ("seconds", "cpu_s", *["joules"][:known])}
+        return EnergyRecord.of({
+            "source": spent.meter.source or None, "note": spent.meter.note, "whole": whole, "parts": parts,
+        })  # fmt: skip
+
+    def text(self) -> str:
+        """One line for people: joules, or seconds of the processors where there are none."""
+        key, unit = ("cpu_s", "s") if self.source is None else ("joules", "J")
+        words = ", ".join(f"{name} {used.number(key) or 0:.1f} {unit}" for name, used in self.parts.items())
+        total = f"{self.whole.number(key) or 0:.1f} {unit}"
+        if self.source is None:
+            return f"{self.note}; processor time {total}: {words}"
+        return f"energy {total} ({self.source}, the whole machine): {words}"
+
+
 class TimingRecord(RecordFile):
     """Seconds by part; see `slam.result.SlamTimes`. `peak_rss_mb` is in MB (10^6 bytes). Of a merged run they are the
-    sums over its runs, and `merge_s` says what merging took, `seam_iterations` the steps it made."""
+    sums over its runs, and `merge_s` says what merging took, `seam_iterations` the steps it made. `energy` is there
+    if it was asked for."""
 
     FILE: ClassVar[str] = "timing.json"
     frames: int = 0
@@ -49,6 +88,7 @@ class TimingRecord(RecordFile):
     paging: dict[str, NumberOrNone] | None = None
     merge_s: dict[str, Number] | None = None
     seam_iterations: int | None = None
+    energy: EnergyRecord | None = None
 
     @staticmethod
     def of_result(result: SlamResult) -> TimingRecord:

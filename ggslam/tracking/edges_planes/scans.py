@@ -12,6 +12,7 @@ from torch import Tensor
 from ggslam.scene.camera import Camera
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.edges_planes.extraction import LineScanner, ScanFeatures, ScanLines
+from ggslam.tracking.edges_planes.segments import RangeSegments
 from ggslam.tracking.edges_planes.settings import ExtractionSettings
 from ggslam.tracking.settings import DepthNoise
 
@@ -50,6 +51,7 @@ class DepthImageFeatures:
         self._design = torch.stack([du, dv, ones], 1)
         self._solve = self._design / self._design.square().sum(0)  # the three columns are orthogonal
         self._margin = int(offsets[-1])
+        self._segments = _DepthSegments(camera, settings, self._pitch) if settings.segment_angle_deg else None
 
     @torch.inference_mode()
     def extract(self, depth: np.ndarray, noise: DepthNoise) -> ScanFeatures:
@@ -65,6 +67,8 @@ class DepthImageFeatures:
         expected = (self.camera.height, self.camera.width)
         if depth.shape != expected:
             raise ValueError(f"depth is {depth.shape}, expected {expected} of the camera")
+        if self._segments is not None:
+            depth = self._segments.without_small(depth, noise)
         image = self._depth.copy_(torch.tensor(np.ascontiguousarray(depth, np.float32)))
         edges, planes = self._lines.pick(image, noise)
         planes, normals, z = self._patches(planes, noise)
@@ -109,6 +113,34 @@ class DepthImageFeatures:
         good = (residual * z * z < limit) & (cosine > s.min_cosine)  # false for what is not a number
         kept = good.nonzero()[:, 0]
         return (rays * z[:, None]).index_select(0, kept), normals.index_select(0, kept), z.index_select(0, kept)
+
+
+class _DepthSegments:
+    """Leaves small segments out of depth images of one camera. Of each square of `pitch` x `pitch` pixels the first one
+    speaks for all."""
+
+    def __init__(self, camera: Camera, settings: ExtractionSettings, pitch: int) -> None:
+        self._pitch, self._least, self._sigmas = pitch, settings.segment_pixels, settings.segment_sigmas
+        rays = camera.rays()[::pitch, ::pitch].astype(np.float64)
+        lengths = np.linalg.norm(rays, axis=2)
+        rays /= lengths[..., None]
+        self._lengths = lengths.astype(np.float32)
+        across, down = (
+            np.arcsin(np.linalg.norm(np.cross(one, other), axis=2).clip(max=1))
+            for one, other in ((rays[:, :-1], rays[:, 1:]), (rays[:-1], rays[1:]))
+        )
+        self._segments = RangeSegments(across, down, settings.segment_angle_deg)
+
+    def without_small(self, depth: np.ndarray, noise: DepthNoise) -> np.ndarray:
+        """Depth [H, W], metres, 0 where it is unknown or in a small segment. Noise does not part a surface."""
+        coarse = depth[:: self._pitch, :: self._pitch]
+        z = np.where(np.isfinite(coarse), coarse, 0).astype(np.float32)
+        apart = np.float32(self._sigmas) * (noise.constant + noise.square * z * z)
+        kept = self._segments.without_small(z * self._lengths, self._least, apart)
+        if self._pitch > 1:
+            height, width = depth.shape
+            kept = kept.repeat(self._pitch, 0).repeat(self._pitch, 1)[:height, :width]
+        return np.where(kept, depth, 0)
 
 
 def plain_features(planes: Tensor, edges: Tensor, plane_sigmas: Tensor, edge_sigmas: Tensor) -> ScanFeatures:

@@ -43,6 +43,13 @@ class ExtractionTuning:
     """Planes seen at a smaller cosine between normal and ray are dropped."""
     min_depth: float = setting(0.1, 0, 1e4, "m")
     """Nearer depth is ignored."""
+    segment_angle_deg: float = setting(0.0, 0, 89, "deg")
+    """Neighbours belong to one segment if the line through them makes a larger angle with the farther one's ray (10 is
+    usual), and small segments have no features; 0: no segments are looked for."""
+    segment_sigmas: float = setting(4.0, 0, 1e3)
+    """Standard deviations of the depth noise by which neighbours of one segment may be farther apart than that."""
+    segment_pixels: int = setting(30, 1, 10**6, "px")
+    """Smallest segment that has features, in pixels of a 320-pixel-wide image."""
 
 
 @settings_class(frozen=True)

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each part of a program used: seconds, seconds of processors, joules.
+
+    spent = Spent(EnergyMeter())
+    with spent.count_parts("the rest"):
+        with part("tracking"):
+            ...
+
+Whatever runs inside a part counts for that part and no other, so parts add up to the whole. `part` does nothing in a
+program, or a thread, that is not counted.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+
+from ggslam.system.energy import EnergyMeter
+
+
+@dataclass
+class Used:
+    """What one part used: seconds of wall time, seconds of all of this process's threads on a processor, joules of the
+    whole machine meanwhile (0 where they cannot be read)."""
+
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    joules: float = 0.0
+
+
+class Spent:
+    """Counts what the parts use.
+
+    Attributes:
+        meter: where joules come from.
+
+    Args:
+        meter: see above.
+    """
+
+    def __init__(self, meter: EnergyMeter) -> None:
+        self.meter, self._parts = meter, dict[str, Used]()
+        self._open: list[str] = []
+        self._last = (0.0, 0.0, 0.0)
+
+    @contextmanager
+    def count_parts(self, rest: str) -> Iterator[None]:
+        """Counts the block's parts, in this thread.
+
+        Args:
+            rest: the part of what is in no other.
+        """
+        with self.meter.watch():
+            self._last = self._now()
+            token = _COUNTED.set(self)
+            try:
+                with self.part(rest):
+                    yield
+            finally:
+                _COUNTED.reset(token)
+
+    @contextmanager
+    def part(self, name: str, whole: bool = False) -> Iterator[None]:
+        """Counts the block for `name`. `whole`: and whatever parts it has, because they run side by side."""
+        self._lap()
+        self._open.append(name)
+        self._parts.setdefault(name, Used())
+        token = _COUNTED.set(None) if whole else None
+        try:
+            yield
+        finally:
+            if token is not None:
+                _COUNTED.reset(token)
+            self._lap()
+            self._open.pop()
+
+    def so_far(self) -> dict[str, Used]:
+        """What each part used until now, in the order of their first begin."""
+        self._lap()
+        return {name: replace(used) for name, used in self._parts.items()}
+
+    def _lap(self) -> None:
+        """What was used since the last call goes to the innermost open part."""
+        now = self._now()
+        if self._open:
+            used = self._parts[self._open[-1]]
+            used.seconds += now[0] - self._last[0]
+            used.cpu_s += now[1] - self._last[1]
+            used.joules += now[2] - self._last[2]
+        self._last = now
+
+    def _now(self) -> tuple[float, float, float]:
+        return time.perf_counter(), time.process_time(), self.meter.joules() or 0.0
+
+
+_COUNTED: ContextVar[Spent | None] = ContextVar("counted", default=None)
+
+
+@contextmanager
+def part(name: str, whole: bool = False) -> Iterator[None]:
+    """The block is a part of what `Spent.count_parts` counts, if this thread is counted; else nothing."""
+    spent = _COUNTED.get()
+    if spent is None:
+        yield
+        return
+    with spent.part(name, whole):
+        yield
