@@ -26,7 +26,7 @@ from ggslam.mapping.other_sizes import picture_of_turn
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.pruning import is_look_due, prune
 from ggslam.mapping.residency import Residency
-from ggslam.mapping.sampling import KeyframeSampler, last_visits
+from ggslam.mapping.sampling import last_visits, make_sampler
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
@@ -187,7 +187,7 @@ class Mapper(ABC):
         self._rasterizer: TrainingRasterizer
         self._mean = MeanMap()
         self._adam_of_pixel: tuple[float, bool, AdamSettings] | None = None
-        self._sampler = KeyframeSampler(float(np.random.default_rng(seed).random()))
+        self._sampler = make_sampler(settings.order, seed)
 
     @property
     @abstractmethod
@@ -233,6 +233,7 @@ class Mapper(ABC):
         keyframe = self._new_keyframe(frame, T_world_camera)
         self._insert(keyframe, T_world_camera, labeller, begin_others)
         self.keyframes.append(keyframe)
+        self._sampler.arrive(self.keyframes)
         self.use_typical_exposure()
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
             prune(self.map, self.settings.pruning)
@@ -351,7 +352,7 @@ class Mapper(ABC):
     # --- optimisation ------------------------------------------------------------------------------------------------
 
     def run(self, iterations: int) -> None:
-        """Optimisation, see `KeyframeSampler` for the order of keyframes."""
+        """Optimisation, see `mapping.sampling` for the order of keyframes."""
         numbers = self._trainable()
         for _ in range(iterations):
             if self.residency is not None:  # a part on disk comes late to the last steps, and for short
@@ -433,7 +434,7 @@ class Mapper(ABC):
         return [k for k in numbers if k not in self.left_out] if self.left_out else numbers
 
     def _draw(self, numbers: Sequence[int]) -> Keyframe:
-        return self.keyframes[numbers[self._sampler.draw(len(numbers))]]
+        return self.keyframes[self._sampler.choose(numbers)]
 
     def stages(self) -> Iterable[Sequence[int]]:
         """Numbers of all keyframes, some after the others: of those handed out the whole map is in memory."""
@@ -586,6 +587,7 @@ class Mapper(ABC):
         mean over the last ones, see `MapperSettings.average_last`, or learning rates fall exponentially. The first
         `begin` steps were made before; between steps `progress` is told how many of how many are."""
         share, done = self._averaged_share, 0
+        self._sampler.end()
         for numbers, steps in self._stages(iterations):
             self._beside = self._trained_beside(numbers)
             for i in range(steps):
