@@ -27,7 +27,7 @@ class CovisibilityTuning(Tuning):
 def covisible(keyframe: Keyframe, others: Sequence[Keyframe]) -> list[int]:
     """Numbers, ascending, of the keyframes that show most of a keyframe's surface, of those that show enough."""
     points = _surface(keyframe)
-    shared = np.array([_shown(points, other) for other in others])
+    shared = np.array([_share_on(points, other) for other in others])
     best = np.argsort(-shared, kind="stable")[: CovisibilityTuning.window]
     return sorted(others[k].index for k in best if shared[k] >= CovisibilityTuning.least_shared)
 
@@ -41,7 +41,7 @@ def _surface(keyframe: Keyframe) -> np.ndarray:
     return points[(grid & (depth > 0)).reshape(-1)]
 
 
-def _shown(points: np.ndarray, keyframe: Keyframe) -> float:
+def _share_on(points: np.ndarray, keyframe: Keyframe) -> float:
     """Share of the points on surface that a keyframe shows; 0 of none."""
     depth = keyframe.depth_m()
     if not len(points) or not depth.size:  # those of an earlier map may have no images

@@ -236,7 +236,9 @@ class Mapper(ABC):
         self._sampler.arrive(self.keyframes)
         self.use_typical_exposure()
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
-            prune(self.map, self.settings.pruning)
+            self._densify()
+            if self.settings.pruning.enabled:
+                prune(self.map, self.settings.pruning)
         if self._is_noisy and not self.is_live and is_look_due(len(self.keyframes)):
             self.drop_hidden()
         self.times.insertion += time.perf_counter() - start
@@ -334,6 +336,9 @@ class Mapper(ABC):
         begin_others: Callable[[], None],
     ) -> None:  # fmt: skip
         """Inserts Gaussians for what the map lacks at a keyframe seen from `T_world_camera`, and takes its labels."""
+
+    def _densify(self) -> None:  # noqa: B027
+        """Clones and splits Gaussians if `MapperSettings.densification` says so; on the CPU."""
 
     def _take_labels(self, keyframe: Keyframe, labels: KeyframeLabels) -> None:
         """The keyframe's objects become its mask. What was rendered last is the map as the keyframe sees it, if

@@ -85,6 +85,10 @@ CAPABILITIES = (
         {Mode.RIG: _OUT, Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}, "mapping.exposure.enabled",
         lambda c: not c.mapping.exposure.enabled,
     ),
+    Capability(
+        "cloning and splitting Gaussians", {Mode.GPU: _OUT}, "mapping.densification",
+        lambda c: c.mapping.densification != "never",
+    ),
     Capability("pruning hidden Gaussians where depth is noisy", {Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END}),
     Capability("checkpoints and `resume`", {Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}),
     Capability("repeating bit for bit", {Mode.GPU: _OUT, Mode.REALTIME: _OUT}),

@@ -39,8 +39,11 @@ KINDS: dict[str, list[str]] = {
     "dense identities, degree 1": ["identity.schedule=dense", "sh_degree=1", "mapping.exposure.enabled=true"],
     "random keyframes": ["identity.enabled=false", "mapping.order=random"],
     "newest keyframes first": ["identity.enabled=false", "mapping.order=newest"],
-    "covisible keyframes": ["identity.enabled=false", "mapping.order=covisible"],
-}
+    "covisible keyframes, cloned Gaussians": [
+        "identity.enabled=false", "mapping.order=covisible", "mapping.densification=added",
+        "mapping.pruning.every_keyframes=2",
+    ],
+}  # fmt: skip
 
 
 def copied(slam: Slam) -> tuple[Any, list[np.ndarray]]:
