@@ -412,7 +412,7 @@ class Mapper(ABC):
     @property
     def _is_identity_dense(self) -> bool:
         """Whether identities are trained on whole rendered images of them."""
-        return self.identity is not None and self.identity.settings.schedule == "dense"
+        return self.identity is not None and self.identity.settings.renders_images
 
     def _is_identity_due(self, keyframe: Keyframe) -> bool:
         return self.identity is not None and self.identity.due(keyframe)

@@ -37,6 +37,7 @@ KINDS: dict[str, list[str]] = {
     "no objects": ["identity.enabled=false", "loops.enabled=false"],
     "edges and planes, segmented": ["tracker=edges_planes", "edges_planes.align.budget_ms=0", "masks.source=geometry"],
     "dense identities, degree 1": ["identity.schedule=dense", "sh_degree=1", "mapping.exposure.enabled=true"],
+    "objects as colours": ["identity.schedule=colors", "identity.every=2"],
     "random keyframes": ["identity.enabled=false", "mapping.order=random"],
     "newest keyframes first": ["identity.enabled=false", "mapping.order=newest"],
     "covisible keyframes, cloned Gaussians": [
