@@ -89,8 +89,8 @@ def main() -> None:
         raise SystemExit(f"{recording}: not there")
     conditions = (
         f"{RECORDING} at 320x240 with its exact masks, {os.cpu_count()} processors; held-out frames. The ablation: "
-        f"frames 0 to {ABLATION_FRAMES - 1}, without objects. Identities have 16 channels in all rows, of which colours "
-        "use 3."
+        f"frames 0 to {ABLATION_FRAMES - 1}, without objects. Identities have 16 channels in all rows; "
+        "colours use 3 of them."
     )
     paper = Paper("gg_slam", "GG-SLAM", conditions)
     add_schedules(paper, recording, short)
