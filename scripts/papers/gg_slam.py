@@ -5,7 +5,8 @@
 
 Table 1 is in the layout of Replica's scenes and comes from `ggslam batch --replica` (replica.py). Here: table 2,
 schedules of learning objects on one recording; table 3, real time at 10, 20 and 30 frames a second with objects; and an
-ablation of which keyframe is trained next, and of how the map grows and is pruned, without objects. The paper's own figures are not in the code: its cells are empty. Nothing else should run on the machine.
+ablation of which keyframe is trained next, and of how the map grows and is pruned, without objects. The paper's own
+figures are not in the code: its cells are empty. Nothing else should run on the machine.
 """
 
 from __future__ import annotations
