@@ -256,12 +256,12 @@ class IdentityLearner(ABC):
             rate_factor: multiplies the learning rates (of the sampled schedule).
 
         Returns:
-            With the dense schedule the gradient of the rendered features [F, H, W], for the caller's backward pass;
-            else None, and the step is made.
+            With a schedule that renders images of identities the gradient of the rendered features [F, H, W], for the
+            caller's backward pass; else None, and the step is made.
         """
         start = time.perf_counter()
         gradient = None
-        if self.settings.schedule == "dense":
+        if self.settings.renders_images:
             gradient = self._dense(gaussians, rasterizer, keyframe, view)
         pixels, vote_weights = self._draw(keyframe)
         if len(pixels):
@@ -333,8 +333,8 @@ class IdentityLearner(ABC):
 
     @abstractmethod
     def _dense(self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers) -> torch.Tensor:
-        """Cross-entropy of a whole rendered identity image, as published; updates the classifier. Returns the gradient
-        of the rendered features [F, H, W]."""
+        """Cross-entropy of a whole rendered identity image, as published; updates the classifier. Or the difference of
+        a whole image of colours. Returns the gradient of the rendered features [F, H, W]."""
 
     @abstractmethod
     def split(

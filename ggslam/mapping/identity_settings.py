@@ -40,7 +40,8 @@ class IdentityTuning:
     boundary: float = setting(0.5, 0, 1)
     """Share of the sample taken at boundaries of objects."""
     detach: bool = True
-    """Keep gradients of identity from geometry and opacity; false needs the dense schedule."""
+    """Keep gradients of identity from geometry and opacity; false needs a schedule that renders images of
+    them: dense or colors."""
     initialisation: Literal["votes", "random"] = "votes"
     """votes: a new Gaussian starts with the code of the object it is seen on; random: (uniform - 0.5) / C0."""
     rate: float = setting(0.05, 0, 10)
@@ -59,9 +60,15 @@ class IdentitySettings(IdentityTuning):
 
     enabled: bool = setting(True, basic=True)
     """Learn objects from masks (`masks.source`)."""
-    schedule: Literal["sampled", "dense", "votes"] = "sampled"
+    schedule: Literal["sampled", "dense", "colors", "votes"] = "sampled"
     """How identities are learned. sampled: on sampled pixels of views rendered for colour anyway; dense: on all pixels
-    of rendered identity images, as published; votes: by counting, without training."""
+    of rendered identity images, as published; colors: likewise, but as colours of objects compared in L1, the nearest
+    of which tells the object, as in SGS-SLAM (CPU); votes: by counting, without training."""
     final_passes: int = setting(4, 0, 10**4)
     """Passes over all keyframes with masks after the last frame that train identities only."""
     neighbours: NeighbourSettings = field(default_factory=NeighbourSettings)
+
+    @property
+    def renders_images(self) -> bool:
+        """Whether whole images of identities are rendered and differentiated."""
+        return self.schedule in ("dense", "colors")

@@ -26,7 +26,7 @@ from ggslam.mapping.other_sizes import picture_of_turn
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.pruning import is_look_due, prune
 from ggslam.mapping.residency import Residency
-from ggslam.mapping.sampling import KeyframeSampler, last_visits
+from ggslam.mapping.sampling import last_visits, make_sampler
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
@@ -188,7 +188,7 @@ class Mapper(ABC):
         self._rasterizer: TrainingRasterizer
         self._mean = MeanMap()
         self._adam_of_pixel: tuple[float, bool, AdamSettings] | None = None
-        self._sampler = KeyframeSampler(float(np.random.default_rng(seed).random()))
+        self._sampler = make_sampler(settings.order, seed)
 
     @property
     @abstractmethod
@@ -234,9 +234,12 @@ class Mapper(ABC):
         keyframe = self._new_keyframe(frame, T_world_camera)
         self._insert(keyframe, T_world_camera, labeller, begin_others)
         self.keyframes.append(keyframe)
+        self._sampler.arrive(self.keyframes)
         self.use_typical_exposure()
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
-            prune(self.map, self.settings.pruning)
+            self._densify()
+            if self.settings.pruning.enabled:
+                prune(self.map, self.settings.pruning)
         if self._is_noisy and not self.is_live and is_look_due(len(self.keyframes)):
             self.drop_hidden()
         self.times.insertion += time.perf_counter() - start
@@ -335,6 +338,9 @@ class Mapper(ABC):
     ) -> None:  # fmt: skip
         """Inserts Gaussians for what the map lacks at a keyframe seen from `T_world_camera`, and takes its labels."""
 
+    def _densify(self) -> None:  # noqa: B027
+        """Clones and splits Gaussians if `MapperSettings.densification` says so; on the CPU."""
+
     def _take_labels(self, keyframe: Keyframe, labels: KeyframeLabels) -> None:
         """The keyframe's objects become its mask. What was rendered last is the map as the keyframe sees it, if
         there was one."""
@@ -352,7 +358,7 @@ class Mapper(ABC):
     # --- optimisation ------------------------------------------------------------------------------------------------
 
     def run(self, iterations: int) -> None:
-        """Optimisation, see `KeyframeSampler` for the order of keyframes."""
+        """Optimisation, see `mapping.sampling` for the order of keyframes."""
         numbers = self._trainable()
         for _ in range(iterations):
             if self.residency is not None:  # a part on disk comes late to the last steps, and for short
@@ -407,7 +413,7 @@ class Mapper(ABC):
     @property
     def _is_identity_dense(self) -> bool:
         """Whether identities are trained on whole rendered images of them."""
-        return self.identity is not None and self.identity.settings.schedule == "dense"
+        return self.identity is not None and self.identity.settings.renders_images
 
     def _is_identity_due(self, keyframe: Keyframe) -> bool:
         return self.identity is not None and self.identity.due(keyframe)
@@ -434,7 +440,7 @@ class Mapper(ABC):
         return [k for k in numbers if k not in self.left_out] if self.left_out else numbers
 
     def _draw(self, numbers: Sequence[int]) -> Keyframe:
-        return self.keyframes[numbers[self._sampler.draw(len(numbers))]]
+        return self.keyframes[self._sampler.choose(numbers)]
 
     def stages(self) -> Iterable[Sequence[int]]:
         """Numbers of all keyframes, some after the others: of those handed out the whole map is in memory."""
@@ -588,6 +594,7 @@ class Mapper(ABC):
         mean over the last ones, see `MapperSettings.average_last`, or learning rates fall exponentially. The first
         `begin` steps were made before; between steps `progress` is told how many of how many are."""
         share, done = self._averaged_share, 0
+        self._sampler.end()
         for numbers, steps in self._stages(iterations):
             self._beside = self._trained_beside(numbers)
             for i in range(steps):

@@ -3,12 +3,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
+from ggslam.mapping.covisibility import covisible
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.settings import SamplingOrder
 from ggslam.system.savable import savable
+from ggslam.system.tuning import Tuning
+
+
+class SamplingTuning(Tuning):
+    """Draws of covisible keyframes."""
+
+    elsewhere = 0.2
+    """Share of the draws that are of all keyframes, against forgetting: 2 of 10, as in MonoGS."""
+
 
 GOLDEN_RATIO: Final = 0.6180339887498949
 """Fractional part of the golden ratio: its multiples are spread evenly."""
@@ -21,7 +33,8 @@ class KeyframeSampler:
     Every keyframe is visited about equally often, soon after it enters and then at even intervals, and successive
     draws are far apart in the recording, so that each Gaussian is stepped evenly. Measured on a rendered room at 4
     iterations a frame, held-out PSNR against independent uniform draws: shuffled rounds +0.4 dB, this +1.0 dB;
-    training the newest keyframe first -0.2 dB, the least trained one -1.8 dB.
+    training the newest keyframe first -0.2 dB, the least trained one -1.8 dB. `scripts/papers/gg_slam.py` compares
+    the orders.
 
     Args:
         offset: of the sequence, in [0, 1).
@@ -41,6 +54,88 @@ class KeyframeSampler:
             raise IndexError("no keyframe to draw")
         self._draws += 1
         return int((self._offset + self._draws * GOLDEN_RATIO) % 1.0 * count)
+
+    def choose(self, numbers: Sequence[int]) -> int:
+        """One of the keyframes with these numbers, in the order of the recording."""
+        return numbers[self.draw(len(numbers))]
+
+    def arrive(self, keyframes: Sequence[Keyframe]) -> None:
+        """The last of the keyframes is new."""
+
+    def end(self) -> None:
+        """No more will arrive."""
+
+
+@savable()
+class RandomSampler(KeyframeSampler):
+    """Independent uniform draws.
+
+    Args:
+        seed: of the draws.
+    """
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self._rng = np.random.default_rng([seed, 19])
+
+    def draw(self, count: int) -> int:
+        if count < 1:
+            raise IndexError("no keyframe to draw")
+        return int(self._rng.integers(count))
+
+
+@savable()
+class NewestSampler(KeyframeSampler):
+    """From the newest keyframe back to the first, again and again; when one arrives, from that one on. Between two
+    arrivals as many of the newest are trained as there are steps: a window that slides along the recording."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._count = 0
+
+    def draw(self, count: int) -> int:
+        if count < 1:
+            raise IndexError("no keyframe to draw")
+        if count != self._count:
+            self._count, self._draws = count, 0
+        self._draws += 1
+        return count - 1 - (self._draws - 1) % count
+
+
+@savable()
+class CovisibleSampler(RandomSampler):
+    """Uniform draws of the newest keyframe and those that share most surface with it (`covisible`), and now and then
+    of all; of all after the last frame. As the windows of MonoGS (Matsuki et al., 2024) and GS-SLAM (Yan et al., 2024).
+    """
+
+    _window: list[int]
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self._window = []
+
+    def choose(self, numbers: Sequence[int]) -> int:
+        near = [number for number in self._window if number in numbers]
+        if near and self._rng.random() >= SamplingTuning.elsewhere:
+            return near[self.draw(len(near))]
+        return super().choose(numbers)
+
+    def arrive(self, keyframes: Sequence[Keyframe]) -> None:
+        self._window = [*covisible(keyframes[-1], keyframes[:-1]), keyframes[-1].index]
+
+    def end(self) -> None:
+        self._window = []
+
+
+def make_sampler(order: SamplingOrder, seed: int) -> KeyframeSampler:
+    """The sampler of an order: spread (`KeyframeSampler`), random, newest, covisible."""
+    if order == "newest":
+        return NewestSampler()
+    if order == "random":
+        return RandomSampler(seed)
+    if order == "covisible":
+        return CovisibleSampler(seed)
+    return KeyframeSampler(float(np.random.default_rng(seed).random()))
 
 
 def last_visits(objects: Mapping[int, np.ndarray], steps: int, at_once: int) -> Iterator[tuple[int, int]]:

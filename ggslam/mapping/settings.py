@@ -8,6 +8,9 @@ from typing import Literal
 
 from ggslam.system.settings import setting, settings_class, tuning_class
 
+SamplingOrder = Literal["spread", "random", "newest", "covisible"]
+"""Which keyframe is trained next, see `ggslam.mapping.sampling`."""
+
 
 @tuning_class(frozen=True)
 class InsertionTuning:
@@ -92,8 +95,10 @@ class LearningRates(RateTuning):
 class PruningTuning:
     """Numbers of pruning."""
 
+    enabled: bool = True
+    """Remove useless Gaussians."""
     every_keyframes: int = setting(5, 1, 10**6, "keyframes")
-    """Prune after every n-th keyframe."""
+    """Prune and densify after every n-th keyframe."""
 
 
 @settings_class(frozen=True)
@@ -233,6 +238,13 @@ class LossSettings(LossTuning):
 class MapperTuning:
     """Numbers of training."""
 
+    order: SamplingOrder = "spread"
+    """Keyframe that is trained next. spread: all evenly, successive ones far apart; random: uniform draws; newest: from
+    the newest one back; covisible: the newest one and those that share most surface with it, and now and then
+    others."""
+    densification: Literal["never", "added", "instead"] = "never"
+    """Clone and split Gaussians that images pull at, as 3DGS does (CPU). added: besides inserting them at unexplained
+    pixels; instead: these are inserted at every fourth pixel of every fourth row only."""
     sparse_noise: float = setting(0.2, 0, 1e6, "px")
     """If the depth noise is at least this wide in the image, a step after the last frame on the CPU becomes two sparse
     steps on two keyframes; 0: always."""

@@ -102,8 +102,13 @@ def yolo_candidates(detections: np.ndarray, prototypes: np.ndarray, threshold: f
     """Of a YOLO-seg model: a mask is the sum of prototypes weighted by the detection's coefficients, cut to its box.
 
     Args:
-        detections: [1, 4 + classes + m, n]: centre x, y, width, height, class scores, coefficients; or, from a model
-            that ends with non-maximum suppression, [1, n, 6 + m]: corners, score, class, coefficients.
+        detections: as one of
+
+            - [1, 4 + classes + m, n] (v8, v11): centre x, y, width, height, class scores, coefficients;
+            - [1, n, 5 + classes + m] (v5): centre x, y, width, height, objectness, class scores, which it multiplies,
+              coefficients;
+            - [1, n, 6 + m], from a model that ends with non-maximum suppression: corners, score, class, coefficients.
+              v5 with one class has the same shape; see `_are_corners`.
         prototypes: [1, m, h, w].
         threshold: lowest score.
         count: of candidates, at most.
@@ -113,22 +118,39 @@ def yolo_candidates(detections: np.ndarray, prototypes: np.ndarray, threshold: f
     """
     channels = prototypes.shape[1]
     rows, columns = detections.shape[1:]
-    if columns == 6 + channels:
+    is_raw_row = 4 + channels < columns <= rows
+    if columns == 6 + channels and _are_corners(detections[0]):
         table = detections[0].astype(np.float32)
         boxes, scores, weights = table[:, :4], table[:, 4], table[:, 6:]
+    elif is_raw_row and columns > 5 + channels:
+        table = detections[0].astype(np.float32)
+        boxes, weights = _corners(table), table[:, columns - channels :]
+        scores = table[:, 4] * table[:, 5 : columns - channels].max(1)
     elif 4 + channels < rows <= columns:
         table = detections[0].T.astype(np.float32)
-        centre, half = table[:, :2], table[:, 2:4] / 2
-        boxes = np.concatenate([centre - half, centre + half], axis=1)
+        boxes = _corners(table)
         scores, weights = table[:, 4 : rows - channels].max(1), table[:, rows - channels :]
     else:
         raise ConfigError(
-            f"expected detections [1, 4 + classes + {channels}, n] or [1, n, {6 + channels}] beside {channels} "
-            f"prototypes, found {list(detections.shape)}"
+            f"expected detections [1, 4 + classes + {channels}, n], [1, n, 5 + classes + {channels}] or "
+            f"[1, n, {6 + channels}] beside {channels} prototypes, found {list(detections.shape)}"
         )
     chosen = best(scores, threshold, count)
     grids = np.tensordot(weights[chosen], prototypes[0].astype(np.float32), axes=1)
     return MaskCandidates(scores[chosen], grids, boxes[chosen])
+
+
+def _corners(table: np.ndarray) -> np.ndarray:
+    """Corners [n, 4] of boxes of which the first columns are centre x, y, width and height."""
+    centre, half = table[:, :2], table[:, 2:4] / 2
+    return np.concatenate([centre - half, centre + half], axis=1)
+
+
+def _are_corners(table: np.ndarray) -> bool:
+    """Whether rows [n, 6 + m] are of non-maximum suppression: corners in order, and whole numbers of classes. Of a raw
+    table of v5 the sixth column is a score between 0 and 1, and hardly ever 0 or 1 in all of its thousands of rows."""
+    whole = table[:, 5] == np.round(table[:, 5])
+    return bool((whole & (table[:, 2:4] >= table[:, :2]).all(1)).all())
 
 
 def mask_candidates(

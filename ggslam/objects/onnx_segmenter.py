@@ -55,8 +55,8 @@ class OnnxSegmenter:
 
     - masks and their scores (names with "mask", and "score" or "iou"): exports of the SAM family with a grid of points
       inside; the image is put in the upper left corner of the input;
-    - detections and prototypes (an output of rank 3 and one of rank 4): exports of the YOLO-seg family, FastSAM among
-      them, with or without non-maximum suppression inside; the image is put in the middle of the input.
+    - detections and prototypes (an output of rank 3 and one of rank 4): exports of the YOLO-seg family (v5, v8,
+      v11, FastSAM), with or without non-maximum suppression inside; the image is put in the middle of the input.
     """
 
     def __init__(self, path: str | Path, settings: OnnxSegmenterSettings | None = None) -> None:

@@ -17,10 +17,10 @@ import pydantic
 
 from ggslam.errors import ConfigError, FormatError, InputError
 from ggslam.objects.boxes import middle_of, oriented_box
-from ggslam.objects.colors import id_palette
 from ggslam.objects.history import History
 from ggslam.objects.settings import ClassifierTuning
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.id_colors import id_palette
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.scene.object_names import object_label
 from ggslam.scene.oriented_box import OrientedBox, Vector

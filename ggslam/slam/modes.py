@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from operator import attrgetter
 
 from ggslam.errors import ConfigError
 from ggslam.slam.config import Config
@@ -85,6 +86,14 @@ CAPABILITIES = (
         {Mode.RIG: _OUT, Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}, "mapping.exposure.enabled",
         lambda c: not c.mapping.exposure.enabled,
     ),
+    Capability(
+        "objects as colours", {Mode.GPU: _NO}, "identity.schedule",
+        lambda c: c.identity.enabled and c.identity.schedule == "colors",
+    ),
+    Capability(
+        "cloning and splitting Gaussians", {Mode.GPU: _OUT}, "mapping.densification",
+        lambda c: c.mapping.densification != "never",
+    ),
     Capability("pruning hidden Gaussians where depth is noisy", {Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END}),
     Capability("checkpoints and `resume`", {Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}),
     Capability("repeating bit for bit", {Mode.GPU: _OUT, Mode.REALTIME: _OUT}),
@@ -111,7 +120,7 @@ def refuse(mode: Mode, config: Config) -> None:
     """Raises ConfigError if the settings ask for something that a mode refuses."""
     for one in CAPABILITIES:
         if one.lacks.get(mode) is Lack.REFUSED and one.setting and one.is_wanted(config):
-            value = getattr(config, one.setting)
+            value = attrgetter(one.setting)(config)
             raise ConfigError(f"{one.setting}: {value}: {mode.value} cannot be combined with {one.name}")
 
 

@@ -135,7 +135,7 @@ def make_mapper(
     channels, degree = IDENTITY_CHANNELS if learns else 0, max(0, config.sh_degree)
     if library is None:
         learner = CpuIdentityLearner(config.identity, config.seed) if learns else None
-        compact = compact and learns and config.identity.schedule != "dense"
+        compact = compact and learns and not config.identity.renders_images
         gaussians = GaussianMap(degree, channels, compact_features=compact)
         mapper = CpuMapper(gaussians, config.mapping, context, config.seed, learner)
         mapper.fits_view_colors = config.fits_view_colors

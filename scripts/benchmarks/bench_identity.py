@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What learning objects costs and brings, as printed in docs/objects.md.
 
-    python scripts/benchmarks/bench_identity.py  # no identity, the published schedule, ours, votes only
+    python scripts/benchmarks/bench_identity.py  # no identity, the published schedule, colours, ours, votes only
     python scripts/benchmarks/bench_identity.py --ablation          # and single choices of ours
 
 Runs on a recording with exact instance masks. Every line is one run in a process of its own; nothing else should run
@@ -13,22 +13,23 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
-from typing import Any
 
-from ggslam.runs.records.metrics import MetricsRecord
-from ggslam.runs.records.timing import TimingRecord
+from scored_runs import ScoredRun, scored_run
 
 NONE = ["identity.enabled=false"]
 PUBLISHED = [
     "identity.schedule=dense", "identity.every=1", "identity.detach=false", "identity.initialisation=random",
     "identity.rate=0.0025", "identity.weight=0.1",
 ]  # fmt: skip
+COLORS = [
+    "identity.schedule=colors", "identity.every=1", "identity.detach=false", "identity.rate=0.0025",
+    "identity.weight=0.1",
+]  # fmt: skip
+"""Objects as colours in L1, as in SGS-SLAM, trained in every step together with everything else."""
 RUNS: dict[str, list[str]] = {
     "published schedule": PUBLISHED,
+    "objects as colours": COLORS,
     "ours": [],
     "votes only": ["identity.schedule=votes"],
 }
@@ -48,29 +49,16 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def run(settings: list[str], arguments: argparse.Namespace) -> dict[str, Any]:
+def run(settings: list[str], arguments: argparse.Namespace) -> ScoredRun:
     """One run with scores in a fresh process."""
-    with tempfile.TemporaryDirectory() as temporary:
-        command = [
-            sys.executable, "-m", "ggslam", "run", str(arguments.recording), "--scale", str(arguments.scale),
-            "--out", f"{temporary}/run", "--iterations", str(arguments.iterations),
-            *[part for setting in settings for part in ("--set", setting)],
-        ]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise SystemExit(f"{' '.join(command)}\n{done.stdout}\n{done.stderr}")
-        folder = Path(temporary) / "run"
-        return {"metrics": MetricsRecord.read(folder), "timing": TimingRecord.read(folder)}
+    return scored_run(
+        arguments.recording, settings, ["--iterations", str(arguments.iterations)], arguments.scale
+    )
 
 
-def wall(outcome: dict[str, Any]) -> float:
-    """Seconds from the first frame to the last identity step."""
-    return outcome["timing"].wall_s + outcome["timing"].mapping.identity_finish
-
-
-def cells(outcome: dict[str, Any], reference: float) -> list[float | None]:
+def cells(outcome: ScoredRun, reference: float) -> list[float | None]:
     """The numbers of one line."""
-    metrics: MetricsRecord = outcome["metrics"]
+    metrics = outcome.metrics
 
     def percent(*keys: str) -> float | None:
         value = metrics.number("segmentation", *keys)
@@ -79,7 +67,7 @@ def cells(outcome: dict[str, Any], reference: float) -> list[float | None]:
     return [
         metrics.number("images", "held_out", "psnr"), percent("held_out", "miou"), percent("held_out", "boundary_miou"),
         percent("held_out", "votes_miou"), percent("gaussians", "accuracy"),
-        outcome["timing"].mapping_ms_per_iteration, wall(outcome), wall(outcome) / reference,
+        outcome.timing.mapping_ms_per_iteration, outcome.wall_s, outcome.wall_s / reference,
     ]  # fmt: skip
 
 
@@ -109,8 +97,8 @@ def main() -> None:
         if arguments.only and name not in arguments.only:
             continue
         reference = run(NONE, arguments)
-        show("no identity", cells(reference, wall(reference)))
-        show(name, cells(run(settings, arguments), wall(reference)))
+        show("no identity", cells(reference, reference.wall_s))
+        show(name, cells(run(settings, arguments), reference.wall_s))
 
 
 if __name__ == "__main__":

@@ -13,15 +13,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
-from typing import Any
 
-from ggslam.runs.records.keyframes import KeyframesRecord
-from ggslam.runs.records.metrics import MetricsRecord
-from ggslam.runs.records.timing import TimingRecord
+from scored_runs import ScoredRun, scored_run
 
 RECORDINGS = ("livingroom", "redkitchen", "rgbd_dataset_freiburg3_cabinet", "shelf")
 BIG_STEPS = {"rgbd_dataset_freiburg3_cabinet", "shelf"}
@@ -32,26 +26,16 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def run(recording: Path, k: int, arguments: argparse.Namespace, refine: int, realtime: float) -> dict[str, Any]:
-    """One run with scores in a fresh process; its metrics and timing."""
-    with tempfile.TemporaryDirectory() as temporary:
-        out = Path(arguments.out) / f"{recording.name}-k{k}-r{refine}" if arguments.out else Path(temporary) / "run"
-        command = [
-            sys.executable, "-m", "ggslam", "run", str(recording), "--scale", str(arguments.scale), "--out",
-            str(out), "--iterations", str(k), "--refine", str(refine), "--overwrite",
-            *(["--realtime", str(realtime)] if realtime else []),
-            *[part for setting in arguments.set for part in ("--set", setting)],
-        ]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise SystemExit(f"{' '.join(command)}\n{done.stdout}\n{done.stderr}")
-        lost = [frame for frame in KeyframesRecord.read(out).frames if frame.is_lost]
-        return {"metrics": MetricsRecord.read(out), "timing": TimingRecord.read(out), "lost": lost}
+def run(recording: Path, k: int, arguments: argparse.Namespace, refine: int, realtime: float) -> ScoredRun:
+    """One run with scores in a fresh process."""
+    out = Path(arguments.out) / f"{recording.name}-k{k}-r{refine}" if arguments.out else None
+    words = ["--iterations", str(k), "--refine", str(refine), *(["--realtime", str(realtime)] if realtime else [])]
+    return scored_run(recording, arguments.set, words, arguments.scale, out)
 
 
-def cells(outcome: dict[str, Any]) -> list[float | None]:
+def cells(outcome: ScoredRun) -> list[float | None]:
     """The numbers of one line of the table."""
-    metrics, mapping = outcome["metrics"], outcome["timing"].mapping
+    metrics, mapping = outcome.metrics, outcome.timing.mapping
     speed, images = metrics.speed, metrics.images
     insertion = 1e3 * mapping.insertion / max(1, mapping.keyframes)
     depth, ate = images.number("all", "depth_l1_m"), metrics.number("trajectory", "ate_rmse_m")
@@ -60,7 +44,7 @@ def cells(outcome: dict[str, Any]) -> list[float | None]:
         images.number("held_out", "psnr"), images.number("keyframes", "psnr"), images.number("all", "psnr"),
         images.number("all", "psnr_unmasked"), images.number("held_out", "ssim"), images.number("held_out", "lpips"),
         None if depth is None else 100 * depth, None if ate is None else 100 * ate,
-        metrics.map.gaussians / 1000, metrics.memory.peak_rss_mb, len(outcome["lost"]), speed.dropped_frames,
+        metrics.map.gaussians / 1000, metrics.memory.peak_rss_mb, len(outcome.lost), speed.dropped_frames,
     ]  # fmt: skip
 
 
@@ -95,11 +79,11 @@ def main() -> None:
     for name in arguments.only:
         for k in arguments.iterations:
             outcome = run(arguments.data / name, k, arguments, arguments.refine, arguments.realtime)
-            outcomes.append({"recording": name, "k": k, **outcome})
+            outcomes.append({"recording": name, "k": k, **vars(outcome)})
             label = str(k) + (f" + {arguments.refine}" if arguments.refine >= 0 else "")
             label += f" realtime {arguments.realtime:g}" if arguments.realtime else ""
             print(line(name, label, cells(outcome)), flush=True)
-            for frame in outcome["lost"]:
+            for frame in outcome.lost:
                 print(f"  lost at frame {frame.frame}: {frame.reason}")
     if arguments.json:
         arguments.json.write_text(json.dumps(outcomes, indent=1, default=lambda record: record.values()))

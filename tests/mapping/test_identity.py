@@ -73,7 +73,7 @@ def shown(mapper: Mapper, camera: Camera = CAMERA) -> np.ndarray:
 @pytest.mark.parametrize(
     "changes",
     [{}, {"initialisation": "random", "final_passes": 100}, {"schedule": "dense", "weight": 1.0},
-     {"schedule": "dense", "detach": False}],
+     {"schedule": "dense", "detach": False}, {"schedule": "colors", "weight": 1.0}],
 )  # fmt: skip
 def test_objects_are_learned(changes: dict[str, object]) -> None:
     mapper = trained(pictures(), **changes)

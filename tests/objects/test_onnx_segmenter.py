@@ -231,9 +231,9 @@ def test_models_that_are_not_understood(tmp_path: Path) -> None:
 
 
 def test_detections_of_another_layout(tmp_path: Path) -> None:
-    """[1, n, 5 + classes + 32] of an older family is refused, not misread."""
-    segmenter = OnnxSegmenter(yolo(tmp_path / "old.onnx", np.zeros((1, 200, 117))))
-    with pytest.raises(ConfigError, match=r"old\.onnx.*\[1, 200, 117\]"):
+    """Fewer columns than boxes and coefficients have are refused, not misread."""
+    segmenter = OnnxSegmenter(yolo(tmp_path / "other.onnx", np.zeros((1, 200, 36))))
+    with pytest.raises(ConfigError, match=r"other\.onnx.*\[1, 200, 36\]"):
         segmenter.segment(picture())
 
 

@@ -13,10 +13,10 @@ import torch
 
 from ggslam.errors import ConfigError, FormatError
 from ggslam.objects.boxes import middle_of, oriented_box
-from ggslam.objects.colors import PaletteTuning, id_palette
 from ggslam.objects.settings import ClassifierTuning
 from ggslam.objects.table import ObjectRecord, ObjectTable, Observation
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.id_colors import PaletteTuning, id_palette
 from ggslam.scene.identity import IdentityClassifier, IdentityVectorTuning
 from ggslam.scene.oriented_box import OrientedBox
 from ggslam.system.tuning import overridden

@@ -19,6 +19,7 @@ REFUSED = {
     (Mode.RIG, "realtime_fps"): "realtime_fps=10", (Mode.RIG, "memory_limit_mb"): "memory_limit_mb=4000",
     (Mode.RIG, "device"): "device=cuda", (Mode.RIG, "tracker"): "tracker=edges_planes",
     (Mode.GPU, "memory_limit_mb"): "memory_limit_mb=4000", (Mode.PAGED, "device"): "device=cuda",
+    (Mode.GPU, "identity.schedule"): "identity.schedule=colors",
 }  # fmt: skip
 """What each mode refuses, by the setting that asks for it."""
 

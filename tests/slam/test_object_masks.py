@@ -211,3 +211,36 @@ def test_masks_of_other_frames_are_refused_and_leave_no_folder(room: Path, tmp_p
     assert not (tmp_path / "run").exists()
     with pytest.raises(ConfigError, match=r"masks\.model"):
         execute(RunRequest(SequenceRequest(room), tmp_path / "run", overrides=["masks.source=model"]))
+
+
+def deva_masks(recording: Path, out: Path, gone: range) -> dict[int, int]:
+    """A recording's masks as DEVA writes them: ids above 65535 as colours, and pred.json, which lists the segments of
+    each frame. The object that most frames show vanishes in some and comes back with its id. Returns code by id."""
+    (out / "Annotations").mkdir(parents=True)
+    masks = {path: cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted((recording / "masks").iterdir())}
+    ids = np.unique(np.concatenate([np.unique(mask) for mask in masks.values()]))
+    codes = {int(i): 70_001 * int(i) for i in ids if i}
+    lost = max(codes, key=lambda i: sum((mask == i).any() for mask in masks.values()))
+    frames = []
+    for number, (path, mask) in enumerate(masks.items()):
+        seen = np.where(mask == lost, 0, mask) if number in gone else mask
+        coded = 70_001 * seen.astype(np.int64)
+        cv2.imwrite(str(out / "Annotations" / path.name), np.stack([coded >> 16, coded >> 8 & 255, coded & 255], -1))
+        segments = [{"id": codes[int(i)], "isthing": True, "score": 0.9} for i in np.unique(seen) if i]
+        frames.append({"file_name": path.name, "segments_info": segments})
+    (out / "pred.json").write_text(json.dumps({"annotations": frames}))
+    return codes
+
+
+def test_deva_masks_of_a_moving_camera(room: Path, own_scores: MetricsRecord, tmp_path: Path) -> None:
+    """Objects come into view, vanish and come back: each stays one, and the map is as right as with all masks."""
+    codes = deva_masks(room, tmp_path / "deva", range(6, 14))
+    outcome = run(room, tmp_path / "run", masks=tmp_path / "deva")
+    assert table(outcome.folder.path)["supervision"] == "masks"  # ids are taken as they are
+    listed = {entry["id"] for entry in table(outcome.folder.path)["objects"]}
+    assert listed <= set(range(1, len(codes) + 1))  # one id for each code, in their order
+    truth = open_recording_of(outcome.folder, masks=room / "masks")
+    found = score_run(outcome.folder, truth, SilentObserver(), lpips=False, every=4)
+    miou = found.number("segmentation", "all", "miou")
+    usual = own_scores.number("segmentation", "all", "miou")
+    assert miou is not None and usual is not None and miou > usual - 0.02

@@ -37,7 +37,14 @@ KINDS: dict[str, list[str]] = {
     "no objects": ["identity.enabled=false", "loops.enabled=false"],
     "edges and planes, segmented": ["tracker=edges_planes", "edges_planes.align.budget_ms=0", "masks.source=geometry"],
     "dense identities, degree 1": ["identity.schedule=dense", "sh_degree=1", "mapping.exposure.enabled=true"],
-}
+    "objects as colours": ["identity.schedule=colors", "identity.every=2"],
+    "random keyframes": ["identity.enabled=false", "mapping.order=random"],
+    "newest keyframes first": ["identity.enabled=false", "mapping.order=newest"],
+    "covisible keyframes, cloned Gaussians": [
+        "identity.enabled=false", "mapping.order=covisible", "mapping.densification=added",
+        "mapping.pruning.every_keyframes=2",
+    ],
+}  # fmt: skip
 
 
 def copied(slam: Slam) -> tuple[Any, list[np.ndarray]]:

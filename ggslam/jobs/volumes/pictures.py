@@ -8,10 +8,10 @@ import math
 import cv2
 import numpy as np
 
-from ggslam.objects.colors import id_palette
 from ggslam.reporting.cloud_pictures import CloudView, draw_cloud, view_along
 from ggslam.reporting.mesh_pictures import MeshDrawing
 from ggslam.reporting.pictures import side_by_side
+from ggslam.scene.id_colors import id_palette
 from ggslam.scene.origin import moved_pose
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.mesh_parts import MeshParts

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.mapping.cpu.class_table import CpuClassTable
+from ggslam.mapping.cpu.color_table import ColorTable, color_loss
 from ggslam.mapping.cpu.cross_entropy import cross_entropy
 from ggslam.mapping.cpu.neighbours import NeighbourIndex, kl_gradient
 from ggslam.mapping.cpu.pixel_pool import draw_pool
@@ -46,11 +47,12 @@ class CpuIdentityLearner(IdentityLearner):
 
     kept_pools = CpuIdentityTuning.kept_pools
     last_loss: float = float("nan")
-    """Cross-entropy of the last step."""
+    """Cross-entropy of the last step, or mean difference of its colours."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.table: CpuClassTable = CpuClassTable(self._rng)
+        kind = ColorTable if self.settings.schedule == "colors" else CpuClassTable
+        self.table: CpuClassTable = kind(self._rng)
         self._index = NeighbourIndex(self.settings.neighbours.growth)
 
     # --- objects ------------------------------------------------------------------------------------------------------
@@ -140,14 +142,18 @@ class CpuIdentityLearner(IdentityLearner):
         s = self.settings
         assert keyframe.mask is not None and view.features is not None
         pixels = np.flatnonzero(keyframe.mask)
-        classes = self.table.classes(self.current(keyframe.mask.reshape(-1)[pixels]))
-        pixels, classes = pixels[classes >= 0], classes[classes >= 0]
+        labels = self.current(keyframe.mask.reshape(-1)[pixels])
+        classes = self.table.classes(labels)
+        pixels, labels, classes = (array[classes >= 0] for array in (pixels, labels, classes))
         features = view.features.numpy().reshape(IDENTITY_CHANNELS, -1)
+        out, shown = np.zeros_like(features), features[:, pixels].T
+        if s.schedule == "colors":
+            self.last_loss, gradient = color_loss(shown, self.table.codes(labels))
+            out[:, pixels] = s.weight * gradient.T
+            return torch.from_numpy(out.reshape(view.features.shape))
         chosen = np.arange(self.table.count)
-        shown = features[:, pixels].T
         self.last_loss, gradient, rows = cross_entropy(shown, self.classifier, classes, chosen, rasterizer.context)
         self.table.step(chosen, s.weight * rows, s.classifier_rate)
-        out = np.zeros_like(features)
         out[:, pixels] = s.weight * gradient.T
         if self._pulls(gaussians):
             rows_pulled, pull = self._pull_together(gaussians)

@@ -18,6 +18,7 @@ from ggslam.mapping.cpu.insertion import fill_gaussians, find_unexplained, new_g
 from ggslam.mapping.cpu.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.cpu.losses import CpuImageLoss, CpuLossResult
 from ggslam.mapping.cpu.view_colors import ShownColors, ViewColorTuning, fit_view_colors
+from ggslam.mapping.densification import DensificationTuning, ScreenGradients, densify, sparse_pixels
 from ggslam.mapping.identity import IdentityTuning
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe, PoseAdam, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
@@ -149,6 +150,8 @@ class CpuMapper(Mapper):
             where = find_unexplained(depth, alpha, rendered, s)
             show = partial(self._show_labels, alpha, rendered)
             seen = SeenAgain(view.image.numpy(), alpha, rendered, depth)
+        if self.settings.densification == "instead":
+            where = sparse_pixels(where, depth.shape)
         begin_others()
         color = self._colors(keyframe, seen)
         valid = self.valid_of(keyframe)
@@ -244,7 +247,7 @@ class CpuMapper(Mapper):
         return MapLabels.from_grid(ids, share, depth, stride)
 
     def drop_hidden(self) -> None:
-        least = self.settings.pruning.min_weight
+        least = self.settings.pruning.min_weight if self.settings.pruning.enabled else 0.0
         if not least or not self.keyframes or len(self._trainable()) < len(self._all_numbers):
             return
         keyframes = [self.keyframes[k] for k in self._all_numbers]
@@ -261,6 +264,20 @@ class CpuMapper(Mapper):
             self._render(keyframe, features=False, grid=grid)
             self._rasterizer.mark_shown(stays, least)
         self.map.keep(torch.from_numpy(stays))
+
+    def _densify(self) -> None:
+        if self.settings.densification == "never":
+            return
+        gradients = ScreenGradients.none(len(self.map))
+        for number in self._trainable()[-DensificationTuning.views :]:
+            keyframe = self.keyframes[number]
+            if keyframe.frame_index == FROM_EARLIER_RUN:
+                continue
+            loss = self._evaluate_loss(keyframe, self._render(keyframe, features=False))
+            found = self._rasterizer.backward(loss.d_image, loss.d_depth, loss.d_alpha)
+            shown = found.touched.numpy().astype(bool)
+            gradients.add(keyframe, self.map.means.numpy(), found.means.numpy(), shown)
+        densify(self.map, gradients, len(self.keyframes))
 
     def _render(
         self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
@@ -282,6 +299,9 @@ class CpuMapper(Mapper):
     def _insertion(self) -> InsertionSettings:
         """How Gaussians are inserted: beside soft outlines one for each pixel, as at sharp ones."""
         s = self.settings.insertion
+        if self.settings.densification == "instead":
+            width = s.scale_pixels * DensificationTuning.sparse_stride
+            s = replace(s, scale_pixels=min(width, 100.0), adaptive_stride=False)
         return replace(s, fill_stride=min(s.fill_stride, 1)) if self.has_soft_outlines else s
 
     def _loss_settings(self, keyframe: Keyframe) -> LossSettings:

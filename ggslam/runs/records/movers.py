@@ -11,8 +11,8 @@ import pydantic
 
 from ggslam.movers.mover_table import FoundMover, MoverSight
 from ggslam.movers.point_files import POINTS_FILE
-from ggslam.objects.colors import id_palette
 from ggslam.runs.records.record import Array, Number, Record, RecordFile
+from ggslam.scene.id_colors import id_palette
 from ggslam.scene.poses import inverse, separation
 from ggslam.sequences.mask_ids import LARGEST_ID
 from ggslam.sequences.moving_pixels import MOVERS_FILE
