@@ -25,6 +25,8 @@ EPILOG = """
 
   ggslam localize campus.pcd scans/tuesday --near "120 -40 15"
 
+  ggslam localize campus.grid scans/tuesday --radius auto
+
   ggslam localize campus.pcd scans/tuesday --start-pose given --full-map --out localized/full
 
   ggslam localize campus.pcd scans/tuesday --start-pose given --set scans.search.reach=4 --set scans.scan.farthest=100
@@ -65,10 +67,10 @@ Near = Annotated[
 FullMap = Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")]
 Radius = Annotated[
-    float | None,
-    typer.Option(help="R': align to cells whose centres are so near, metres; default: the map's, of a cloud what suits "
-                 "the scanner.", min=0, max=1e7),
-]
+    str | None,
+    typer.Option(metavar="METRES|auto", help="R': align to cells whose centres are so near; auto: as far as each scan "
+                 "or frame sees, less where the map is dense. Default: the map's, of a cloud what suits the scanner."),
+]  # fmt: skip
 Voxel = Annotated[
     float | None,
     typer.Option(help="Edge of the voxels to align to, metres; default 0.03, of scans 0.15.", min=1e-3, max=10),

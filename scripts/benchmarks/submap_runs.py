@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
@@ -29,6 +29,7 @@ from ggslam.jobs.localize.report import LocalizationReport
 from ggslam.jobs.submaps.stores import INDOORS
 from ggslam.localization.frames import FrameTracker
 from ggslam.localization.localizer import Localization, Localizer
+from ggslam.localization.reach import AUTO, AdaptiveReach, parse_radius, scan_ranges
 from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
 from ggslam.localization.scans import ScanSequence, scan_files
 from ggslam.localization.surface import NORMAL, SCAN_TARGET, FullSurface, PartialSurface, packed_normals
@@ -54,6 +55,9 @@ def main() -> None:
     world.add_argument("--spacing", type=float, default=0.1, help="of the map's points")
     world.add_argument("--scans", type=int, default=150)
     world.add_argument("--seed", type=int, default=0)
+    world.add_argument("--kind", choices=("rooms", "halls", "equal"), default="rooms", help="see tests/worlds/special")
+    world.add_argument("--changed", type=float, default=0.0, help="share of things moved between map and scans")
+    world.add_argument("--every", type=int, default=1, help="of the walk's poses, 12 cm apart, one in so many is used")
     room = cases.add_parser("room", help="the first frames of a recording with their true poses: FOLDER/map.grid")
     room.add_argument("folder", type=Path)
     room.add_argument("--recording", type=Path, required=True)
@@ -65,14 +69,14 @@ def main() -> None:
     locate.add_argument("--full", action="store_true")
     locate.add_argument("--tree", action="store_true", help="the reference of scripts/benchmarks/kdtree_gicp.py")
     locate.add_argument("--voxel", type=float, default=0.15)
-    locate.add_argument("--radius", type=float, default=10.0)
+    locate.add_argument("--radius", type=parse_radius, default=10.0)
     locate.add_argument("--first", type=int, default=0)
     locate.add_argument("--stop", type=int)
     locate.add_argument("--scale", type=float, default=0.5)
     a = parser.parse_args()
     began = time.perf_counter()
     if a.case == "world":
-        found = make_world(a.folder, a.size, a.spacing, a.scans, a.seed)
+        found = make_world(a.folder, a.kind, a.size, a.spacing, a.scans, a.seed, a.changed, a.every)
     elif a.case == "room":
         found = make_room(a.folder, a.recording, a.stop, a.scale)
     else:
@@ -80,21 +84,26 @@ def main() -> None:
     print(json.dumps(json_ready({**found, "seconds": time.perf_counter() - began, "peak_mb": peak_memory_mb()})))
 
 
-def make_world(folder: Path, size: float, spacing: float, scans: int, seed: int) -> dict[str, Any]:
-    """Writes the map of a generated world, and scans along a walk in it with the true poses."""
+def make_world(
+    folder: Path, kind: str, size: float, spacing: float, scans: int, seed: int, share: float, every: int
+) -> dict[str, Any]:
+    """Writes the map of a generated world, and scans along a walk in it with the true poses, with a share of its things
+    moved since."""
     from worlds.cloud import cloud_tiles
     from worlds.plan import make_world as planned
     from worlds.scanner import Scanner
+    from worlds.special import changed, equal_rooms, hall_world
     from worlds.walk import SPEED, walk
 
     from ggslam.formats.trajectory import write_tum
 
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "scans").mkdir(parents=True)
-    world = planned(size, seed)
-    poses = walk(world, scans * SPEED / 10 + 1, seed)[:scans]
+    world = {"rooms": planned, "halls": hall_world, "equal": equal_rooms}[kind](size, seed)
+    poses = walk(world, scans * every * SPEED / 10 + 1, seed)[: scans * every : every]
+    today = changed(world, share, seed) if share else world
     for number, T in enumerate(poses):
-        np.save(folder / "scans" / f"{number:06d}.npy", Scanner().scan(world, T, number).points)
+        np.save(folder / "scans" / f"{number:06d}.npy", Scanner().scan(today, T, number).points)
     write_tum(folder / "trajectory.txt", np.arange(len(poses)) / 10, poses)
     tiles = [(points, packed_normals(normals)) for points, normals in cloud_tiles(world, spacing)]
     points, normals = (np.concatenate(arrays) for arrays in zip(*tiles, strict=True))
@@ -118,15 +127,15 @@ def make_room(folder: Path, recording: Path, stop: int, scale: float) -> dict[st
 
 
 def located(
-    path: Path, sequence: Path, full: bool, tree: bool, voxel: float, radius: float, first: int, stop: int | None,
-    scale: float,
+    path: Path, sequence: Path, full: bool, tree: bool, voxel: float, radius: float | Literal["auto"], first: int,
+    stop: int | None, scale: float,
 ) -> dict[str, Any]:  # fmt: skip
     """Locates a recording from its first given pose; times by frame."""
     before = peak_memory_mb()
     context = NativeContext()
     with GridStore.open(path) as store:
         target = replace(SCAN_TARGET if scan_files(sequence) else TargetSettings(), voxel=voxel)
-        submaps = replace(store.settings, partial_radius=radius)
+        submaps = store.settings if radius == AUTO else replace(store.settings, partial_radius=radius)
         surface: Any
         if tree:
             surface = TreeSurface(store, submaps, full)
@@ -137,7 +146,9 @@ def located(
             truth, times = scans.ground_truth, scans.timestamps
             assert truth is not None
             tracker: Any = TreeTracker(truth[0]) if tree else ScanTracker(ScanTrackerSettings(), context, truth[0])
-            results, processor = timed(Localizer(surface, tracker, truth[0]), [scan.points for scan in scans.stream()])
+            reach = AdaptiveReach(surface, scan_ranges) if radius == AUTO else None
+            by_scan = Localizer(surface, tracker, truth[0], reach)
+            results, processor = timed(by_scan, [scan.points for scan in scans.stream()])
         else:
             frames = open_sequence(sequence, start=first, stop=stop, scale=scale)
             truth, times = frames.ground_truth, frames.timestamps
