@@ -27,6 +27,8 @@ EPILOG = """
 
   ggslam localize campus.grid scans/tuesday --radius auto
 
+  ggslam localize campus.grid scans/tuesday --body=-0.4,-0.3,-0.5,0.2,0.3,-0.1
+
   ggslam localize campus.pcd scans/tuesday --start-pose given --full-map --out localized/full
 
   ggslam localize campus.pcd scans/tuesday --start-pose given --set scans.search.reach=4 --set scans.scan.farthest=100
@@ -101,10 +103,11 @@ def localize(
     depth_delay: options.DepthDelay = None,
     upright: options.Upright = False,
     columns: options.Columns = None,
+    body: options.Body = None, body_frame: options.BodyFrame = None,
     skip_bad_frames: options.SkipBadFrames = False,
     threads: options.Threads = None,
     settings: options.Settings = None,
-) -> None:
+) -> None:  # fmt: skip
     """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
     from ggslam.jobs.localize.locate import LocalizeRequest
     from ggslam.jobs.localize.locate import localize as locate_all
@@ -119,7 +122,7 @@ def localize(
             depth_delay=depth_delay, upright=upright,
         ),
         start_pose=start_pose, no_start_pose=no_start_pose, near=near, full=full_map, out=out, radius=radius,
-        voxel=voxel, columns=columns, threads=threads, overrides=settings or [],
+        voxel=voxel, columns=columns, body=body or (), body_frame=body_frame, threads=threads, overrides=settings or [],
     )  # fmt: skip
     with progress_bar() as bar:
         report = locate_all(request, ProgressObserver(bar))

@@ -92,13 +92,13 @@ class AdaptiveReach:
             return
         tuning = AdaptiveReachTuning
         step = max(edge, min(tuning.scans_apart * moved, tuning.max_step * seen))
-        wanted = max(tuning.min_cells * edge, min(seen + step - edge, self._uncluttered()))
+        wanted = max(tuning.min_cells * edge, min(seen + step - edge, self._clutter_limit()))
         if not tuning.shrink < wanted / self.radius < tuning.grow:
             self.radius = wanted
         self.step = step
         self._surface.set_reach(self.radius, self.step)
 
-    def _uncluttered(self) -> float:
+    def _clutter_limit(self) -> float:
         """Metres within which the map has about so many points, as dense as it is in memory; before anything is in
         memory, the R' of the settings."""
         points = self._surface.points

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.driving.body import Body, CameraBody
+from ggslam.driving.body_options import read_body
 from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.localize.report import LocalizationReport, write_localization
 from ggslam.jobs.localize.settings import LocalizeSettings, localize_settings
@@ -85,6 +87,8 @@ class LocalizeRequest:
         radius: R' in metres; None: the store's; "auto": by what the sensor sees, see `AdaptiveReach`.
         voxel: edge of the target's voxels in metres; None: 0.03 for images, 0.15 for scans, or what the map allows.
         columns: numbers of a point in .bin scans; None: as they tell themselves.
+        body: of the robot, left out of scans or depth, see `driving.body_options.read_body`; `body_frame`: the sensor's
+            link in a URDF file.
         threads: None: all processors.
         overrides: settings as "name.of.setting=value", see `LocalizeSettings`.
     """
@@ -99,6 +103,8 @@ class LocalizeRequest:
     radius: float | str | None = None
     voxel: float | None = None
     columns: int | None = None
+    body: Several[str] = ()
+    body_frame: str | None = None
     threads: int | None = None
     overrides: Several[str] = ()
 
@@ -112,7 +118,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     """
     if request.start_pose is not None and request.no_start_pose:
         raise ConfigError("`start_pose` and `no_start_pose`: one of them")
-    chosen = localize_settings(request.overrides)
+    chosen, body = localize_settings(request.overrides), read_body(request.body, request.body_frame)
     if note := tuning_note(chosen.settings):
         observer.note(note)
     out = request.out or Path("localized") / request.sequence.path.resolve().name
@@ -138,7 +144,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         else:
             places = _places(request, recording, store, start, near, observer)
         localizer = _localizer(chosen.settings, recording, places, surface, context, start, reach)
-        results, error = _run(localizer, recording, observer)
+        results, error = _run(localizer, recording, body, observer)
         if error is not None and not results:
             raise error
         damaged = sorted({*surface.damage, *(places.damage if places is not None else [])})
@@ -298,7 +304,7 @@ def _scan_look_up(
     def make() -> ScanPlaces | MapPicture:
         return scan_places(store) if held is None else held
 
-    return ScanLookUp(make, store.settings.axes, settings.look_up, settings.scans.min_overlap)
+    return ScanLookUp(make, store.settings.axes, settings.look_up, settings.scans.min_overlap, near)
 
 
 def _start_note(start: np.ndarray | None, results: Several[Localization]) -> str:
@@ -328,16 +334,17 @@ def _localizer(
 
 
 def _run(
-    localizer: Localizer[Any], recording: Sequence | ScanSequence, observer: Observer
+    localizer: Localizer[Any], recording: Sequence | ScanSequence, body: Body | None, observer: Observer
 ) -> tuple[list[Localization], BaseException | None]:
     """What was located, and what stopped it before the end."""
     results: list[Localization] = []
     observer.begin("localize", len(recording))
     items: Iterable[Any]
     if isinstance(recording, ScanSequence):
-        items = (scan.points for scan in recording.stream())
+        items = (scan.points if body is None else body.without(scan.points) for scan in recording.stream())
     else:
         items = recording.stream(masks=False)
+        items = items if body is None else map(CameraBody(body).without, items)
     try:
         for item in items:
             results.append(localizer.locate(item))
