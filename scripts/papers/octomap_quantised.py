@@ -5,7 +5,8 @@
 
 One ray a voxel instead of one a point, against `insertPointCloud` of OctoMap itself (pyoctomap), on frames of a
 recording with true poses; agreement with the update by every point after more frames; figure 5 as a picture of one
-height at 1, 2 and 4 cm; and paths a second planned on such a map.
+height at 1, 2 and 4 cm, unquantised above quantised; and paths a second planned on the recordings' maps and on a
+generated one.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from rows import Paper, options
 from agreement import agreement  # isort: skip
 from bench_occupancy import Scan, load_scans, milliseconds  # isort: skip
 from bench_planner import HEIGHTS, OCTOMAPS, clearance_of, fill_place, open_octomap, plan_pairs  # isort: skip
+from ggslam.driving.plan_settings import PlanSettings
+from ggslam.driving.robot import Robot
+from ggslam.jobs.plan.map_files import MapRequest, open_plan_map
 from ggslam.native.loader import NativeContext
 from ggslam.reporting.pictures import side_by_side, write_picture
 from ggslam.system.atomic import make_folder
@@ -36,6 +40,8 @@ Pairs = dict[float, tuple[OccupancyMap, OccupancyMap]]
 """Maps by the edge of their voxels: a ray for every point, and quantised."""
 BAR_M = 0.5
 """Length of the bar of scale."""
+PLAN_VOXEL, PLAN_CLEARANCE = 0.05, 0.1
+"""Of ways on the map of a recording, metres."""
 RECORDINGS = ("redkitchen", "livingroom")
 COLOURS = {UNKNOWN: (200, 200, 200), FREE: (255, 255, 255), OCCUPIED: (30, 30, 60)}
 SHOWN = (0.04, 0.02, 0.01)
@@ -139,6 +145,30 @@ def add_paths(paper: Paper, quick: bool) -> None:
             )  # fmt: skip
 
 
+def add_recorded_paths(paper: Paper, name: str, scans: list[Scan], context: NativeContext) -> None:
+    """Ways in space a second on the map that the quantised updates of a recording, y down, made; at the height of the
+    camera, between places within what the map holds around it."""
+    quantised = OccupancyMap(PLAN_VOXEL, context=context)
+    turn = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+    for scan in scans:
+        quantised.insert(scan.points @ turn.T, turn @ scan.origin)
+    low, high = np.percentile(np.concatenate([scan.points[::50] for scan in scans]) @ turn.T, [10, 90], axis=0).tolist()
+    size = high[0] - low[0], high[1] - low[1], high[2] - low[2]
+    height = float(np.median([turn @ scan.origin for scan in scans], 0)[2])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.bt"
+        write_octomap(quantised, path)
+        request = MapRequest(path, Robot(0.2, PLAN_CLEARANCE), True, PLAN_CLEARANCE, PlanSettings(), np.zeros(3))
+        plan_map = open_plan_map(request)
+        found = plan_pairs(plan_map, PLAN_CLEARANCE, size, height, 200, (low[0], low[1]))
+    paper.add(
+        "planning", f"space, {name}, {len(scans)} frames, {100 * PLAN_VOXEL:g} cm", "",
+        f"{found.paths_per_s:.0f} paths/s" if found.ms else "",
+        f"{len(found.ms)} of {len(found.cold_ms)} pairs joined; made by quantised updates of the recording, read from "
+        f".bt; clearance {PLAN_CLEARANCE:g} m",
+    )  # fmt: skip
+
+
 def main() -> None:
     arguments = options(__doc__).parse_args()
     quick, context = arguments.quick, NativeContext()
@@ -152,6 +182,7 @@ def main() -> None:
         add_times(paper, name, list(load_scans(arguments.data / name, 1 if quick else 3)), voxels, context)
         scans = list(load_scans(arguments.data / name, 4 if quick else 20))
         maps = add_agreement(paper, name, scans, voxels, context)
+        add_recorded_paths(paper, name, scans, context)
         add_picture(paper, name, maps, np.median(scans[len(scans) // 2].points, 0), arguments.out)
     if not paper.rows:
         raise SystemExit(f"{arguments.data}: none of {', '.join(RECORDINGS)}")

@@ -130,7 +130,7 @@ def add_adaptive(paper: Paper, made: Path, out: Path, size: float, scans: int, s
 def add_changed(paper: Paper, made: Path, size: float, scans: int, seeds: int, quick: bool) -> None:
     """Where the whole map serves better than a part, and where worse."""
     for name, words in list(CHANGED.items())[-1 if quick else 0 :]:
-        runs: dict[float | str, list[Found]] = {radius: [] for radius in (10, "auto", "full")[:: 2 if quick else 1]}
+        runs: dict[float | str, list[Found]] = {radius: [] for radius in (10, "full")}
         for seed in range(seeds):
             folder = make(made, seed, size, scans, ("--every", 2, *words))
             for radius, found in runs.items():
@@ -174,7 +174,7 @@ def main() -> None:
         add_table(paper, Path(made), size, scans, seeds)
         add_adaptive(paper, Path(made), arguments.out, *less, seeds, arguments.quick)
         add_changed(paper, Path(made), *less, seeds, arguments.quick)
-        add_starts(paper, Path(made), 30.0 if arguments.quick else 48.0, 1 if arguments.quick else 5, seeds)
+        add_starts(paper, Path(made), 30.0 if arguments.quick else 48.0, 1 if arguments.quick else 3, seeds)
     paper.write(arguments.out)
 
 
