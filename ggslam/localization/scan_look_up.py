@@ -233,8 +233,8 @@ class ScanLookUp:
         ranked = sorted(found, key=lambda pose: -pose.score)
         believed, reason = self._judge([pose for pose in ranked if self._allows(pose)], tried)
         if believed is None and ranked and not self._allows(ranked[0]):
-            best = _position_text(ranked[0].alignment.T_world_camera)
-            reason = f"the scan matches the map best at {best}, which is not {self._near}; there, {reason}"
+            there = _position_text(ranked[0].alignment.T_world_camera)
+            reason = f"the scan matches the map best at {there}, which is not {self._near}; near it, {reason}"
         return believed, reason
 
     def _allows(self, pose: FoundPose) -> bool:
