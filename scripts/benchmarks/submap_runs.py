@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +31,10 @@ from ggslam.jobs.localize.report import LocalizationReport
 from ggslam.jobs.submaps.stores import INDOORS
 from ggslam.localization.frames import FrameTracker
 from ggslam.localization.localizer import Localization, LocalizationStatus, Localizer
+from ggslam.localization.near import Near
 from ggslam.localization.reach import AUTO, AdaptiveReach, parse_radius, scan_ranges
+from ggslam.localization.scan_look_up import ScanLookUp
+from ggslam.localization.scan_maps import scan_places
 from ggslam.localization.scan_tracker import ScanTracker, ScanTrackerSettings
 from ggslam.localization.scans import ScanSequence, scan_files
 from ggslam.localization.surface import NORMAL, SCAN_TARGET, FullSurface, PartialSurface, packed_normals
@@ -87,6 +91,13 @@ def main() -> None:
     starts.add_argument("--radius", type=parse_radius, default=10.0)
     starts.add_argument("--off", type=float, nargs=2, default=(2.0, 10.0), help="metres and degrees")
     starts.add_argument("--count", type=int, default=10, help="of scans")
+    near = cases.add_parser("near", help="scans without a start pose, looked up near a position")
+    near.add_argument("store", type=Path)
+    near.add_argument("sequence", type=Path)
+    near.add_argument("--sigma", type=float, help="of the position, metres; default: none is given")
+    near.add_argument("--off", type=float, default=0.0, help="metres that it is wrong along x")
+    near.add_argument("--range", type=float, default=6.0, help="of the scanner, metres")
+    near.add_argument("--count", type=int, default=6, help="of scans")
     a = parser.parse_args()
     began = time.perf_counter()
     if a.case == "world":
@@ -95,6 +106,8 @@ def main() -> None:
         found = make_room(a.folder, a.recording, a.stop, a.scale)
     elif a.case == "starts":
         found = started(a.store, a.sequence, a.full, a.radius, a.off[0], a.off[1], a.count)
+    elif a.case == "near":
+        found = looked_up(a.store, a.sequence, a.sigma, a.off, a.range, a.count)
     else:
         found = located(a.store, a.sequence, a.full, a.tree, a.voxel, a.radius, a.first, a.stop, a.scale)
     print(json.dumps(json_ready({**found, "seconds": time.perf_counter() - began, "peak_mb": peak_memory_mb()})))
@@ -211,6 +224,31 @@ def started(
         surface.close()
     rmse = float(np.sqrt(np.mean(np.square(errors)))) if errors else None
     return {"outcomes": dict(outcomes), "starts": 4 * count, "rmse_m": rmse}
+
+
+def looked_up(
+    path: Path, sequence: Path, sigma: float | None, off: float, farthest: float, count: int
+) -> dict[str, Any]:
+    """Looks scans up one by one, near a position that is `off` metres wrong: how many were right, elsewhere and lost,
+    and RMSE of the right ones."""
+    context, outcomes, errors = NativeContext(), Counter[str](), []
+    scans = ScanSequence(sequence)
+    truth = scans.ground_truth
+    assert truth is not None
+    with GridStore.open(path) as store, PartialSurface(store, SCAN_TARGET, context) as surface:
+        for number in np.linspace(0, len(scans) - 1, count).round().astype(int).tolist():
+            x, y = truth[number][:2, 3].tolist()
+            near = None if sigma is None else Near((x + off, y), sigma)
+            look_up = ScanLookUp(partial(scan_places, store, near), store.settings.axes, near=near)
+            points = scans.scan(number).points
+            points = points[np.linalg.norm(points, axis=1) < farthest]
+            tracker = ScanTracker(ScanTrackerSettings(), context, None, look_up)
+            found = Localizer(surface, tracker, None).locate(points)
+            away = float(np.linalg.norm(found.T_world_sensor[:3, 3] - truth[number][:3, 3]))
+            outcomes[_outcome(found, away)] += 1
+            errors += [away] if found.status.is_located and away < RIGHT else []
+    rmse = float(np.sqrt(np.mean(np.square(errors)))) if errors else None
+    return {"outcomes": dict(outcomes), "rmse_m": rmse}
 
 
 def _outcome(found: Localization, away: float) -> str:

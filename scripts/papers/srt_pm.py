@@ -164,6 +164,25 @@ def add_starts(paper: Paper, made: Path, size: float, count: int, seeds: int) ->
         )  # fmt: skip
 
 
+def add_near(paper: Paper, made: Path, size: float, count: int, seeds: int) -> None:
+    """Which of equal rooms a scanner that sees 6 m is in: with no position, a rough one, and a wrong one."""
+    ways: dict[str, tuple[Any, ...]] = {
+        "no position": (), "position within 1 m": ("--sigma", 1), "position 3 m wrong": ("--sigma", 0.5, "--off", 3)
+    }
+    runs: dict[str, list[Found]] = {name: [] for name in ways}
+    for seed in range(seeds):
+        folder = make(made, seed, size, count, ("--kind", "equal", "--every", 20))
+        for name, words in ways.items():
+            runs[name].append(case("near", folder / "map.grid", folder, "--count", count, *words))
+    for name, found in runs.items():
+        shares = {key: spread([100 * run["outcomes"].get(key, 0) / count for run in found], 0)
+                  for key in ("right", "wrong", "lost")}  # fmt: skip
+        errors = [run["rmse_m"] for run in found if run["rmse_m"] is not None]
+        paper.add("which of equal rooms", name, "", f"{shares['right']} % right",
+                  f"{shares['wrong']} % wrong, {shares['lost']} % told to be lost"
+                  + (f"; RMSE {spread(errors, 2, 1e3)} mm" if errors else ""))  # fmt: skip
+
+
 def main() -> None:
     arguments = options(__doc__).parse_args()
     size, scans, seeds = (30.0, 8, 1) if arguments.quick else (100.0, 100, 5)
@@ -175,6 +194,7 @@ def main() -> None:
         add_adaptive(paper, Path(made), arguments.out, *less, seeds, arguments.quick)
         add_changed(paper, Path(made), *less, seeds, arguments.quick)
         add_starts(paper, Path(made), 30.0 if arguments.quick else 48.0, 1 if arguments.quick else 3, seeds)
+        add_near(paper, Path(made), 30.0 if arguments.quick else 48.0, 1 if arguments.quick else 4, seeds)
     paper.write(arguments.out)
 
 
