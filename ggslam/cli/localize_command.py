@@ -27,7 +27,7 @@ EPILOG = """
 
   ggslam localize campus.grid scans/tuesday --radius auto
 
-  ggslam localize campus.grid scans/tuesday --body=-0.4,-0.3,-0.5,0.2,0.3,-0.1
+  ggslam localize campus.grid scans/tuesday --body -0.4,-0.3,-0.5,0.2,0.3,-0.1
 
   ggslam localize campus.pcd scans/tuesday --start-pose given --full-map --out localized/full
 
