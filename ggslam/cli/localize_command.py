@@ -25,6 +25,10 @@ EPILOG = """
 
   ggslam localize campus.pcd scans/tuesday --near "120 -40 15"
 
+  ggslam localize campus.grid scans/tuesday --radius auto
+
+  ggslam localize campus.grid scans/tuesday --body -0.4,-0.3,-0.5,0.2,0.3,-0.1
+
   ggslam localize campus.pcd scans/tuesday --start-pose given --full-map --out localized/full
 
   ggslam localize campus.pcd scans/tuesday --start-pose given --set scans.search.reach=4 --set scans.scan.farthest=100
@@ -65,10 +69,10 @@ Near = Annotated[
 FullMap = Annotated[bool, typer.Option("--full-map", help="Align to the whole map, for comparison.")]
 Out = Annotated[Path | None, typer.Option(help="Folder for the results; default localized/NAME.")]
 Radius = Annotated[
-    float | None,
-    typer.Option(help="R': align to cells whose centres are so near, metres; default: the map's, of a cloud what suits "
-                 "the scanner.", min=0, max=1e7),
-]
+    str | None,
+    typer.Option(metavar="METRES|auto", help="R': align to cells whose centres are so near; auto: as far as each scan "
+                 "or frame sees, less where the map is dense. Default: the map's, of a cloud what suits the scanner."),
+]  # fmt: skip
 Voxel = Annotated[
     float | None,
     typer.Option(help="Edge of the voxels to align to, metres; default 0.03, of scans 0.15.", min=1e-3, max=10),
@@ -99,10 +103,11 @@ def localize(
     depth_delay: options.DepthDelay = None,
     upright: options.Upright = False,
     columns: options.Columns = None,
+    body: options.Body = None, body_frame: options.BodyFrame = None,
     skip_bad_frames: options.SkipBadFrames = False,
     threads: options.Threads = None,
     settings: options.Settings = None,
-) -> None:
+) -> None:  # fmt: skip
     """Locate each frame or scan of a recording in a map, of which only the surroundings are in memory."""
     from ggslam.jobs.localize.locate import LocalizeRequest
     from ggslam.jobs.localize.locate import localize as locate_all
@@ -117,7 +122,7 @@ def localize(
             depth_delay=depth_delay, upright=upright,
         ),
         start_pose=start_pose, no_start_pose=no_start_pose, near=near, full=full_map, out=out, radius=radius,
-        voxel=voxel, columns=columns, threads=threads, overrides=settings or [],
+        voxel=voxel, columns=columns, body=body or (), body_frame=body_frame, threads=threads, overrides=settings or [],
     )  # fmt: skip
     with progress_bar() as bar:
         report = locate_all(request, ProgressObserver(bar))

@@ -14,6 +14,7 @@ from typing import Final, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from ggslam.localization.reach import AdaptiveReach
 from ggslam.localization.surface import Surface
 from ggslam.scene.poses import inverse
 from ggslam.tracking.gicp import GicpTarget
@@ -107,10 +108,14 @@ class Localizer(Generic[Item]):
         surface: of the map.
         front_end: for what is to be located.
         T_world_sensor: pose of the first one, float64 [4, 4]; None: it is looked up.
+        reach: how far the map in memory reaches follows from what is seen; None: it stays.
     """
 
-    def __init__(self, surface: Surface, front_end: FrontEnd[Item], T_world_sensor: np.ndarray | None) -> None:
-        self.surface, self.front_end = surface, front_end
+    def __init__(
+        self, surface: Surface, front_end: FrontEnd[Item], T_world_sensor: np.ndarray | None,
+        reach: AdaptiveReach | None = None,
+    ) -> None:  # fmt: skip
+        self.surface, self.front_end, self._reach = surface, front_end, reach
         self._pose = None if T_world_sensor is None else np.array(T_world_sensor, float)
         self._velocity = np.eye(4)
         self._lost = T_world_sensor is None
@@ -122,7 +127,7 @@ class Localizer(Generic[Item]):
             FormatError: the index of the store is damaged. (Damaged cells are left out; see `Surface.damage`.)
         """
         began = time.perf_counter()
-        changed, map_seconds = self._move(), time.perf_counter() - began
+        changed, map_seconds = self._move(item), time.perf_counter() - began
         target = self.surface.target if self._pose is not None else None
         found = None if target is None else self.front_end.track(item, self.surface, target)
         if found is None or not found.status.is_located:
@@ -134,8 +139,10 @@ class Localizer(Generic[Item]):
             self.surface.points, changed, map_seconds, spent - map_seconds,
         )  # fmt: skip
 
-    def _move(self) -> bool:
+    def _move(self, item: Item) -> bool:
         """Brings the map to where the sensor is expected."""
+        if self._reach is not None:
+            self._reach.adapt(item, float(np.linalg.norm(self._velocity[:3, 3])))
         if self._pose is None:
             return False
         expected = self._pose @ self._velocity

@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ggslam.localization.level import about_z, between, floor_height, level_axes, level_turn
+from ggslam.localization.near import Near
 from ggslam.localization.surface import Surface
 from ggslam.scene.poses import inverse, separation, transform_points
 from ggslam.submaps.settings import GridAxes
@@ -185,13 +186,15 @@ class ScanLookUp:
         axes: of the map's grid.
         settings: see `ScanLookUpSettings`.
         min_overlap: share of the points that must match.
+        near: poses elsewhere are not believed; None: anywhere.
     """
 
     def __init__(
         self, make_places: Callable[[], Guesser], axes: GridAxes, settings: ScanLookUpSettings | None = None,
-        min_overlap: float = 0.5,
+        min_overlap: float = 0.5, near: Near | None = None,
     ) -> None:  # fmt: skip
         self.settings, self._min_overlap = settings or ScanLookUpSettings(), min_overlap
+        self._axes, self._near = axes, near
         self._make_places = make_places
         self._places: Guesser | None = None
         self._R_world_level = level_axes(axes)
@@ -227,7 +230,16 @@ class ScanLookUp:
                 turned[:3, :3] = turned[:3, :3] @ about_z(np.pi)
                 if (pose := self._try(scan, turned, surface, align)) is not None:
                     found.append(pose)
-        return self._judge(sorted(found, key=lambda pose: -pose.score), tried)
+        ranked = sorted(found, key=lambda pose: -pose.score)
+        believed, reason = self._judge([pose for pose in ranked if self._allows(pose)], tried)
+        if believed is None and ranked and not self._allows(ranked[0]):
+            there = _position_text(ranked[0].alignment.T_world_camera)
+            reason = f"the scan matches the map best at {there}, which is not {self._near}; near it, {reason}"
+        return believed, reason
+
+    def _allows(self, pose: FoundPose) -> bool:
+        position = pose.alignment.T_world_camera[None, :3, 3]
+        return self._near is None or bool(self._near.allows(position, self._axes)[0])
 
     def _why_not(self, scans: list[_Scan]) -> str:
         if not scans:

@@ -13,7 +13,7 @@ told by the target, and poses are world poses everywhere else.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Final, Protocol
 
@@ -202,6 +202,7 @@ class PartialSurface:
         self.has_sides = True
         self.points = 0
         self._coverage: Coverage = Everywhere()
+        self._reach: tuple[float, float] | None = None
         self.damage: set[str] = set()
         """What is wrong with cells that were within R' and cannot be read."""
 
@@ -212,6 +213,8 @@ class PartialSurface:
             self.map.close()
             self.map = self._cells_around(local_origin(position))
             self.target = None
+            if self._reach is not None:
+                self.map.set_reach(*self._reach)
         status = self.map.update(position, velocity)
         if status is MapStatus.UNCHANGED:
             return False
@@ -220,12 +223,18 @@ class PartialSurface:
         self.points = sum(cell.part.count for cell in cells)
         self.has_sides = all(cell.has_sides for cell in cells)
         reaches = {key: cell.reach for key, cell in self.map.cells.items()}
-        self._coverage = coverage_of(reaches, self.map.settings, np.asarray(position, np.float64))
+        submaps = replace(self.map.settings, partial_radius=self.map.radius)
+        self._coverage = coverage_of(reaches, submaps, np.asarray(position, np.float64))
         parts, like = [cell.part for cell in cells], self.target
         self.target = None
         if self.points:
             self.target = composed_target(parts, self._settings, self._context, like, self._origin)
         return self.target is not None or before is not None
+
+    def set_reach(self, radius: float, step: float) -> None:
+        """Changes R' and the distance between two maps, see `CellsAround.set_reach`."""
+        self._reach = radius, step
+        self.map.set_reach(radius, step)
 
     def _cells_around(self, origin: np.ndarray) -> CellsAround[SurfaceCell]:
         """Cells as parts of targets with this origin."""

@@ -71,7 +71,11 @@ class CellsAround(Generic[Cell]):
         self.cache = CellCache(int(self.settings.cache_megabytes * 1e6), size)
         self._loader, self._part, self._size = loader, part, size
         self._versions: dict[CellKey, int] = {}
+        self.radius = self.settings.partial_radius
+        """R' of the moment, metres."""
+        self._step: float | None = None
         self._entered: CellKey | None = None
+        self._centre: tuple[np.ndarray, float] | None = None
         self._last_position: np.ndarray | None = None
         self._last_ahead: CellKey | None = None
         self._updating = threading.Lock()
@@ -91,13 +95,19 @@ class CellsAround(Generic[Cell]):
         position = np.array(position, np.float64)
         with self._updating:
             key = self.store.key_of(position)
-            changed = key != self._entered and self._assemble(position)
+            changed = self._is_due(key, position) and self._assemble(position)
             self._entered = key
             self._look_ahead(position, velocity)
             self._last_position = position
             if not self.cells:
                 return MapStatus.EMPTY
             return MapStatus.CHANGED if changed else MapStatus.UNCHANGED
+
+    def set_reach(self, radius: float, step: float) -> None:
+        """From the next update on: R', and the metres from where cells were looked up at which they are again,
+        instead of whenever the sensor enters a cell."""
+        with self._updating:
+            self.radius, self._step = radius, step
 
     def wait(self, timeout: float | None = None) -> bool:
         """Waits, at most `timeout` seconds, until loading ahead has nothing left to do; returns whether that is so."""
@@ -117,9 +127,20 @@ class CellsAround(Generic[Cell]):
     ) -> None:
         self.close()
 
+    def _is_due(self, key: CellKey, position: np.ndarray) -> bool:
+        """Whether cells are to be looked up for a sensor in a cell."""
+        if self._step is None:
+            return key != self._entered
+        if self._centre is not None and self._centre[1] == self.radius:
+            away = float(np.linalg.norm((position - self._centre[0]) * self.store.grid.spans))
+            if away <= self._step:
+                return False
+        self._centre = position, self.radius
+        return True
+
     def _assemble(self, position: np.ndarray) -> bool:
         """Loads what came, drops what went; whether there was anything to do."""
-        wanted = self.store.part_versions(self._part, position, self.settings.partial_radius)
+        wanted = self.store.part_versions(self._part, position, self.radius)
         if wanted == self._versions:
             return False
         cells: dict[CellKey, Cell] = {}
@@ -153,7 +174,8 @@ class CellsAround(Generic[Cell]):
         speed = float(np.linalg.norm(velocity))
         if not speed > 0:
             return
-        ahead = position + np.asarray(velocity, np.float64) * (self.settings.lookahead / speed)
+        far = max(self.settings.lookahead, 2 * (self._step or 0.0))
+        ahead = position + np.asarray(velocity, np.float64) * (far / speed)
         key = self.store.key_of(ahead)
         if key != self._last_ahead:
             self._last_ahead = key
@@ -161,7 +183,7 @@ class CellsAround(Generic[Cell]):
 
     def _steps_ahead(self, position: np.ndarray) -> Iterator[Callable[[], None]]:
         """Loads cells around a place, nearest first, until one more could push the first out of the cache."""
-        wanted = self.store.part_versions(self._part, position, self.settings.partial_radius)
+        wanted = self.store.part_versions(self._part, position, self.radius)
         current = self._versions
         loaded = largest = 0
 

@@ -233,13 +233,15 @@ class PairTimes:
 
 
 def plan_pairs(
-    plan_map: PlanMap, clearance: float, size: tuple[float, float, float], height: float, pairs: int = 60
-) -> PairTimes:
-    """Plans between random pairs at a height, each again until no page of the map is read for it."""
+    plan_map: PlanMap, clearance: float, size: tuple[float, float, float], height: float, pairs: int = 60,
+    corner: tuple[float, float] = (0.0, 0.0),
+) -> PairTimes:  # fmt: skip
+    """Plans between random pairs at a height, `corner` and more, each again until no page of the map is read for it."""
     planner, rng = Planner(plan_map, clearance), np.random.default_rng(0)
     ms, lengths, cold = [], [], []
     for _ in range(pairs):
         ends = rng.uniform(0, size, (2, 3))
+        ends[:, :2] += corner
         ends[:, 2] = height
         began = time.process_time()
         path = planner.plan(ends[0], ends[1], explain=False)

@@ -261,6 +261,49 @@ def test_damaged_places_are_left_out(run: Path, room: Path, tmp_path: Path) -> N
     one_error(ggslam("localize", store, room), "--start-pose is needed", "places.npz")
 
 
+def test_the_robots_body_is_left_out_of_scans_that_are_located(scans: Path, tmp_path: Path) -> None:
+    cloud, box = scans.parent / "cloud.npy", "-0.9,-0.4,-0.6,-0.3,0.4,0.3"
+    low, high = np.array([-0.93, -0.43, -0.63]), np.array([-0.27, 0.43, 0.33])  # with the margin of 3 cm
+    for name in ("seen", "bare"):
+        shutil.copytree(scans, tmp_path / name)
+    share = []
+    for path in sorted((scans / "scans").iterdir()):
+        points = np.load(path).astype(float)
+        with np.errstate(divide="ignore"):
+            ends = np.sort([low / points, high / points], 0)
+        enter, leave = ends[0].max(1), ends[1].min(1)
+        hidden = (enter <= leave) & (enter > 0) & (enter < 1)
+        near = points[hidden] * (enter[hidden, None] + 0.05)  # what the scanner sees there: the body
+        np.save(tmp_path / "bare" / "scans" / path.name, points[~hidden].astype(np.float32))
+        seen = np.where(hidden[:, None], 0, points)
+        seen[hidden] = near
+        np.save(tmp_path / "seen" / "scans" / path.name, seen.astype(np.float32))
+        share.append(hidden.mean())
+    assert 0.03 < np.mean(share) < 0.5
+    common = ("--start-pose", "given")
+    done("localize", cloud, tmp_path / "bare", *common, "--out", tmp_path / "a")
+    done("localize", cloud, tmp_path / "seen", *common, "--body", box, "--out", tmp_path / "b")
+    done("localize", cloud, tmp_path / "seen", *common, "--out", tmp_path / "c")
+    overlap = [
+        np.mean([f["overlap"] for f in json.loads((tmp_path / name / "localization.json").read_text())["frames"]])
+        for name in "abc"
+    ]
+    found = [read_tum(tmp_path / name / "trajectory.txt").T_world_camera for name in "ab"]
+    truth = read_tum(scans / "trajectory.txt").T_world_camera
+    assert np.linalg.norm(found[1][:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.03
+    np.testing.assert_allclose(found[1], found[0], atol=2e-3)  # points at the box's very edge may differ
+    assert overlap[1] == pytest.approx(overlap[0], abs=2e-3) and overlap[2] < overlap[0] - 0.01
+    one_error(ggslam("localize", cloud, scans, "--body", "1,2,3"), "body", "'1,2,3'")
+
+
+def test_the_radius_may_follow_what_is_seen(scans: Path, tmp_path: Path) -> None:
+    cloud = scans.parent / "cloud.npy"
+    done("localize", cloud, scans, "--start-pose", "given", "--radius", "auto", "--out", tmp_path / "auto")
+    found = summary(tmp_path / "auto")
+    assert found["located_share"] == 1 and found["rmse_m"] < 0.03
+    one_error(ggslam("localize", cloud, scans, "--radius", "far"), "--radius", "or auto", "'far'")
+
+
 def test_another_camera_is_located_from_a_start_pose(run: Path, room: Path, tmp_path: Path) -> None:
     output = done("localize", run, room, "--scale", 0.5, "--stop", 3, "--start-pose", ORIGIN, "--out", tmp_path / "out")
     assert summary(tmp_path / "out")["located_share"] == 1 and "lost frames are not looked up" in output

@@ -21,7 +21,7 @@ def localize_recording(
     start_pose: str | None = None,
     near: str | None = None,
     full: bool = False,
-    radius: float | None = None,
+    radius: float | str | None = None,
     voxel: float | None = None,
     threads: int | None = None,
     overrides: Iterable[str] = (),
@@ -37,7 +37,7 @@ def localize_recording(
         start_pose: of the first frame, "x y z qx qy qz qw" in metres; None: it is looked up among the map's places.
         near: roughly where the recording was made, "x y sigma" or "x y z sigma" in metres; None: anywhere.
         full: use all of the map at once, not only what is around the camera.
-        radius: of the part that is used, in metres; None: the store's.
+        radius: of the part that is used, in metres; None: the store's; "auto": as far as each scan or frame sees.
         voxel: edge of the target's voxels in metres; None: 0.03 for images, 0.15 for scans, or what the map allows.
         threads: None: all processors.
         overrides: settings as "name.of.setting=value".

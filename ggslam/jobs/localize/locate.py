@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from ggslam.driving.body import Body, CameraBody
+from ggslam.driving.body_options import read_body
 from ggslam.errors import ConfigError, GgslamError, SequenceError
 from ggslam.jobs.localize.report import LocalizationReport, write_localization
 from ggslam.jobs.localize.settings import LocalizeSettings, localize_settings
@@ -26,6 +28,7 @@ from ggslam.localization.localizer import Localization, LocalizationStatus, Loca
 from ggslam.localization.map_picture import MapPicture
 from ggslam.localization.near import Near, parse_near
 from ggslam.localization.places import StoredPlaces
+from ggslam.localization.reach import AUTO, AdaptiveReach, frame_ranges, parse_radius, scan_ranges
 from ggslam.localization.scan_look_up import ScanLookUp
 from ggslam.localization.scan_maps import scan_places
 from ggslam.localization.scan_places import ScanPlaces
@@ -81,9 +84,11 @@ class LocalizeRequest:
             places within three sigma are looked at; None: all.
         full: against the whole map.
         out: folder for the results; None: localized/NAME. The cells of a run's map are kept beside it.
-        radius: R' in metres; None: the store's.
+        radius: R' in metres; None: the store's; "auto": by what the sensor sees, see `AdaptiveReach`.
         voxel: edge of the target's voxels in metres; None: 0.03 for images, 0.15 for scans, or what the map allows.
         columns: numbers of a point in .bin scans; None: as they tell themselves.
+        body: of the robot, left out of scans or depth, see `driving.body_options.read_body`; `body_frame`: the sensor's
+            link in a URDF file.
         threads: None: all processors.
         overrides: settings as "name.of.setting=value", see `LocalizeSettings`.
     """
@@ -95,9 +100,11 @@ class LocalizeRequest:
     near: str | None = None
     full: bool = False
     out: Path | None = None
-    radius: float | None = None
+    radius: float | str | None = None
     voxel: float | None = None
     columns: int | None = None
+    body: Several[str] = ()
+    body_frame: str | None = None
     threads: int | None = None
     overrides: Several[str] = ()
 
@@ -111,7 +118,7 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
     """
     if request.start_pose is not None and request.no_start_pose:
         raise ConfigError("`start_pose` and `no_start_pose`: one of them")
-    chosen = localize_settings(request.overrides)
+    chosen, body = localize_settings(request.overrides), read_body(request.body, request.body_frame)
     if note := tuning_note(chosen.settings):
         observer.note(note)
     out = request.out or Path("localized") / request.sequence.path.resolve().name
@@ -124,27 +131,27 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         store = open_map(request.map, out.parent, opened, observer, of_cloud)
         context = NativeContext(request.threads)
         submaps = replace(store.settings, **chosen.submaps)
-        submaps = submaps if request.radius is None else replace(submaps, partial_radius=request.radius)
+        radius = None if request.radius is None else parse_radius(request.radius)
+        submaps = submaps if radius is None or radius == AUTO else replace(submaps, partial_radius=radius)
         own = SCAN_TARGET if scans is not None else chosen.settings.tracking.target
         target = _target(request, submaps, own, point_spacing(store) if scans is not None else 0.0)
-        surface: Surface = (
-            FullSurface(store, target, context) if request.full else PartialSurface(store, target, context, submaps)
-        )
+        ranges = None if radius != AUTO else frame_ranges if scans is None else scan_ranges
+        surface, reach = _surface(request.full, store, target, context, submaps, ranges)
         opened.callback(surface.close)
         places: StoredPlaces | ScanLookUp | None
         if isinstance(recording, ScanSequence):
             places = _scan_look_up(request, store, near, chosen.settings)
         else:
             places = _places(request, recording, store, start, near, observer)
-        localizer = _localizer(chosen.settings, recording, places, surface, context, start)
-        results, error = _run(localizer, recording, observer)
+        localizer = _localizer(chosen.settings, recording, places, surface, context, start, reach)
+        results, error = _run(localizer, recording, body, observer)
         if error is not None and not results:
             raise error
         damaged = sorted({*surface.damage, *(places.damage if places is not None else [])})
         report = LocalizationReport(
             str(request.map), str(request.sequence.path), request.full, recording.timestamps[: len(results)], results,
             None if recording.ground_truth is None else recording.ground_truth[: len(results)], damaged,
-            submaps.partial_radius,
+            submaps.partial_radius if reach is None else reach.radius,
         )  # fmt: skip
     for warning in [*filter(None, [_start_note(start, results)]), *report.warnings()]:
         observer.note(warning)
@@ -257,6 +264,17 @@ def _target(request: LocalizeRequest, submaps: SubmapSettings, own: TargetSettin
     return replace(own, voxel=voxel if request.voxel is None else request.voxel)
 
 
+def _surface(
+    full: bool, store: GridStore, target: TargetSettings, context: NativeContext, submaps: SubmapSettings,
+    ranges: Callable[[Any], np.ndarray] | None,
+) -> tuple[Surface, AdaptiveReach | None]:  # fmt: skip
+    """The map that is aligned to, and what adapts it if it is to be, by what an item measured."""
+    if full:
+        return FullSurface(store, target, context), None
+    surface = PartialSurface(store, target, context, submaps)
+    return surface, None if ranges is None else AdaptiveReach(surface, ranges)
+
+
 def _places(
     request: LocalizeRequest, recording: Sequence, store: GridStore, start: np.ndarray | None, near: Near | None,
     observer: Observer,
@@ -286,7 +304,7 @@ def _scan_look_up(
     def make() -> ScanPlaces | MapPicture:
         return scan_places(store) if held is None else held
 
-    return ScanLookUp(make, store.settings.axes, settings.look_up, settings.scans.min_overlap)
+    return ScanLookUp(make, store.settings.axes, settings.look_up, settings.scans.min_overlap, near)
 
 
 def _start_note(start: np.ndarray | None, results: Several[Localization]) -> str:
@@ -305,27 +323,28 @@ def _start_note(start: np.ndarray | None, results: Several[Localization]) -> str
 
 def _localizer(
     settings: LocalizeSettings, recording: Sequence | ScanSequence, places: StoredPlaces | ScanLookUp | None,
-    surface: Surface, context: NativeContext, start: np.ndarray | None,
+    surface: Surface, context: NativeContext, start: np.ndarray | None, reach: AdaptiveReach | None,
 ) -> Localizer[Any]:  # fmt: skip
     if isinstance(recording, ScanSequence):
         assert isinstance(places, ScanLookUp)
-        return Localizer(surface, ScanTracker(settings.scans, context, start, places), start)
+        return Localizer(surface, ScanTracker(settings.scans, context, start, places), start, reach)
     assert not isinstance(places, ScanLookUp)
     front_end = FrameTracker(recording.camera, settings.tracking, context, start, places)
-    return Localizer(surface, front_end, start)
+    return Localizer(surface, front_end, start, reach)
 
 
 def _run(
-    localizer: Localizer[Any], recording: Sequence | ScanSequence, observer: Observer
+    localizer: Localizer[Any], recording: Sequence | ScanSequence, body: Body | None, observer: Observer
 ) -> tuple[list[Localization], BaseException | None]:
     """What was located, and what stopped it before the end."""
     results: list[Localization] = []
     observer.begin("localize", len(recording))
     items: Iterable[Any]
     if isinstance(recording, ScanSequence):
-        items = (scan.points for scan in recording.stream())
+        items = (scan.points if body is None else body.without(scan.points) for scan in recording.stream())
     else:
         items = recording.stream(masks=False)
+        items = items if body is None else map(CameraBody(body).without, items)
     try:
         for item in items:
             results.append(localizer.locate(item))

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.jobs.submaps.stores import INDOORS
+from ggslam.localization.reach import reach_of_ranges
 from ggslam.localization.scans import ScanSequence
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.tuning import Tuning
@@ -27,12 +28,8 @@ class StoreSensorTuning(Tuning):
 
     scans = 5
     """Scans that are read, spread over the recording."""
-    reach_percentile = 95
-    """Percentile of the ranges that is taken for the reach."""
     farthest_percentile = 99
     """Percentile of the ranges that is taken for the farthest."""
-    reach_factor = 1.2
-    """R' over the reach."""
     length_step_m = 5.0
     """Lengths are rounded up to whole multiples of this, in metres."""
     max_length_m = 100.0
@@ -68,10 +65,8 @@ def settings_of_scans(scans: ScanSequence, cut: bool = False) -> SubmapSettings:
     ranges = ranges[np.isfinite(ranges) & (ranges > 0)]
     if not len(ranges):
         return _SHORT
-    most, farthest = np.percentile(
-        ranges, [StoreSensorTuning.reach_percentile, StoreSensorTuning.farthest_percentile]
-    ).tolist()
-    return _of_reach(most * StoreSensorTuning.reach_factor, farthest, cut)
+    farthest = float(np.percentile(ranges, StoreSensorTuning.farthest_percentile))
+    return _of_reach(reach_of_ranges(ranges), farthest, cut)
 
 
 def settings_of_cloud(points: np.ndarray) -> SubmapSettings:
