@@ -59,8 +59,8 @@ def main() -> None:
             if "corridor" in WAYS[name]:
                 add_clients(paper, path, 40 if quick else 400)
                 add_run(paper, Path(folder), name, path, 10 if quick else 60)
-            for file in write_sheet(arguments.out / f"embedded_figure_4_{path.name}", plots):
-                print(file)
+            for file in write_sheet(arguments.out / f"embedded_figure_4_{path.name}", plots)[:1]:
+                paper.show(file, f"Figure 4, {name}: odometry by 100 frames, and voxels of the local maps")
     for seed in range(1 if quick else 4):
         add_person(paper, person(seed), PEOPLE_QPS[: 1 if quick else None])
     recording = arguments.data / "livingroom"

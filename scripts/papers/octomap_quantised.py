@@ -124,8 +124,7 @@ def add_picture(paper: Paper, name: str, pairs: Pairs, centre: np.ndarray, out: 
     path = out / f"octomap_{name}.png"
     write_picture(path, np.concatenate(rows))
     sizes = ", ".join(f"{100 * voxel:g}" for voxel in pairs)
-    paper.add("figure 5", f"{name}, {sizes} cm side by side", "", path.name,
-              "one height of the maps; above a ray for every point, below quantised")  # fmt: skip
+    paper.show(path, f"Figure 5, {name}, {sizes} cm, at one height; above a ray for every point, below quantised")
 
 
 def add_paths(paper: Paper, quick: bool) -> None:

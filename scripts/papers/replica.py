@@ -41,10 +41,11 @@ OTHERS = """
 ## Other papers
 
 The other scripts in `scripts/papers/` print a paper each, ours beside what is published (`--quick`: less of
-everything): `gg_slam.py` (schedules of learning objects, real time with objects), `embedded.py` (odometry by 100
-frames, coding by quantiser and scale), `octomap_quantised.py`, `srt_pm.py` (partial maps) and `gpu_mapping.py`. A dash
-under "published" is a figure that is not in the code; recordings that are not to be had are replaced by generated
-ones, which the rows name. What they wrote with `--out docs/papers` {what}.
+everything): `replica_day.py` (`batch --replica` on generated rooms), `gg_slam.py` (ways of learning objects, real time
+with objects, an ablation), `embedded.py` (odometry by 100 frames, coding by quantiser and scale, clients),
+`octomap_quantised.py`, `srt_pm.py` (partial maps) and `gpu_mapping.py`. A dash under "published" is a figure that is
+not in the code; recordings that are not to be had are replaced by generated ones, which the rows name. What they wrote
+with `--out docs/papers` {what}.
 
 """
 

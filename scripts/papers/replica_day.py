@@ -21,6 +21,7 @@ from gg_slam import scores  # isort: skip
 from ggslam.jobs.batch.manifest import REPLICA
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.timing import TimingRecord
+from ggslam.system.plurals import quantity
 
 
 def make_scenes(folder: Path, scenes: list[str], frames: int) -> None:
@@ -52,8 +53,9 @@ def main() -> None:
     scenes = arguments.scenes[: 1 if arguments.quick else None]
     frames = arguments.frames or (4 if arguments.quick else 30)
     paper = Paper(
-        "replica_day" if frames < 2000 else "replica_day_full", "A day with Replica (GG-SLAM, table 1)",
-        f"Generated rooms of 1200x680, {frames} frames each, `ggslam batch --replica`; held-out frames.",
+        "replica_day" if arguments.frames is None else f"replica_day_{frames}",
+        f"A day with Replica, {quantity(len(scenes), 'scene')} (GG-SLAM, table 1)",
+        f"Generated rooms of 1200x680, {frames} frames each, `ggslam batch --replica`; held-out frames.", "replica_day",
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.recordings or Path(temporary, "Replica")

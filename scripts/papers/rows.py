@@ -24,18 +24,27 @@ class Paper:
         name: of the script's results, `NAME.json`.
         title: of the paper and its source.
         conditions: what ours ran on.
+        script: its name, if not that of the results.
         rows: (table or figure, row, published, ours, remark), each text.
+        pictures: file beside the results, and what it shows.
     """
 
     name: str
     title: str
     conditions: str = ""
+    script: str = ""
     rows: list[tuple[str, str, str, str, str]] = field(default_factory=list)
+    pictures: list[tuple[str, str]] = field(default_factory=list)
 
     def add(self, table: str, row: str, published: str, ours: str, remark: str = "") -> None:
         """Takes and prints one row."""
         self.rows.append((table, row, published or NOT_MADE, ours or NOT_MADE, remark))
         print("| " + " | ".join(self.rows[-1]) + " |", flush=True)
+
+    def show(self, path: Path, what: str) -> None:
+        """Takes a picture, which lies in the folder of the results."""
+        self.pictures.append((path.name, what))
+        print(path, flush=True)
 
     def write(self, out: Path) -> None:
         """Keeps the rows as `out`/NAME.json, whole or not at all."""
@@ -48,7 +57,9 @@ class Paper:
         """The section of the page."""
         lines = ["| table | row | published | ours | remark |", "| --- | --- | --- | --- | --- |"]
         lines += ["| " + " | ".join(row) + " |" for row in self.rows]
-        return f"### {self.title}\n\n`{self.name}.py`. {self.conditions}\n\n" + "\n".join(lines) + "\n"
+        shown = [f"\n![{what}](papers/{name})\n\n*{what}*\n" for name, what in self.pictures]
+        head = f"### {self.title}\n\n`{self.script or self.name}.py`. {self.conditions}\n\n"
+        return head + "\n".join(lines) + "\n" + "".join(shown)
 
 
 def options(text: str | None) -> argparse.ArgumentParser:

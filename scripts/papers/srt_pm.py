@@ -124,7 +124,8 @@ def add_adaptive(paper: Paper, made: Path, out: Path, size: float, scans: int, s
             series.append(Series(f"R' {radius}", thousands, logs, "dots", color))
         plots.append(Plot(name, name, "thousand points of the map", "log10 of the RMSE in mm", series))
     make_folder(out)
-    write_sheet(out / "srt_pm_radius", plots)
+    for file in write_sheet(out / "srt_pm_radius", plots)[:1]:
+        paper.show(file, "RMSE over points of the map, a dot for each world")
 
 
 def add_changed(paper: Paper, made: Path, size: float, scans: int, seeds: int, quick: bool) -> None:
