@@ -18,6 +18,10 @@ from ggslam.errors import ConfigError
 from ggslam.objects.model_files import find_pair, open_segmenter
 from ggslam.objects.onnx_segmenter import OnnxSegmenterSettings
 from ggslam.objects.sam_segmenter import SamSegmenter, SamTuning
+from ggslam.scene.camera import Camera
+from ggslam.scene.frame import Frame
+from ggslam.slam.config import load_config
+from ggslam.slam.slam import Slam
 from ggslam.system.tuning import overridden
 
 SIZE, GRID, PATCH = 1024, 256, 4
@@ -167,15 +171,22 @@ def export(path: Path, net: torch.nn.Module, inputs: dict[str, torch.Tensor], ou
     return path
 
 
-def export_meta(path: Path, low_res: bool = True, others: int = 1) -> Path:
-    inputs = {
+def meta_inputs() -> dict[str, torch.Tensor]:
+    """What Meta's decoder is exported with."""
+    return {
         "image_embeddings": torch.rand(1, 256, 64, 64), "point_coords": 1000 * torch.rand(1, 5, 2),
         "point_labels": torch.ones(1, 5), "mask_input": torch.zeros(1, 1, 256, 256), "has_mask_input": torch.ones(1),
         "orig_im_size": torch.tensor([1500.0, 2250.0]),
     }  # fmt: skip
-    axes = {"point_coords": {1: "num_points"}, "point_labels": {1: "num_points"}}
-    outputs = ["masks", "iou_predictions", "low_res_masks"] if low_res else ["masks", "iou_predictions", "others"]
-    return export(path, MetaDecoder(others), inputs, outputs, axes)
+
+
+META_AXES = {"point_coords": {1: "num_points"}, "point_labels": {1: "num_points"}}
+META_OUTPUTS = ["masks", "iou_predictions", "low_res_masks"]
+
+
+def export_meta(path: Path, low_res: bool = True, others: int = 1) -> Path:
+    outputs = META_OUTPUTS if low_res else [*META_OUTPUTS[:2], "others"]
+    return export(path, MetaDecoder(others), meta_inputs(), outputs, META_AXES)
 
 
 def export_encoder(path: Path, layout: str = "meta") -> Path:
@@ -279,6 +290,24 @@ def test_decoders_without_the_point_that_is_none(tmp_path: Path) -> None:
     export_encoder(tmp_path / "encoder.onnx")
     export_meta(tmp_path / "decoder.onnx", others=0)
     assert not segments(tmp_path, scene()[0]).any()
+
+
+def test_a_run_learns_what_a_pair_finds(tmp_path: Path) -> None:
+    """A picture on a wall, 2 m away."""
+    export_pair(tmp_path, "sam2")
+    color, truth = scene(160, 120)
+    depth = np.full(truth.shape, 2, np.float32)
+    frames = [Frame(i, i, i / 30, color, depth, Camera(160, 120, 150, 150, 79.5, 59.5)) for i in range(8)]
+    slam = Slam(frames[0].camera, load_config(None, [f"masks.model={tmp_path}", "mapping.iterations_per_frame=2"]))
+    for frame in frames:
+        slam.step(frame)
+    result = slam.finish()
+    assert result.objects is not None and result.objects.supervision == "model"
+    ids, places = result.gaussians.object_id.numpy(), result.gaussians.means.numpy()
+    x, y = (np.rint(150 * places[:, i] / places[:, 2] + c).astype(int) for i, c in ((0, 79.5), (1, 59.5)))
+    true = truth[y.clip(0, 119), x.clip(0, 159)]
+    assert len(set(ids.tolist()) - {0}) == 4
+    assert sum(np.bincount(ids[true == i]).max() for i in range(1, 5)) > 0.9 * len(ids)
 
 
 @pytest.mark.parametrize(
