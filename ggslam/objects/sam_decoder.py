@@ -44,10 +44,10 @@ class SamDecoder:
         self._embeddings: dict[str, str] = {}
         for value in session.inputs:
             role = _role(value.name)
+            if value.type not in NUMBER_TYPES or role in roles:
+                raise self._not_understood()
             if role == "embedding":
                 self._embeddings[value.name] = _source(value, session, encoder)
-            elif role in roles or value.type not in NUMBER_TYPES:
-                raise self._not_understood()
             else:
                 roles[role] = value
         self._roles = roles
@@ -83,9 +83,10 @@ class SamDecoder:
         Raises:
             ConfigError: the decoder fails, or gives other shapes.
         """
-        values = {name: embeddings[source] for name, source in self._embeddings.items()}
+        types = {value.name: NUMBER_TYPES[value.type] for value in self._session.inputs}
+        values = {n: embeddings[source].astype(types[n], copy=False) for n, source in self._embeddings.items()}
         for role, value in self._roles.items():
-            values[value.name] = self._value(role, value, points, size).astype(NUMBER_TYPES[value.type])
+            values[value.name] = self._value(role, value, points, size).astype(types[value.name])
         masks, scores = self._session.run(self._outputs, values)
         count = len(points)
         if masks.ndim < 3 or math.prod(masks.shape[:-2]) != scores.size or scores.size % count or not masks.size:

@@ -72,7 +72,7 @@ class MaskSettings(MaskTuning):
 
     def __post_init__(self) -> None:
         if self.source == "model" and not self.model:
-            raise Conflict("model", "expected an ONNX file, because masks.source is model, found none")
+            raise Conflict("model", "expected an ONNX file, or a folder of two: masks.source is model, found none")
 
 
 @savable(not_saved="settings _segment")
