@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from ggslam.errors import ConfigError
+from ggslam.objects.mask_painting import distinct_masks, paint_segments
 
 PROTOTYPE_GREY: Final = 114
 """Grey of the border that the YOLO family is trained with."""
@@ -36,6 +37,11 @@ class Letterbox:
         inner = max(1, round(width * scale)), max(1, round(height * scale))
         corner = ((size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2) if centred else (0, 0)
         return Letterbox(size, inner, corner)
+
+    @staticmethod
+    def stretch(size: tuple[int, int]) -> Letterbox:
+        """The image fills the input, whatever its aspect."""
+        return Letterbox(size, size, (0, 0))
 
     def place(self, color: np.ndarray, border: int) -> np.ndarray:
         """uint8 [h, w, 3] of the input's size with the image uint8 [H, W, 3] in it."""
@@ -90,6 +96,24 @@ class MaskCandidates:
         y = (np.arange(height) + 0.5) * (letterbox.inner[1] / height) + letterbox.corner[1]
         left, top, right, bottom = self.boxes[index]
         return inside & ((y >= top) & (y < bottom))[:, None] & ((x >= left) & (x < right))[None, :]
+
+    def segments(
+        self, letterbox: Letterbox, width: int, height: int, overlap: float, min_area: float, count: int
+    ) -> np.ndarray:
+        """Segments uint16 [height, width] of the image: 1, 2, ... by falling area, smaller ones on top; 0: none.
+
+        Args:
+            letterbox: how the image lies in the model's input.
+            width, height: of the image.
+            overlap: of masks with a larger intersection over union only the one of the best score is used.
+            min_area: least share of the image that a segment has.
+            count: of masks, at most.
+        """
+        kept = distinct_masks(self.coarse(letterbox.size), self.scores, overlap)[:count]
+        if len(kept) == 0:
+            return np.zeros((height, width), np.uint16)
+        masks = [self.mask(index, letterbox, width, height) for index in kept]
+        return paint_segments(masks, min_area * height * width)
 
 
 def best(scores: np.ndarray, threshold: float, count: int) -> np.ndarray:

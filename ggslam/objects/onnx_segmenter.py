@@ -4,19 +4,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from ggslam.errors import ConfigError, MissingDependency
-from ggslam.objects.mask_painting import distinct_masks, paint_segments
+from ggslam.errors import ConfigError
 from ggslam.objects.onnx_outputs import PROTOTYPE_GREY, Letterbox, MaskCandidates, mask_candidates, yolo_candidates
+from ggslam.objects.onnx_sessions import IMAGE_TYPES, OnnxSession, Pixels, image_values
 from ggslam.system.settings import setting, settings_class, tuning_class
-from ggslam.system.untrusted_files import open_untrusted
-
-IMAGENET_MEAN = np.array((0.485, 0.456, 0.406), np.float32)
-IMAGENET_DEVIATION = np.array((0.229, 0.224, 0.225), np.float32)
-_INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
 @tuning_class(frozen=True)
@@ -42,10 +37,10 @@ class OnnxSegmenterSettings(OnnxSegmenterTuning):
     mask_quality: float = setting(0.7, 0, 1)
     """Least predicted intersection over union of a mask (SAM family)."""
     input_size: int = setting(640, 32, 8192, "px")
-    """Width and height of the model's input if the model does not fix them."""
-    pixels: Literal["unit", "imagenet"] = "unit"
+    """Width and height of the model's input if the model does not fix them; a SAM encoder gets 1024."""
+    pixels: Pixels = "auto"
     """Input of a model that takes real numbers. unit: values from 0 to 1; imagenet: those normalised by ImageNet's mean
-    and standard deviation."""
+    and standard deviation; bytes: 0 to 255; auto: as a SAM encoder's export wants it, unit for other models."""
 
 
 class OnnxSegmenter:
@@ -67,7 +62,7 @@ class OnnxSegmenter:
             ConfigError: no such file, no ONNX model, or inputs and outputs that are not understood.
         """
         self.path, self.settings = Path(path), settings or OnnxSegmenterSettings()
-        self._session = _open_session(self.path, self.settings.threads)
+        self._session = OnnxSession(self.path, self.settings.threads)
         self._input = self._find_input()
         self._outputs, self._gives_masks = self._find_outputs()
         height, width = (n if isinstance(n, int) else self.settings.input_size for n in self._input.shape[2:])
@@ -84,29 +79,17 @@ class OnnxSegmenter:
         height, width = color.shape[:2]
         letterbox = Letterbox.fit(width, height, self._size, centred=not self._gives_masks)
         candidates = self._candidates(self._feed(letterbox.place(color, 0 if self._gives_masks else PROTOTYPE_GREY)))
-        kept = distinct_masks(candidates.coarse(self._size), candidates.scores, self.settings.overlap)
-        if len(kept) == 0:
-            return np.zeros((height, width), np.uint16)
-        masks = [candidates.mask(index, letterbox, width, height) for index in kept]
-        return paint_segments(masks, self.settings.min_area * height * width)
+        settings = self.settings
+        return candidates.segments(letterbox, width, height, settings.overlap, settings.min_area, settings.max_masks)
 
     def _feed(self, image: np.ndarray) -> np.ndarray:
         """The tensor [1, 3, h, w] of an image uint8 [h, w, 3], as the model wants it."""
-        dtype = _INPUT_TYPES[self._input.type]
-        if dtype is not np.uint8:
-            image = image.astype(np.float32) / 255
-            if self.settings.pixels == "imagenet":
-                image = (image - IMAGENET_MEAN) / IMAGENET_DEVIATION
-        return np.ascontiguousarray(image.transpose(2, 0, 1)[None], dtype)
+        values = image_values(image, IMAGE_TYPES[self._input.type], self.settings.pixels)
+        return np.ascontiguousarray(values.transpose(2, 0, 1)[None])
 
     def _candidates(self, tensor: np.ndarray) -> MaskCandidates:
         settings = self.settings
-        try:
-            first, second = self._session.run(self._outputs, {self._input.name: tensor})
-        except MemoryError:
-            raise
-        except Exception as error:  # onnxruntime has no common class of errors
-            raise ConfigError(f"{self.path}: the model failed on an input {tensor.shape}: {error}") from None
+        first, second = self._session.run(self._outputs, {self._input.name: tensor})
         try:
             if self._gives_masks:
                 return mask_candidates(first, second, self._size, settings.mask_quality, settings.max_masks)
@@ -115,16 +98,16 @@ class OnnxSegmenter:
             raise ConfigError(f"{self.path}: {error}") from None
 
     def _find_input(self) -> Any:
-        inputs = self._session.get_inputs()
+        inputs = self._session.inputs
         if len(inputs) == 1:
             shape = inputs[0].shape
-            if inputs[0].type in _INPUT_TYPES and len(shape) == 4 and (shape[1] == 3 or isinstance(shape[1], str)):
+            if inputs[0].type in IMAGE_TYPES and len(shape) == 4 and (shape[1] == 3 or isinstance(shape[1], str)):
                 return inputs[0]
         raise self._not_understood()
 
     def _find_outputs(self) -> tuple[list[str], bool]:
         """Names of (masks, scores) and true, or of (detections, prototypes) and false."""
-        outputs = {output.name: output.shape for output in self._session.get_outputs()}
+        outputs = {output.name: output.shape for output in self._session.outputs}
         masks = [name for name, shape in outputs.items() if "mask" in name.lower() and len(shape) in (3, 4)]
         scores = [name for name in outputs if name not in masks and any(w in name.lower() for w in ("score", "iou"))]
         if masks and scores:
@@ -137,32 +120,15 @@ class OnnxSegmenter:
         raise self._not_understood()
 
     def _not_understood(self) -> ConfigError:
-        def text(values: Any) -> str:
-            return ", ".join(f"{value.name} {value.type} {value.shape}" for value in values)
-
+        for half, values, other in (
+            ("encoder", self._session.outputs, "decoder"), ("decoder", self._session.inputs, "encoder"),
+        ):  # fmt: skip
+            if any("embed" in value.name.lower() for value in values):
+                return ConfigError(
+                    f"{self.path}: a SAM {half} alone; expected its {other} beside it, named alike or the only "
+                    f"*{other}*.onnx there; found {self._session}"
+                )
         return ConfigError(
             f"{self.path}: not a segmentation model that is understood. Expected one image [1, 3, H, W] as input, and "
-            "masks with scores, or YOLO-seg detections with prototypes, as outputs; found inputs "
-            f"{text(self._session.get_inputs())}; outputs {text(self._session.get_outputs())}"
+            f"masks with scores, or YOLO-seg detections with prototypes, as outputs; found {self._session}"
         )
-
-
-def _open_session(path: Path, threads: int) -> Any:
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise MissingDependency(
-            f"to segment with {path} the package onnxruntime is needed: `pip install 'ggslam[masks]'` ({error})"
-        ) from None
-    open_untrusted(path, ConfigError).close()
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = 3
-    options.intra_op_num_threads = threads
-    # Threads that wait for work must not take the processors from tracking and mapping.
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except MemoryError:
-        raise
-    except Exception as error:  # onnxruntime has no common class of errors
-        raise ConfigError(f"{path}: cannot be loaded as an ONNX model: {error}") from None

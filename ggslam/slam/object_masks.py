@@ -17,7 +17,8 @@ from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, MapLabels
 from ggslam.objects.association import Associator, MapView
 from ggslam.objects.geometric_segmenter import GeometricSegmenter
-from ggslam.objects.onnx_segmenter import OnnxSegmenter, OnnxSegmenterSettings
+from ggslam.objects.model_files import open_segmenter
+from ggslam.objects.onnx_segmenter import OnnxSegmenterSettings
 from ggslam.objects.same_object import LabelledVoxels, find_counterparts
 from ggslam.objects.segments import boundary_trust, clean_segments
 from ggslam.objects.settings import AssociationSettings, CleaningSettings, GeometricSettings, SameObjectSettings
@@ -56,7 +57,8 @@ class MaskSettings(MaskTuning):
     """auto: the model if `masks.model` is given, else the recording's masks if it has any, else geometry. none: no
     objects."""
     model: str = setting("", basic=True)
-    """ONNX file of a segmentation model (YOLO-seg or SAM family). Needs the extra [masks]."""
+    """ONNX file of a segmentation model (YOLO-seg or SAM family), or the folder of a SAM encoder and its decoder. Needs
+    the extra [masks]."""
     every: int = setting(6, 1, 10**6)
     """Minimum gap, in frames, between two segmented frames."""
     min_views: int = setting(3, 1, 10**6)
@@ -70,7 +72,7 @@ class MaskSettings(MaskTuning):
 
     def __post_init__(self) -> None:
         if self.source == "model" and not self.model:
-            raise Conflict("model", "expected an ONNX file, because masks.source is model, found none")
+            raise Conflict("model", "expected an ONNX file, or a folder of two: masks.source is model, found none")
 
 
 @savable(not_saved="settings _segment")
@@ -95,7 +97,7 @@ class ObjectMasks:
         self._source = _choose(settings, has_masks)
         self._segment: Callable[[Frame], np.ndarray] | None = None
         if self._source == "model":
-            model = OnnxSegmenter(settings.model, settings.onnx)
+            model = open_segmenter(settings.model, settings.onnx)
             self._segment = lambda frame: model.segment(frame.color)
         self._associator = self._make_associator()
         self._segmented = {}  # of each camera the last frame, or instant, that was

@@ -36,7 +36,7 @@ ALLOWED = {
     "ggslam.system.images:decode_image": "the door of pictures: their headers were read",
     "ggslam.sequences.video:_open": "OpenCV takes names only; the door looks first",
     "ggslam.sequences.formats.ros_messages:<import>": "rosbags takes names only; the door looks first",
-    "ggslam.objects.onnx_segmenter:_open_session": "onnxruntime takes names only; the door looks first",
+    "ggslam.objects.onnx_sessions:_open_session": "onnxruntime takes names only; the door looks first",
     "ggslam.formats.gaussian_usd_reading:read_gaussian_usd": "usd-core takes names only; the door looks first",
     "ggslam.slam.color_poses:_decode": "JPEGs that this process made, in memory",
     "ggslam.mapping.between_frames:view": "JPEGs that this process made, in memory",
