@@ -26,7 +26,7 @@ ALLOWED = (
     "config", "set", "start", "stop", "stride", "scale", "format", "depth-scale", "pose-convention", "masks", "camera",
     "intrinsics", "depth-camera", "depth-kind", "depth-delay", "upright", "void-id", "min-confidence", "topic",
     "iterations", "refine", "realtime", "tracker", "device", "map", "loops", "no-loops", "threads", "skip-bad-frames",
-    "no-skip-bad-frames", "check", "no-check", "strict", "checkpoint-every",
+    "no-skip-bad-frames", "check", "no-check", "strict", "energy", "checkpoint-every",
 )  # fmt: skip
 """Options of `ggslam run` that a batch passes on: they say how a run is made. The others choose folders, write files of
 their own (`--log`, `--record`), run code of others (`--loss`), serve pages, or are the batch's own business."""
@@ -92,7 +92,7 @@ class Manifest:
         return name
 
 
-FLAGS = {"upright", "loops", "no-loops", "skip-bad-frames", "no-skip-bad-frames", "check", "no-check", "strict"}
+FLAGS = {"upright", "loops", "no-loops", "skip-bad-frames", "no-skip-bad-frames", "check", "no-check", "strict", "energy"}
 """Those of them that take no value."""
 
 
