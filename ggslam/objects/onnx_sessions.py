@@ -62,10 +62,10 @@ class OnnxSession:
             raise ConfigError(f"{self.path}: the model failed on an input {shapes}: {_one_line(error)}") from None
 
     def __str__(self) -> str:
-        return f"inputs {described(self.inputs)}; outputs {described(self.outputs)}"
+        return f"inputs {words_of(self.inputs)}; outputs {words_of(self.outputs)}"
 
 
-def described(values: Sequence[Any]) -> str:
+def words_of(values: Sequence[Any]) -> str:
     """Name, type and shape of inputs or outputs."""
     return ", ".join(f"{value.name} {value.type} {value.shape}" for value in values)
 

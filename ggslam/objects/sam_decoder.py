@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from ggslam.errors import ConfigError
-from ggslam.objects.onnx_sessions import NUMBER_TYPES, OnnxSession, described
+from ggslam.objects.onnx_sessions import NUMBER_TYPES, OnnxSession, words_of
 
 _MASK_SIDE: Final = 256
 """Width and height of SAM's masks, and of the mask that can be given as a hint, px."""
@@ -162,8 +162,8 @@ def _source(value: Any, decoder: OnnxSession, encoder: OnnxSession) -> str:
     found = [output for output in same or encoder.outputs if _fits(output.shape, value.shape)]
     if len(found) != 1:
         raise ConfigError(
-            f"{decoder.path}: takes {described([value])}, which {encoder.path} does not give; it gives "
-            f"{described(encoder.outputs)}"
+            f"{decoder.path}: takes {words_of([value])}, which {encoder.path} does not give; it gives "
+            f"{words_of(encoder.outputs)}"
         )
     return str(found[0].name)
 

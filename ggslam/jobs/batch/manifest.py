@@ -92,7 +92,9 @@ class Manifest:
         return name
 
 
-FLAGS = {"upright", "loops", "no-loops", "skip-bad-frames", "no-skip-bad-frames", "check", "no-check", "strict", "energy"}
+FLAGS = {
+    "upright", "loops", "no-loops", "skip-bad-frames", "no-skip-bad-frames", "check", "no-check", "strict", "energy",
+}  # fmt: skip
 """Those of them that take no value."""
 
 
