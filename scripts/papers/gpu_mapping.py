@@ -73,7 +73,7 @@ def add_sizes(paper: Paper, folder: Path, size: tuple[int, int], count: int, vox
         both = fusion + update
         late = 100 * float(np.mean(both > PERIOD_MS))
         most = np.percentile(both, 95)
-        field = f", with the distance field {both.mean():.1f}, 95 % {most:.1f}" if update.any() else ""
+        field = f", with the distance field {both.mean():.1f}, 95 % {most:.1f}" if voxel >= FIELD_FROM else ""
         paper.add(
             "fusion", f"{size[0]}x{size[1]}, {100 * voxel:g} cm", "",
             f"{fusion.mean():.1f} ms, 95 % {np.percentile(fusion, 95):.1f}{field}",
