@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 
 _OPTIONS = {
-    "check": "--no-check", "inpainting": "--inpaint",
+    "check": "--no-check", "full": "--full-map", "inpainting": "--inpaint",
     "latency": "--driving", "on_bad_frame": "--skip-bad-frames", "overrides": "--set",
     "recording": "--sequence", "rotation": "--rotate", "slice_height": "--slice", "topics": "--topic",
 }  # fmt: skip

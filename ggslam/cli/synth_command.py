@@ -68,6 +68,8 @@ class LayoutName(str, Enum):
     replica = "replica"
 
 
+WidthOption = Annotated[int | None, typer.Option(help="Image width; default 320.", min=16)]
+HeightOption = Annotated[int | None, typer.Option(help="Image height; default 240.", min=16)]
 LayoutOption = Annotated[
     LayoutName,
     typer.Option(
@@ -126,8 +128,7 @@ def synth(
         int | None,
         typer.Option(help="Number of frames; default: room 60, with movers 120, loop 480, corridors 720.", min=2),
     ] = None,
-    width: Annotated[int, typer.Option(help="Image width.", min=16)] = 320,
-    height: Annotated[int, typer.Option(help="Image height.", min=16)] = 240,
+    width: WidthOption = None, height: HeightOption = None,
     size: SizeOption = None,
     layout: LayoutOption = LayoutName.plain,
     seed: Annotated[int, typer.Option(help="Seed of textures, camera path and noise.", min=0)] = 0,
@@ -161,8 +162,7 @@ def synth(
 
     if frames is None:
         frames = SynthTuning.frames_with_movers if movers is not None else SCENES[scene.value].frames
-    if size is not None:
-        width, height = _size_of(size)
+    width, height = _size_of(size, width, height)
     write = _writer(rig, rig_delay, changes, visit, movers, speed, Shutter(blur, rolling, depth_delay), layout.value)
     cameras = f" by each of {rig}" if rig is not None else ""
     with progress_bar() as bar:
@@ -177,12 +177,16 @@ def synth(
     )
 
 
-def _size_of(text: str) -> tuple[int, int]:
-    """Width and height.
+def _size_of(text: str | None, own_width: int | None, own_height: int | None) -> tuple[int, int]:
+    """Width and height: of a text like 1200x680, or one by one.
 
     Raises:
-        SequenceError: the text is not like 1200x680.
+        SequenceError: it is not like that, or both are given.
     """
+    if text is None:
+        return own_width or 320, own_height or 240
+    if own_width is not None or own_height is not None:
+        raise SequenceError("--size: not with --width or --height")
     width, _, height = text.partition("x")
     if not (width.isascii() and width.isdecimal() and height.isascii() and height.isdecimal()):
         raise SequenceError(f"--size: expected WxH, like 1200x680, found '{text}'")

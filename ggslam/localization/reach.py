@@ -82,7 +82,7 @@ class AdaptiveReach:
 
     def __init__(self, surface: PartialSurface, ranges: Callable[[Any], np.ndarray]) -> None:
         self._surface, self._ranges = surface, ranges
-        self.radius, self.step = surface.map.radius, 0.0
+        self.radius, self.step = max(surface.map.radius, surface.map.settings.spacing), 0.0
         """R', and how far the sensor goes before the map is put together anew, metres; 0: into another cell."""
 
     def adapt(self, item: Any, moved: float) -> None:

@@ -135,8 +135,9 @@ def layout_named(name: str) -> Layout:
 
 
 def depth_units(depth: np.ndarray, scale: float) -> np.ndarray:
-    """Depth [H, W] metres as the numbers that are stored, uint16 [H, W]."""
-    return np.rint(np.minimum(depth * scale, 65535)).astype(np.uint16)
+    """Depth [H, W] metres as the numbers that are stored, uint16 [H, W]; 0, none, where they do not reach."""
+    units = np.rint(depth * scale)
+    return np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
 
 
 def write_image(path: Path, image: np.ndarray) -> None:

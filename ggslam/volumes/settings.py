@@ -27,6 +27,8 @@ class TsdfLimits(Tuning):
 Integrator = Literal["projection", "rays", "hybrid"]
 INTEGRATORS: tuple[Integrator, ...] = ("projection", "rays", "hybrid")
 """In the compiled core's order."""
+MOST_RAYS = 10**6
+"""Largest `least_rays`."""
 
 
 @tuning_class(frozen=True)
@@ -50,7 +52,7 @@ class TsdfTuning:
     """Where voxels near a surface have their depth from. projection: the image, at the voxel's projection; rays: the
     mean of all pixels whose rays pass the voxel; hybrid: that mean of `least_rays` or more, else the projection. Rays
     take several times as long and are nearer to the truth where voxels are larger than pixels and depth is noisy."""
-    least_rays: int = setting(2, 1, 10**6)
+    least_rays: int = setting(2, 1, MOST_RAYS)
     """Fewest rays of which `hybrid` takes the mean."""
 
 
@@ -118,7 +120,7 @@ class TsdfSettings(TsdfTuning):
         """
         values: dict[str, Any] = dict(numbers)
         for name in {"integrator", "least_rays"} & values.keys():
-            if values[name] not in range(10**6 if name == "least_rays" else len(INTEGRATORS)):
+            if values[name] not in range(MOST_RAYS + 1 if name == "least_rays" else len(INTEGRATORS)):
                 raise ValueError(f"{name} {values[name]:g}")
             values[name] = int(values[name])
         if "integrator" in values:

@@ -302,6 +302,7 @@ def test_the_radius_may_follow_what_is_seen(scans: Path, tmp_path: Path) -> None
     found = summary(tmp_path / "auto")
     assert found["located_share"] == 1 and found["rmse_m"] < 0.03
     one_error(ggslam("localize", cloud, scans, "--radius", "far"), "--radius", "or auto", "'far'")
+    one_error(ggslam("localize", cloud, scans, "--radius", "auto", "--full-map"), "--radius", "auto", "--full-map")
 
 
 def test_another_camera_is_located_from_a_start_pose(run: Path, room: Path, tmp_path: Path) -> None:

@@ -161,6 +161,8 @@ def test_a_map_is_continued(of_recording: tuple[Path, str], room: Path, tmp_path
     made(room, "--out", tmp_path / "more", "--stop", 2, "--onto", start)
     assert record(tmp_path / "more")["tsdf"]["blocks"] >= record(of_recording[0])["tsdf"]["blocks"]
     one_error(ggslam("volumes", room, "--out", tmp_path / "x", "--onto", start, "--voxel", 0.02), "--voxel", "--onto")
+    rays = ["--set", "volumes.tsdf.integrator=rays"]
+    one_error(ggslam("volumes", room, "--onto", start, *rays), "volumes.tsdf.integrator", "--onto", "as in the file")
 
 
 def test_what_was_fused_before_a_damaged_frame_is_written(room: Path, tmp_path: Path) -> None:

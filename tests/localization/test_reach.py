@@ -84,6 +84,11 @@ def test_the_map_follows_what_is_seen(hall: tuple[Path, np.ndarray, list[np.ndar
     assert np.sqrt((fixed**2).mean()) > 1.2 * np.sqrt((away**2).mean())
 
 
+def test_a_map_without_a_radius_of_its_own_follows_too(hall: tuple[Path, np.ndarray, list[np.ndarray]]) -> None:
+    away, radii, _ = errors(hall, 0.0, adapts=True)
+    assert away.max() < 0.02 and (radii > 0).all()
+
+
 def test_a_dense_map_reaches_less_far(hall: tuple[Path, np.ndarray, list[np.ndarray]]) -> None:
     _, radii, points = errors(hall, 5.0, adapts=True)
     with overridden(AdaptiveReachTuning, max_points=20_000):

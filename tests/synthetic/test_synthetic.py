@@ -14,6 +14,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.sequences import inspect_sequence, open_sequence
 from ggslam.synthetic import RayCaster, Scene, SceneBuilder, camera_path, furnished_room, lighting
+from ggslam.synthetic.layouts import LAYOUTS, depth_units
 from ggslam.synthetic.materials import MaterialMaker
 from ggslam.synthetic.scene import FACES, Kind, Shape
 from ggslam.synthetic.sensor import noisy_depth
@@ -295,3 +296,10 @@ def test_replicas_layout_is_replaced_only_where_it_was_generated(tmp_path: Path)
         write_synthetic_sequence(folder, frames=2, layout="replica", overwrite=True)
     with pytest.raises(SequenceError, match="layout: expected one of plain, replica, found 'tum'"):
         write_synthetic_sequence(tmp_path / "other", layout="tum")
+
+
+def test_depth_that_the_numbers_do_not_reach_is_none() -> None:
+    for layout in LAYOUTS.values():
+        most = 65535 / layout.depth_scale
+        units = depth_units(np.array([0.0, 1.0, most, most + 0.01, 1e6], np.float32), layout.depth_scale)
+        assert units.tolist() == [0, round(layout.depth_scale), 65535, 0, 0]

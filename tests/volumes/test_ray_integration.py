@@ -14,7 +14,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 from ggslam.volumes.raycast import render_depth as render_map
-from ggslam.volumes.settings import INTEGRATORS, Integrator, TsdfSettings
+from ggslam.volumes.settings import INTEGRATORS, MOST_RAYS, Integrator, TsdfSettings
 from ggslam.volumes.tsdf import FREE_VALUE, TsdfMap
 from ggslam.volumes.tsdf_file import load_tsdf, save_tsdf
 from ggslam.volumes.tsdf_torch import TorchTsdf
@@ -143,5 +143,7 @@ def test_files_keep_the_integrator_and_those_without_one_are_as_they_were(tmp_pa
         assert kept == (TsdfSettings(voxel=VOXEL) if kind == "projection" else settings)
         with np.load(tmp_path / "tsdf.npz") as arrays:
             assert ("integrator" in arrays["setting_names"]) == (kind != "projection")
+    most = TsdfSettings(integrator="hybrid", least_rays=MOST_RAYS)
+    assert TsdfSettings.of_numbers(most.numbers()) == most
     with pytest.raises(ValueError, match="integrator 3"):
         TsdfSettings.of_numbers({**TsdfSettings(integrator="rays").numbers(), "integrator": 3.0})

@@ -132,6 +132,8 @@ def localize(request: LocalizeRequest, observer: Observer) -> LocalizationReport
         context = NativeContext(request.threads)
         submaps = replace(store.settings, **chosen.submaps)
         radius = None if request.radius is None else parse_radius(request.radius)
+        if radius == AUTO and request.full:
+            raise ConfigError("`radius` auto: not with `full`, which takes the whole map")
         submaps = submaps if radius is None or radius == AUTO else replace(submaps, partial_radius=radius)
         own = SCAN_TARGET if scans is not None else chosen.settings.tracking.target
         target = _target(request, submaps, own, point_spacing(store) if scans is not None else 0.0)

@@ -188,6 +188,9 @@ def _write(
 
 def _config(request: VolumesRequest) -> Config:
     config = load_config(request.config, request.overrides)
+    fused_as = [text.partition("=")[0] for text in request.overrides if text.startswith("volumes.tsdf.")]
+    if request.onto is not None and fused_as:
+        raise ConfigError(f"{fused_as[0]}: with `onto` depth is fused as in the file")
     if request.voxel is None:
         return config
     if request.onto is not None:
