@@ -236,9 +236,11 @@ def _encode_store(
 
 def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> None:
     """A run in a container."""
+    from ggslam.jobs.encode.stream_output import check_stream_output
     from ggslam.runs.folder import RunFolder
     from ggslam.runs.map_container import write_container
 
+    check_stream_output(out, [source])
     done = write_container(RunFolder.open(source), out, rate.value, settings)
     total = out.stat().st_size
     rows = [[name, str(size), f"{size / max(1, done.gaussians):.1f}"] for name, size in done.sizes.items()]
