@@ -43,7 +43,7 @@ class GridPoints:
         load_library().ggslam_gpcc_on_grid(chosen, self._grid, out.ctypes.data)
         return out
 
-    def unrounded(self, positions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+    def places(self, positions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Where points lie before they are rounded to their grid positions [M, 3], voxels float64 [M, 3]; those that
         were moved into the box lie at their positions."""
         if self._exact:

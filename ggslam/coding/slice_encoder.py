@@ -61,7 +61,7 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
     origin = np.array([grid[:, axis].min() for axis in range(3)], np.int32)
     geometry, quantiser = cloud.geometry, PositionQuantiser(settings.geometry_qp)
     if quantiser.qp:
-        grid = quantiser.steps(seen.unrounded(grid, rows) - origin)
+        grid = quantiser.steps(seen.places(grid, rows) - origin)
     else:
         for axis in range(3):
             grid[:, axis] -= origin[axis]

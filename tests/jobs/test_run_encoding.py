@@ -101,7 +101,10 @@ def test_a_resumed_run_gives_the_same_stream(room: Path, whole: Path, tmp_path: 
     asked = EncodeRequest(tmp_path / "points.bin", SLICED)
     with pytest.raises(Killed):
         execute(request(room, tmp_path / "run", asked, evaluate="stage" in moment), Observer(**moment))
-    asked.out.unlink(missing_ok=True)
+    if asked.out.exists():
+        with pytest.raises(ConfigError, match="remove it or choose another name"):
+            resume(tmp_path / "run", encode=asked, evaluate=False)
+        asked.out.unlink()
     assert resume(tmp_path / "run", encode=asked, evaluate=False).encode_failure is None
     assert asked.out.read_bytes() == whole.with_suffix(".bin").read_bytes()
 

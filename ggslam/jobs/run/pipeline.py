@@ -247,7 +247,7 @@ class _Run:
         self._look_at(outcome)
         if error is None and outcome.failure is None:
             checkpoints.remove()
-        with self._coding(outcome, complete=True):
+        with self._code_within(outcome, complete=True):
             return outcome
 
     def _make_checkpointing(self, checkpoints: Checkpoints, resumption: Resumption | None) -> Checkpointing | None:
@@ -313,7 +313,7 @@ class _Run:
             return None
 
     @contextmanager
-    def _coding(self, outcome: RunOutcome, complete: bool) -> Iterator[bool]:
+    def _code_within(self, outcome: RunOutcome, complete: bool) -> Iterator[bool]:
         """The run is coded while the block runs, and waited for: of streams if it is not complete yet, of containers if
         it is. Yields whether that is so."""
         request, reason = self.request.encode, outcome.error or outcome.failure
@@ -341,7 +341,7 @@ class _Run:
     def _look_at(self, outcome: RunOutcome) -> None:
         """Scores, verdict and report; of a run that could not be saved as it should be the verdict alone."""
         kept = None
-        with self._coding(outcome, complete=False) as beside:
+        with self._code_within(outcome, complete=False) as beside:
             if outcome.failure is None:
                 kept = self._score(outcome, "scoring and coding" if beside else "scoring")
         outcome.verdict = self._or_note(lambda: self._verdict(outcome))
