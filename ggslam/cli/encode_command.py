@@ -193,6 +193,8 @@ def run_encoding(context: typer.Context, out: Path, words: Sequence[str]) -> Enc
     from ggslam.runs.map_container import is_container
 
     parted = [word.partition("=") for word in words]
+    if any(name in ("", "help") for name, _, _ in parted):
+        raise ConfigError("--encode-with: expected an option of `ggslam encode` that says how to code, as qp=28")
     typed = [part for name, sign, value in parted for part in (f"--{name}", *([value] if sign else []))]
     group = context.parent
     command = None if group is None else group.command.get_command(group, "encode")  # type: ignore[attr-defined]
@@ -234,9 +236,11 @@ def _encode_store(
 
 def _contain(source: Path, out: Path, settings: CodecSettings, rate: Rate) -> None:
     """A run in a container."""
+    from ggslam.jobs.encode.stream_output import check_stream_output
     from ggslam.runs.folder import RunFolder
     from ggslam.runs.map_container import write_container
 
+    check_stream_output(out, [source])
     done = write_container(RunFolder.open(source), out, rate.value, settings)
     total = out.stat().st_size
     rows = [[name, str(size), f"{size / max(1, done.gaussians):.1f}"] for name, size in done.sizes.items()]
@@ -267,7 +271,7 @@ def _refuse_ignored(context: typer.Context, preset: Preset, sweep: Sweep | None,
     if of_store and "threads" in given:
         raise ConfigError("--threads is not for grid stores: their cells are coded by --workers")
     if preset is Preset.splat:
-        for name in ("qp", "chroma_offset", "bits", "sweep"):
+        for name in ("qp", "chroma_offset", "bits", "geometry_qp", "sweep"):
             if name in given:
                 option = name.replace("_", "-")
                 raise ConfigError(f"--{option} goes with --preset pointcloud; the quality of --preset splat is --rate")

@@ -143,8 +143,8 @@ CheckpointEvery = Annotated[
 EncodeTo = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Also code the run, as `ggslam encode RUN FILE` does afterwards, byte for byte. "
-                 "Slices are coded beside scoring, for no point is final before the last refinement ends. With "
-                 "--resume name it again."),
+                 "Slices are coded beside scoring, for no point is final before the last refinement ends; a .ggz, "
+                 "which holds the run's records, at the end. With --resume name it again."),
 ]
 EncodeWith = Annotated[
     list[str] | None,
@@ -156,7 +156,9 @@ Strict = Annotated[
 Energy = Annotated[
     bool, typer.Option("--energy", help="Tell the joules that each part uses; without sensors, processor seconds.")
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in the output folder.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace a finished run in the output folder, and the file of --encode.")
+]
 
 
 def run(

@@ -31,7 +31,7 @@ class GridPoints:
             points = points.astype(np.int64 if np.issubdtype(points.dtype, np.integer) else np.float64)
         self._points = np.ascontiguousarray(points)
         self._grid = Grid(scale, rounding, origin, tuple(o + s - 1 for o, s in zip(origin, size, strict=True)), exact)
-        self.size = size
+        self._scale, self._origin, self._exact, self.size = scale, origin, exact, size
 
     def __len__(self) -> int:
         return len(self._points)
@@ -42,6 +42,15 @@ class GridPoints:
         out = np.empty((chosen.count, 3), np.int32)
         load_library().ggslam_gpcc_on_grid(chosen, self._grid, out.ctypes.data)
         return out
+
+    def places(self, positions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Where points lie before they are rounded to their grid positions [M, 3], voxels float64 [M, 3]; those that
+        were moved into the box lie at their positions."""
+        if self._exact:
+            return positions.astype(np.float64)
+        points = self._points if rows is None else self._points[rows]
+        exact = points.astype(np.float64) * self._scale - np.array(self._origin, np.float64)
+        return np.where(np.abs(exact - positions) < 0.51, exact, positions)
 
     def coordinates(self, axis: int, rows: np.ndarray | None = None) -> np.ndarray:
         """Grid coordinates int32 [M] along an axis."""

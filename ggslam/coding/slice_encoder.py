@@ -56,11 +56,15 @@ def encode_slice(cloud: CloudToCode, number: int) -> CodedSlice:
     start = time.perf_counter()
     settings = cloud.settings
     rows = None if cloud.slice_numbers is None else np.flatnonzero(cloud.slice_numbers == number)
-    grid = cloud.quantization.of(cloud.points).positions(rows)
+    seen = cloud.quantization.of(cloud.points)
+    grid = seen.positions(rows)
     origin = np.array([grid[:, axis].min() for axis in range(3)], np.int32)
-    for axis in range(3):
-        grid[:, axis] -= origin[axis]
     geometry, quantiser = cloud.geometry, PositionQuantiser(settings.geometry_qp)
+    if quantiser.qp:
+        grid = quantiser.steps(seen.places(grid, rows) - origin)
+    else:
+        for axis in range(3):
+            grid[:, axis] -= origin[axis]
     sides = tree_sides(geometry, quantiser.bits([int(grid[:, axis].max()) for axis in range(3)]))
     axes, grid = levels_of(geometry, sides), quantiser.restore(grid, sides)
     header = GeometryHeader(number, (int(origin[0]), int(origin[1]), int(origin[2])), axes, len(grid))

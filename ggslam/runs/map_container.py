@@ -70,13 +70,13 @@ from ggslam.system.untrusted_files import read_untrusted
 from ggslam.system.zip_files import ZIP_DAMAGE, open_zip
 
 SUFFIX = ".ggz"
-_HEAD, MAP, _PLACES, _XZ = "container.json", "map.bin", "places.bin", ".xz"
+HEAD, MAP, _PLACES, _XZ = "container.json", "map.bin", "places.bin", ".xz"
 _CLASSIFIER, TABLE = "classifier.npz", "objects.json"
 _NEEDED = (
     RunRecord.FILE, KeyframesRecord.FILE, "trajectory.txt", "config.yaml", SequenceRecord.FILE, TimingRecord.FILE,
 )  # fmt: skip
 _PERHAPS = (LoopsRecord.FILE, TRUTH_FILE, *MOVER_FILES, TABLE, _CLASSIFIER)
-_MEMBERS = frozenset((_HEAD, MAP, _PLACES, PLACES_FILE, *_NEEDED, *_PERHAPS))
+_MEMBERS = frozenset((HEAD, MAP, _PLACES, PLACES_FILE, *_NEEDED, *_PERHAPS))
 _MOST_KEYFRAMES: Final = (1 << 16) - 2
 """Largest number of a keyframe: 16 bits hold it plus 1."""
 
@@ -142,7 +142,7 @@ def write_container(folder: RunFolder, out: Path, rate: str, settings: CodecSett
             files={n: FileRecord(bytes=len(b), sha256=hashlib.sha256(b).hexdigest()) for n, b in members.items()},
         )  # fmt: skip
         with atomic_write(out) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-            for member, content in {_HEAD: head.model_dump_json(indent=1).encode(), **members}.items():
+            for member, content in {HEAD: head.model_dump_json(indent=1).encode(), **members}.items():
                 archive.writestr(zipfile.ZipInfo(member), content)
     sizes = {n: len(b) for n, b in members.items()}
     plain = sum((folder.path / n).stat().st_size for n in (*names, PLACES_FILE, "map.ply"))
@@ -265,11 +265,11 @@ def open_container(path: Path) -> Container:
     except ZIP_DAMAGE as error:
         raise FormatError(f"{path}: no whole container of a map: {error}") from None
     sizes = {name: len(content) for name, content in members.items()}
-    head = _head(path, members.pop(_HEAD, b""))
+    head = _head(path, members.pop(HEAD, b""))
     for name, content in members.items():
         told = head.files.get(name)
         if told is None or told.sha256 != hashlib.sha256(content).hexdigest():
-            raise FormatError(f"{path}: {name} is damaged: its checksum is not that in {_HEAD}")
+            raise FormatError(f"{path}: {name} is damaged: its checksum is not that in {HEAD}")
     left = max(ArrayLimits.max_bytes, ArrayLimits.max_ratio * sum(sizes.values()))
     expanded = dict[str, bytes]()
     for member, content in members.items():
@@ -307,7 +307,7 @@ def _head(path: Path, content: bytes) -> ContainerRecord:
     try:
         head = ContainerRecord.parse(content)
     except ValueError as error:
-        raise FormatError(f"{path}: {_HEAD}: not the head of a map's container: {error}") from None
+        raise FormatError(f"{path}: {HEAD}: not the head of a map's container: {error}") from None
     if head.version > CONTAINER_VERSION:
         known = f"this ggslam reads up to {CONTAINER_VERSION}: use a newer one"
         raise FormatError(f"{path}: is of version {head.version}; {known}")

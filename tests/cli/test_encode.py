@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from ggslam.formats.point_cloud import read_point_cloud, write_point_cloud
 from ggslam.formats.point_ply import read_points, write_points
 from ggslam.formats.point_sampling import VoxelCloud
 from ggslam.jobs.encode.coding import study_cloud
+from ggslam.runs.folder import RunFolder
 from ggslam.scene.gaussian_map import GaussianMap
 
 Ggslam = Callable[..., tuple[int, str, str]]
@@ -211,6 +213,28 @@ def test_outputs_that_make_no_sense_are_refused(ggslam: Ggslam, tmp_path: Path) 
     assert points.read_bytes() == before
 
 
+def test_only_coded_files_are_replaced(ggslam: Ggslam, room_run: RunFolder, tmp_path: Path) -> None:
+    write_points(tmp_path, voxel_cloud())
+    points, run = tmp_path / "points.ply", tmp_path / "run"
+    shutil.copytree(room_run.path, run)
+    (tmp_path / "mine.bin").write_bytes(b"mine")
+    before = {path: path.read_bytes() for path in (*run.iterdir(), *tmp_path.iterdir()) if path.is_file()}
+    for out, more, reason in (
+        (run / "points.ply", (), "input itself"), (run / "map.ply", (), "folder of a run"),
+        (run / "new.ggz", (), "folder of a run"),
+        (tmp_path / "mine.bin", (), "no coded file of this kind"), (points, ("--preset", "splat"), "no coded file"),
+        (Path("/dev/null"), (), "no coded file"), (Path("/proc/x.bin"), (), "cannot be written"),
+    ):  # fmt: skip
+        code, _, err = ggslam("encode", run, out, *more)
+        assert code == 2 and reason in err, (out, err)
+    assert all(path.read_bytes() == held for path, held in before.items())
+    for name in ("a.bin", "a.ggz"):
+        for _ in range(2):
+            assert ggslam("encode", run, tmp_path / name)[0] == 0
+    code, _, err = ggslam("encode", run, tmp_path / "a.bin", "--preset", "splat")
+    assert code == 0, err
+
+
 def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
     write_points(tmp_path, voxel_cloud())
     points, stream = tmp_path / "points.ply", tmp_path / "a.bin"
@@ -227,6 +251,9 @@ def test_mistakes_are_named(ggslam: Ggslam, tmp_path: Path) -> None:
         (("encode", points, tmp_path / "b.bin", "--sweep", "qp", "--preset", "splat"), "--sweep"),
         (("encode", points, tmp_path / "b.bin", "--qp", "22", "--preset", "splat"), "--qp goes with"),
         (("encode", points, tmp_path / "b.bin", "--rate", "r01"), "--rate goes with"),
+        (("encode", points, tmp_path / "b.bin", "--geometry-qp", 8, "--preset", "splat"), "--geometry-qp goes with"),
+        (("encode", points, tmp_path / "b.ggz", "--geometry-qp", 8), "--geometry-qp goes with"),
+        (("encode", points, tmp_path / "b.ggc", "--geometry-qp", 8), "--geometry-qp goes with"),
         (("encode", points, tmp_path / "b.bin", "--sweep", "both", "--geometry-scale", "0.5"), "--sweep varies"),
         (("encode", points, tmp_path / "b.bin", "--no-plots"), "--plots goes with"),
         (("encode", plain, tmp_path / "study", "--sweep", "qp", "--no-plots"), "no colours"),

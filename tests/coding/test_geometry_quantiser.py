@@ -5,6 +5,7 @@ streams with a quantiser a node."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +24,21 @@ Surface = tuple[np.ndarray, np.ndarray]
 QPS = (1, 3, 7, 8, 11, 16, 21, 24, 40, 60)
 
 
-def nearest_steps(points: np.ndarray, qp: int) -> np.ndarray:
-    """Multiples of the step, counted from the lowest corner, rounded to voxels: in floating point."""
-    step = 2.0 ** (qp // 8) * (1 + qp % 8 / 8)
-    corner = points.min(0)
-    return np.floor(np.floor((points - corner) / step + 0.5) * step + 0.5).astype(int) + corner
+def decoded_places(points: np.ndarray, settings: CodecSettings) -> np.ndarray:
+    """Where each point is after decoding."""
+    numbers = np.arange(len(points))
+    data = encode_cloud(points, {"object_id": numbers}, replace(settings, duplicates="keep")).data
+    cloud = decode_cloud(data)
+    return cloud.points[np.argsort(cloud.attributes["object_id"])]
+
+
+def least_distances(points: np.ndarray, qp: int) -> np.ndarray:
+    """Along each axis, from whole points to the nearest multiple of the step (counted from the lowest corner), rounded
+    to voxels: in floating point, among all of them."""
+    step, own = 2.0 ** (qp // 8) * (1 + qp % 8 / 8), points - points.min(0)
+    places = np.floor(np.arange(own.max() // step + 3) * step + 0.5)
+    nearest = np.abs(np.arange(own.max() + 1)[:, None] - places).min(1)
+    return nearest[own]
 
 
 @pytest.mark.parametrize("planes", [False, True])
@@ -37,18 +48,45 @@ def test_positions_become_the_nearest_steps(surface: Surface, qp: int, planes: b
     points = points + np.array([1000, 3, 77], np.int32)
     quantiser = PositionQuantiser(qp)
     cloud = decode_cloud(encode_cloud(points, {"color": colors}, CodecSettings(geometry_qp=qp, planes=planes)).data)
-    expected = nearest_steps(points, qp)
-    assert np.abs(expected - points).max() <= quantiser.reach == np.ceil(quantiser.step / 2)
-    assert np.array_equal(np.unique(cloud.points, axis=0), np.unique(expected, axis=0))
+    places = decoded_places(points, CodecSettings(geometry_qp=qp, planes=planes))
+    assert np.array_equal(np.abs(places - points), least_distances(points, qp))
+    assert np.abs(places - points).max() <= quantiser.reach == np.ceil(quantiser.step / 2)
+    assert np.array_equal(np.unique(cloud.points, axis=0), np.unique(places, axis=0))
     assert len(np.unique(cloud.points, axis=0)) == len(cloud)  # points that fell together are one
 
 
 @pytest.mark.parametrize("high", [126, 127, 128, 255, 256])
 def test_no_point_is_rounded_down_at_the_end_of_the_tree(high: int) -> None:
     points = np.array([[0, 0, 0], [high, 0, 0]])
-    cloud = decode_cloud(encode_cloud(points, {}, CodecSettings(geometry_qp=21)).data)
-    assert cloud.points[:, 0].tolist() == nearest_steps(points, 21)[:, 0].tolist()
-    assert abs(cloud.points[1, 0] - high) <= PositionQuantiser(21).step / 2
+    places = decoded_places(points, CodecSettings(geometry_qp=21))
+    assert np.array_equal(np.abs(places - points), least_distances(points, 21))
+    assert abs(places[1, 0] - high) <= PositionQuantiser(21).step / 2
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("qp", [1, 4, 8, 12, 16, 20, 24])
+def test_the_cloud_is_not_shifted(qp: int, whole: bool) -> None:
+    """And a point moves no farther than on a grid that is coarser by the same step."""
+    points = np.random.default_rng(0).random((20_000, 3)) * 3
+    voxel = 1.0 if whole else 0.01
+    if whole:
+        points = np.rint(points / 0.01).astype(np.int32)
+    fine = CodecSettings(voxel_size=voxel, geometry_qp=qp)
+    coarse = CodecSettings(voxel_size=voxel, geometry_scale=1 / PositionQuantiser(qp).step)
+    moved, on_coarse = ((decoded_places(points, settings) - points) / voxel for settings in (fine, coarse))
+    assert np.abs(moved.mean(0)).max() < 0.1
+    if qp % 8 == 0:  # else decoded points are rounded to voxels once more
+        assert np.linalg.norm(moved, axis=1).mean() < 1.001 * np.linalg.norm(on_coarse, axis=1).mean()
+
+
+def test_points_of_a_plane_stay_in_a_plane() -> None:
+    """Also where they are no whole voxels, but for rounding errors."""
+    points = np.random.default_rng(0).random((3000, 3)).astype(np.float32)
+    for height in range(9):
+        points[:, 2] = np.float32(height * 0.01) + np.random.default_rng(1).uniform(-1e-6, 1e-6, 3000)
+        points[0] = 0
+        places = decoded_places(points, CodecSettings(voxel_size=0.01, geometry_qp=8))
+        assert len(np.unique(np.rint(places[1:, 2] * 100))) == 1
 
 
 def test_quantiser_0_is_without_loss(surface: Surface) -> None:

@@ -65,12 +65,14 @@ def test_sweeps_move_the_right_way(cloud: GridCloud) -> None:
 
 
 def test_the_quantiser_of_positions_is_swept_beside_the_scale(cloud: GridCloud) -> None:
-    """Doubling the step halves the grid: the same points, as far off, in about as many bytes."""
+    """Doubling the step halves the grid: points as far off, in about as many bytes; but those half-way between two
+    steps go up or down by turns, while the scale rounds them up."""
     steps = sweep_steps(["geometry", "geometry_qp"], scales=[0.25, 0.5], geometry_qps=[16, 8, 3, 0])
     assert [step.words() for step in steps][1:3] == ["scale 0.5", "geometry QP 16"]
     rows = [row for row, _ in run_sweep(cloud, steps, CodecSettings(threads=1), EnergyMeter())]
     for scaled, quantised in ((rows[0], rows[2]), (rows[1], rows[3])):
-        assert scaled.decoded_points == quantised.decoded_points and scaled.d1 == pytest.approx(quantised.d1)
+        assert scaled.d1 == pytest.approx(quantised.d1)
+        assert scaled.decoded_points == pytest.approx(quantised.decoded_points, rel=0.08)
         assert abs(scaled.geometry_bytes - quantised.geometry_bytes) < 16
     sizes, errors = ([getattr(row, name) for row in rows[2:]] for name in ("geometry_bytes", "d1"))
     assert sizes == sorted(sizes) and errors == sorted(errors) and errors[-1] == np.inf > errors[-2]

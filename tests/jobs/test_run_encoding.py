@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from ggslam.jobs.run import encoding
 from ggslam.jobs.run.encoding import EncodeRequest
 from ggslam.jobs.run.pipeline import RunRequest, execute, resume
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.map_container import open_container
+from ggslam.runs.map_container import open_container, read_container, write_container
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.runs.verification import verify_run
 from ggslam.slam.result import StepReport
@@ -99,7 +101,10 @@ def test_a_resumed_run_gives_the_same_stream(room: Path, whole: Path, tmp_path: 
     asked = EncodeRequest(tmp_path / "points.bin", SLICED)
     with pytest.raises(Killed):
         execute(request(room, tmp_path / "run", asked, evaluate="stage" in moment), Observer(**moment))
-    asked.out.unlink(missing_ok=True)
+    if asked.out.exists():
+        with pytest.raises(ConfigError, match="remove it or choose another name"):
+            resume(tmp_path / "run", encode=asked, evaluate=False)
+        asked.out.unlink()
     assert resume(tmp_path / "run", encode=asked, evaluate=False).encode_failure is None
     assert asked.out.read_bytes() == whole.with_suffix(".bin").read_bytes()
 
@@ -138,6 +143,62 @@ def test_what_cannot_be_is_said_before_the_run(room: Path, tmp_path: Path) -> No
     assert not run.exists()
 
 
+def test_nothing_but_a_stream_is_replaced(room: Path, whole: Path, tmp_path: Path) -> None:
+    """And it is said before the run; the folders of a recording and of runs stay as they are."""
+    copy, stream = tmp_path / "room", tmp_path / "old.bin"
+    shutil.copytree(room, copy)
+    for name, content in (("notes.bin", b"mine"), ("cloud.ggz", b"PK"), ("zeros.bin", bytes(99))):
+        (tmp_path / name).write_bytes(content)
+    stream.write_bytes(whole.with_suffix(".bin").read_bytes())
+    (tmp_path / "old.ggz").write_bytes(stream.read_bytes())
+    (tmp_path / "link.bin").symlink_to(whole / "map.ply")
+    poses = next(path for path in copy.iterdir() if path.is_file())
+    before = {path: path.read_bytes() for path in [*tmp_path.iterdir(), *copy.rglob("*"), *whole.iterdir()]
+              if path.is_file()}  # fmt: skip
+    for out, words in (
+        (poses, "folder of a run or recording"), (copy / "a.bin", "folder of a run or recording"),
+        (whole / "map.ply", "folder of a run or recording"), (whole / "new.bin", "folder of a run or recording"),
+        (whole / "b" / "new.bin", "folder of a run or recording"),
+        (tmp_path / "notes.bin", "no coded file"), (tmp_path / "cloud.ggz", "no coded file"),
+        (tmp_path / "zeros.bin", "no coded file"), (tmp_path / "old.ggz", "no coded file"),
+        (tmp_path / "link.bin", "folder of a run or recording"), (Path("/dev/null"), "no coded file"),
+        (stream, "use `overwrite`"), (tmp_path / "notes.bin" / "a.bin", "is no folder"),
+        (tmp_path / f"{300 * 'a'}.bin", "too long"),
+    ):  # fmt: skip
+        overwrite = out != stream
+        with pytest.raises(ConfigError, match=words):
+            execute(request(copy, tmp_path / "run", EncodeRequest(out), map=whole, overwrite=overwrite))
+    with pytest.raises(RunFolderError, match="cannot be written to"):
+        execute(request(copy, tmp_path / "run", EncodeRequest(Path("/proc/x.bin"))))
+    assert not (tmp_path / "run").exists() and all(path.read_bytes() == held for path, held in before.items())
+    outcome = execute(request(room, tmp_path / "run", EncodeRequest(stream), overwrite=True, checkpoint_every=0))
+    assert outcome.encoded and stream.read_bytes() != before[stream]
+
+
+@pytest.mark.parametrize("evaluate", [False, True])
+def test_a_container_is_that_of_the_complete_run(room: Path, tmp_path: Path, evaluate: bool) -> None:
+    asked = request(room, tmp_path / "run", EncodeRequest(tmp_path / "a.ggz"), evaluate=evaluate, energy=True)
+    assert execute(asked).encode_failure is None
+    write_container(RunFolder.open(tmp_path / "run"), tmp_path / "b.ggz", "r03", CodecSettings())
+    assert (tmp_path / "a.ggz").read_bytes() == (tmp_path / "b.ggz").read_bytes()
+    mark = json.loads(open_container(tmp_path / "a.ggz").members["run.json"])
+    assert mark["complete"] and not mark["missing"]
+    read_container(tmp_path / "a.ggz", tmp_path / "back")
+    assert verify_run(tmp_path / "back").good
+
+
+def test_what_coding_used_is_told(room: Path, tmp_path: Path) -> None:
+    """Beside scoring it is one part with that; alone it has its own."""
+    asked = EncodeRequest(tmp_path / "a.bin")
+    outcome = execute(request(room, tmp_path / "run", asked, evaluate=True, energy=True))
+    assert outcome.energy is not None and {"scoring and coding", "coding"} <= set(outcome.energy.parts)
+    assert "scoring" not in outcome.energy.parts
+    alone = execute(request(room, tmp_path / "alone", EncodeRequest(tmp_path / "b.bin"), energy=True))
+    assert alone.energy is not None and alone.energy.parts["coding"].cpu_s > 0
+    assert not any("scoring" in name for name in alone.energy.parts)
+    assert alone.folder.timing().energy == alone.energy and verify_run(tmp_path / "alone").good
+
+
 def test_the_command(room: Path, tmp_path: Path) -> None:
     run, few = tmp_path / "run", [word for value in FEW for word in ("--set", value)]
     words = ["run", str(room), "--stop", "3", "--no-eval", "--out", str(run), *few]
@@ -147,6 +208,9 @@ def test_the_command(room: Path, tmp_path: Path) -> None:
         (["--encode", str(tmp_path / "a.bin"), "--encode-with", "sweep=qp"], "--sweep writes a study"),
         (["--encode", str(tmp_path / "a.bin"), "--encode-with", "rate=r01"], "--rate goes with --preset splat"),
         (["--encode", str(tmp_path / "a.bin"), "--encode-with", "qp=200"], "4 to 51, found '200'"),
+        (["--encode", str(tmp_path / "a.bin"), "--encode-with", "help"], "--encode-with: expected an option"),
+        (["--encode", str(tmp_path / "a.bin"), "--encode-with", ""], "--encode-with: expected an option"),
+        (["--encode", str(tmp_path / "a.ggz"), "--encode-with", "geometry-qp=8"], "--geometry-qp goes with"),
     ):
         refuse(ggslam(*words, *more), reason)
     said = succeed(*words, "--encode", str(tmp_path / "a.bin"), "--encode-with", "qp=34",

@@ -39,6 +39,7 @@ from ggslam.formats.point_cloud import ColoredCloud, read_point_cloud, write_poi
 from ggslam.formats.splat_formats import open_splats, splat_format
 from ggslam.formats.voxel_cloud import join_clouds
 from ggslam.jobs.encode.attributes import attributes_to_code, restored_attributes
+from ggslam.jobs.encode.stream_output import check_stream_output
 from ggslam.runs.folder import MARKER, RunFolder
 from ggslam.runs.map_file import open_map
 from ggslam.runs.opened_points import opened_points
@@ -91,11 +92,12 @@ def encode_file(
 
     Raises:
         FormatError: the input is damaged or has nothing to code.
-        ConfigError: impossible settings.
+        ConfigError: impossible settings, or `out` is there and no stream, or would lie in a run's folder.
         RunFolderError: the output cannot be written, or the folder is not a run.
     """
     path = _input_file(source, preset)
     _refuse_itself(path, out)
+    check_stream_output(out, [source])
     return _encode(path, out, settings, preset, rate, ids, own=path != source)
 
 

@@ -29,6 +29,7 @@ from ggslam.coding.outliers import OutlierTuning, bulk_of
 from ggslam.coding.splats import SplatCodingTuning, finest_voxel, means_of, rest_range, splat_attributes, splat_settings
 from ggslam.errors import ConfigError, FormatError
 from ggslam.jobs.encode.coded_cells import HEAD, OBJECTS, VISIT
+from ggslam.jobs.encode.stream_output import check_stream_output
 from ggslam.jobs.progress import Observer, SilentObserver
 from ggslam.jobs.stores.over_cells import over_cells
 from ggslam.jobs.submaps.cell_gaussians import (
@@ -105,10 +106,11 @@ def encode_store(
         observer: receives progress updates.
 
     Raises:
-        ConfigError: it has no Gaussians, or no such rate.
+        ConfigError: it has no Gaussians, or no such rate; or `out` is there and no such file.
         GgslamError: it is no store, or the file cannot be written. (Damaged cells are left out and told.)
     """
     start, chosen = time.perf_counter(), settings or CodecSettings()
+    check_stream_output(out, [path])
     make_folder(out.parent)
     with GridStore.open(path) as store, hidden_beside(out) as folder:
         make_folder(folder)

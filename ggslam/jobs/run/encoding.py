@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's stream, coded as soon as the run is saved, beside scoring and report.
+"""A run's stream, coded as soon as the run is saved, beside scoring; a container when the run is complete.
 
 Where a point lies is known when the last refinement has ended and the surface is read off the map; how a cloud is cut
 into slices depends on all of its points. So slices are coded side by side from then on, and the bytes are those of
-`encode` afterwards.
+`encode` afterwards. A container also holds the run's records, which scores and report complete.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from ggslam.coding.settings import CodecSettings
 from ggslam.errors import ConfigError, GgslamError, RunFolderError
 from ggslam.jobs.encode.coded_cells import is_cells_file
 from ggslam.jobs.encode.coding import PRESETS, encode_saved_run
+from ggslam.jobs.encode.stream_output import check_stream_output
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.map_container import is_container, write_container
 from ggslam.system.plurals import quantity
@@ -37,16 +39,32 @@ class EncodeRequest:
     rate: str = "r03"
     ids: bool = True
 
-    def check(self, run: Path) -> None:
-        """Raises ConfigError for what cannot become of a run in this folder, before hours of work."""
+    @property
+    def needs_complete_run(self) -> bool:
+        """Whether records of the run that scoring changes are coded, too."""
+        return is_container(self.out)
+
+    def check(self, run: Path, sources: Sequence[Path] = (), overwrite: bool | None = False) -> None:
+        """Finds out before hours of work what cannot become of a run.
+
+        Args:
+            run: its folder.
+            sources: folders of the recording and of the run in whose map it begins.
+            overwrite: whether a stream may be replaced; None: that cannot be chosen.
+
+        Raises:
+            ConfigError: nothing can be coded so, or the file must not be written there.
+            RunFolderError: its folder cannot be written to.
+        """
         if self.preset not in PRESETS:
             raise ConfigError(f"preset: expected one of {', '.join(PRESETS)}, found '{self.preset}'")
         if is_cells_file(self.out):
             raise ConfigError(f"`encode` {self.out}: a .ggc is of a grid store, and this is a run")
-        if self.out.is_dir():
-            raise ConfigError(f"`encode` {self.out}: is a folder; name a file")
         if run.resolve() in self.out.resolve().parents:
             raise ConfigError(f"`encode` {self.out}: lies in the run's own folder; name a file beside it")
+        if check_stream_output(self.out, sources, "`encode` ") and not overwrite:
+            ways = "remove it" if overwrite is None else "use `overwrite`"
+            raise ConfigError(f"`encode` {self.out}: is there already; {ways} or choose another name")
 
 
 class RunEncoding:
@@ -54,7 +72,7 @@ class RunEncoding:
 
     Args:
         request: what to code it as.
-        folder: the run, saved, whether it is scored yet or not.
+        folder: the run, saved, and complete if the request needs that.
     """
 
     def __init__(self, request: EncodeRequest, folder: RunFolder) -> None:

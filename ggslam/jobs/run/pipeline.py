@@ -28,7 +28,7 @@ from ggslam.jobs.run.slam_loop import Follower, SlamLoop
 from ggslam.jobs.run.start_check import check_depth
 from ggslam.runs.checkpoints import Checkpoints
 from ggslam.runs.folder import RunFolder
-from ggslam.runs.recordings import SequenceRequest, describe, open_recording_of
+from ggslam.runs.recordings import LiveRequest, SequenceRequest, describe, open_recording_of
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.metrics import MetricsRecord
 from ggslam.runs.records.timing import EnergyRecord, TimingRecord
@@ -136,7 +136,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     if earlier is not None and out.resolve() in ancestors(earlier):
         raise ConfigError(f"`out` {out}: is the map to start in, or one that this comes from; choose another folder")
     if request.encode is not None:
-        request.encode.check(out)
+        request.encode.check(out, _inputs(request.sequence, earlier), request.overwrite)
     observer = observer or SilentObserver()
     for note in settings_notes(config, request.config, request.overrides):
         observer.note(note)
@@ -173,10 +173,10 @@ def resume(
             version; `model` or `loss` is not the run's.
     """
     folder = RunFolder.open_unfinished(run)
-    if encode is not None:
-        encode.check(folder.path)
     with stop_on_request() as stop, folder_lock(folder.path):
         found = Resumption.of(folder, recording, evaluate, model, loss)
+        if encode is not None:
+            encode.check(folder.path, _inputs(found.request, found.earlier), None)
         asked = RunRequest(
             found.request, folder.path, evaluate=found.start.evaluate if evaluate is None else evaluate,
             localize_only=found.start.localize_only, checkpoint_every=checkpoint_every, loss=loss,
@@ -244,11 +244,11 @@ class _Run:
             reason = result.frames[0].reason if result.frames else "no frame could be read"
             raise error if error is not None else SequenceError(f"{sequence.path}: could not start a map: {reason}")
         outcome = self._save(result, error)
-        with self._coding_beside(outcome):
-            self._look_at(outcome)
+        self._look_at(outcome)
         if error is None and outcome.failure is None:
             checkpoints.remove()
-        return outcome
+        with self._code_within(outcome, complete=True):
+            return outcome
 
     def _make_checkpointing(self, checkpoints: Checkpoints, resumption: Resumption | None) -> Checkpointing | None:
         """What saves the state; None: nothing does."""
@@ -313,22 +313,26 @@ class _Run:
             return None
 
     @contextmanager
-    def _coding_beside(self, outcome: RunOutcome) -> Iterator[None]:
-        """The run is coded within the block, if it ended and that was asked for."""
+    def _code_within(self, outcome: RunOutcome, complete: bool) -> Iterator[bool]:
+        """The run is coded while the block runs, and waited for: of streams if it is not complete yet, of containers if
+        it is. Yields whether that is so."""
         request, reason = self.request.encode, outcome.error or outcome.failure
-        if request is None or reason is not None:
-            if request is not None:
-                self.observer.note(f"{request.out}: not written: the run did not end, or was not saved as a whole")
-            yield
+        if request is None or request.needs_complete_run is not complete:
+            yield False
+            return
+        if reason is not None:
+            self.observer.note(f"{request.out}: not written: the run did not end, or was not saved as a whole")
+            yield False
             return
         encoding = RunEncoding(request, outcome.folder)
         try:
-            yield
+            yield True
         finally:
-            try:
-                outcome.encoded = encoding.wait()
-            except GgslamError as error:
-                outcome.encode_failure = error
+            with part("coding"):
+                try:
+                    outcome.encoded = encoding.wait()
+                except GgslamError as error:
+                    outcome.encode_failure = error
 
     def _frames_stay(self) -> bool:
         """Whether the frames of the run can be read again."""
@@ -336,20 +340,13 @@ class _Run:
 
     def _look_at(self, outcome: RunOutcome) -> None:
         """Scores, verdict and report; of a run that could not be saved as it should be the verdict alone."""
-        if outcome.failure is not None:
-            outcome.verdict = self._or_note(lambda: self._verdict(outcome))
-            return
-        sequence, error = self.sequence, outcome.error
-        kept = sequence if isinstance(sequence, Sequence) else None if error else _kept_recording(self.folder, sequence)
-        if kept is not None and len(outcome.result.moving):
-            kept.moving = outcome.result.moving
-        if self.request.evaluate and error is None:
-            if kept is None:
-                self.observer.note("not scored: the frames of a live camera are kept with `record` only")
-            else:
-                with part("scoring"):
-                    outcome.metrics = score_run(self.folder, kept, self.observer)
+        kept = None
+        with self._code_within(outcome, complete=False) as beside:
+            if outcome.failure is None:
+                kept = self._score(outcome, "scoring and coding" if beside else "scoring")
         outcome.verdict = self._or_note(lambda: self._verdict(outcome))
+        if outcome.failure is not None:
+            return
         if outcome.verdict is not None:
             with self.folder.change_files(RunVerdict.FILE):
                 outcome.verdict.write(self.folder.path)
@@ -358,6 +355,24 @@ class _Run:
             with self.folder.change_files(TimingRecord.FILE):
                 self.folder.timing().model_copy(update={"energy": outcome.energy}).write(self.folder.path)
         write_report(self.folder, kept)
+
+    def _score(self, outcome: RunOutcome, name: str) -> Sequence | None:
+        """Scores a run that ended, if that was asked for and its frames can be read again; returns its recording.
+
+        Args:
+            name: of the part that this counts for.
+        """
+        sequence, error = self.sequence, outcome.error
+        kept = sequence if isinstance(sequence, Sequence) else None if error else _kept_recording(self.folder, sequence)
+        if kept is not None and len(outcome.result.moving):
+            kept.moving = outcome.result.moving
+        if self.request.evaluate and error is None:
+            if kept is None:
+                self.observer.note("not scored: the frames of a live camera are kept with `record` only")
+            else:
+                with part(name):
+                    outcome.metrics = score_run(self.folder, kept, self.observer)
+        return kept
 
     def _verdict(self, outcome: RunOutcome) -> RunVerdict:
         folder = outcome.folder
@@ -368,6 +383,13 @@ class _Run:
             outcome.result, outcome.verdicts, self.fit, table, outcome.metrics, recording,
             cut and not self.saw_all, cut and self.saw_all,
         )  # fmt: skip
+
+
+def _inputs(recording: SequenceRequest, earlier: RunFolder | None) -> list[Path]:
+    """Folders that a run reads, or keeps frames in."""
+    record = recording.record if isinstance(recording, LiveRequest) else None
+    named = (recording.path, recording.masks, record, None if earlier is None else earlier.path)
+    return [path for path in named if path is not None]
 
 
 def _objects_notes(

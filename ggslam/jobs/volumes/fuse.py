@@ -26,6 +26,7 @@ from ggslam.jobs.volumes.robot_maps import parse_robots
 from ggslam.jobs.volumes.scans import ScanSource, scans_of_recording
 from ggslam.localization.scans import refuse_unread_scans, scan_files
 from ggslam.runs.folder import MARKER, RunFolder
+from ggslam.runs.output_files import lies_among
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.slam.config import Config, config_to_dict, load_config, settings_notes
 from ggslam.system.atomic import make_folder
@@ -261,8 +262,7 @@ def _check_memory(request: VolumesRequest, config: Config) -> None:
 
 def _check_mesh(path: Path, source: Path) -> None:
     check_mesh_path(path)
-    protected = (path.parent / MARKER).is_file() or source.resolve() in path.resolve().parents
-    if path.exists() and protected and path.parent.name != "volumes":
+    if path.exists() and lies_among(path, [source]) and path.parent.name != "volumes":
         raise ConfigError(f"`mesh` {path}: is a file of a run or recording; choose another name")
     make_folder(path.parent)
     RunFolder(path.parent).check_writable()
