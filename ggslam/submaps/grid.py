@@ -275,10 +275,12 @@ class GridStore:
         Raises:
             RunFolderError: the store is open for reading only, the disk is full, ... The store is as it was.
             ValueError: the name of a part is no plain file name.
+            ConfigError: a time, a share or a number is none that a store may hold.
         """
         self._check_writable()
         if not writes:
             return
+        self._index.check(writes)
         sizes = [{name: (len(data), zlib.crc32(data)) for name, data in write.parts.items()} for write in writes]
         with self._writing:
             versions = range(self._last_version + 1, self._last_version + 1 + len(writes))
