@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from ggslam.errors import ConfigError
 
 SequencePath = Annotated[
     Path, typer.Argument(metavar="SEQUENCE", help="Folder or file of the recording; its format is recognised.")
@@ -133,3 +136,12 @@ CellAddress = Annotated[
         help="Address of the Ray cluster; auto: the cluster of this machine. Default: a new cluster on this machine.",
     ),
 ]
+
+
+def refuse_others(context: typer.Context, option: str, taken: Iterable[str]) -> None:
+    """Raises ConfigError for the options of a command line, but for these parameters, that another one ignores."""
+    sources = {one: context.get_parameter_source(one.name or "") for one in context.command.params}
+    given = {one for one, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+    names = [next(iter(one.opts)) for one in given if one.name not in set(taken)]
+    if names:
+        raise ConfigError(f"{option}: {', '.join(sorted(names))} cannot go with it")

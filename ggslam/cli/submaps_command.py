@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import secrets
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -100,6 +101,7 @@ Token = Annotated[
 
 
 def submaps(
+    context: typer.Context,
     source: SourcePath,
     out: Annotated[Path | None, typer.Option(metavar="STORE", help="Grid store to make, or to add a visit to.")] = None,
     visit: Annotated[str | None, typer.Option(help="Name of the visit; default: the source's name.")] = None,
@@ -141,8 +143,10 @@ def submaps(
     if (serve is not None) + (send is not None) + (out is not None) > 1:
         raise ConfigError("--serve, --send, --out: choose one")
     if serve is not None:
+        options.refuse_others(context, "--serve", {"source", "serve", "token", "overrides", *given})
         return _serve(source, serve, token, settings)
     if send is not None:
+        options.refuse_others(context, "--send", {"source", "send", "token"})
         return _send(source, send, token)
     if out is not None:
         reading = SequenceRequest(
@@ -159,20 +163,20 @@ def submaps(
 
 def _serve(path: Path, address: str, token: str | None, settings: Mapping[str, Any]) -> None:
     """Takes cells into a store, which is made if there is none, until Ctrl-C."""
-    from ggslam.jobs.submaps.cell_server import CellServer, address_of
-    from ggslam.jobs.submaps.stores import open_or_create
+    from ggslam.jobs.submaps.cell_server import CellServer, address_of, listen, shown_address
+    from ggslam.jobs.submaps.stores import open_or_create, settings_of_store
     from ggslam.jobs.view.serve import wait_for_interrupt
-    from ggslam.submaps.settings import SubmapSettings
 
     def tell(text: str) -> None:
         console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     secret = secrets.token_hex(8) if token is None else token
     with (
-        open_or_create(path, SubmapSettings(**settings)) as store,
-        CellServer(store, *address_of(address), secret, tell) as server,
+        listen(*address_of(address)) as listener,  # before a store is made
+        open_or_create(path, replace(settings_of_store(path), **settings)) as store,
+        CellServer(store, listener, secret, tell) as server,
     ):
-        at, shown = ":".join(map(str, server.address)), "" if token is not None else f" with --token {secret}"
+        at, shown = shown_address(*server.address), "" if token is not None else f" with --token {secret}"
         wait_for_interrupt(lambda: tell(f"{path} takes cells at {at}{shown} (Ctrl-C ends)"))
 
 

@@ -136,9 +136,12 @@ def stored_views(store: GridStore, key: CellKey, camera: Camera) -> list[StoredV
 
 
 def _arrays(store: GridStore, key: CellKey) -> Mapping[str, np.ndarray]:
-    where = f"{store.path}: cell {key}: {PLACES}"
-    file = io.BytesIO(store.get(key, PLACES))
-    arrays = arrays_of(file, f"{where}: damaged", lambda held: {name: held[name] for name in _NAMES})
+    return arrays_of_places(store.get(key, PLACES), f"{store.path}: cell {key}: {PLACES}")
+
+
+def arrays_of_places(data: bytes, where: str) -> Mapping[str, np.ndarray]:
+    """The arrays of the part `PLACES`. Raises FormatError if it is damaged; begins with `where`."""
+    arrays = arrays_of(io.BytesIO(data), f"{where}: damaged", lambda held: {name: held[name] for name in _NAMES})
     check_arrays(arrays, _FORMS, f"{where}: damaged")
     if int(arrays["counts"].astype(np.int64).sum()) != len(arrays["points"]):
         raise FormatError(f"{where}: damaged: its landmarks do not fit their numbers")

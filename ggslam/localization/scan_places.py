@@ -169,8 +169,11 @@ def _apart(one: float, other: float) -> float:
 
 
 def _arrays(store: GridStore, key: CellKey) -> Mapping[str, np.ndarray]:
-    where = f"{store.path}: cell {key}: {SCAN_PLACES}"
-    file = io.BytesIO(store.get(key, SCAN_PLACES))
-    arrays = arrays_of(file, f"{where}: damaged", lambda held: {name: held[name] for name in _NAMES})
+    return arrays_of_scan_places(store.get(key, SCAN_PLACES), f"{store.path}: cell {key}: {SCAN_PLACES}")
+
+
+def arrays_of_scan_places(data: bytes, where: str) -> Mapping[str, np.ndarray]:
+    """The arrays of the part `SCAN_PLACES`. Raises FormatError if it is damaged; begins with `where`."""
+    arrays = arrays_of(io.BytesIO(data), f"{where}: damaged", lambda held: {name: held[name] for name in _NAMES})
     check_arrays(arrays, _FORMS, f"{where}: damaged")
     return arrays

@@ -13,10 +13,12 @@ import os
 import re
 import shutil
 import stat
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -25,7 +27,7 @@ from ggslam.submaps.cell_keys import CellKey
 from ggslam.system.atomic import write_failure
 from ggslam.system.links import refuse_link, refuse_shared_file
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import read_untrusted
+from ggslam.system.untrusted_files import open_untrusted, read_untrusted
 
 
 class CellFileTuning(Tuning):
@@ -33,6 +35,10 @@ class CellFileTuning(Tuning):
 
     threads = 8
     """Threads that wait for the disk."""
+    lock_tries = 10
+    """Attempts to lock a store: who only asks whether it is locked holds the lock for a moment."""
+    between_tries_s = 0.01
+    """Seconds between them."""
 
 
 _CELL = re.compile(r"(-?\d{1,10})_(-?\d{1,10})_(-?\d{1,10})", re.ASCII)
@@ -150,7 +156,7 @@ class WriterLock:
             raise
         self._file = os.fdopen(handle, "a+b")
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(self._file)
         except OSError as error:
             owner = self._content()
             self._file.close()
@@ -184,6 +190,29 @@ class WriterLock:
             with suppress(OSError):
                 self._file.close()
             raise write_failure(path, error) from error
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Raises OSError if somebody else has it."""
+    for left in reversed(range(CellFileTuning.lock_tries)):
+        try:
+            return fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if not left:
+                raise
+            time.sleep(CellFileTuning.between_tries_s)
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a `WriterLock` of this file is held."""
+    try:
+        with open_untrusted(path) as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except (FormatError, OSError):  # nobody ever wrote, or the file system has no locks
+        return False
+    return False
 
 
 def read_current(find: Callable[[], tuple[Path, int]], attempts: int = 5) -> tuple[Path, bytes]:

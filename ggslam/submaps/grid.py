@@ -31,13 +31,12 @@ from types import TracebackType
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError
-from ggslam.submaps.cell_files import CellFiles, WriterLock, read_current, wait_for_disk
+from ggslam.submaps.cell_files import CellFiles, WriterLock, is_locked, read_current, wait_for_disk
 from ggslam.submaps.cell_keys import CellKey, Grid
 from ggslam.submaps.cell_records import CellChange, CellRecord, CellWrite, PartRecord
 from ggslam.submaps.index import CellIndex
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.atomic import make_folder, write_failure
-from ggslam.system.untrusted_files import read_untrusted_text
 
 INDEX, CELLS = "index.sqlite", "cells"
 _LOCK = "lock"
@@ -275,10 +274,12 @@ class GridStore:
         Raises:
             RunFolderError: the store is open for reading only, the disk is full, ... The store is as it was.
             ValueError: the name of a part is no plain file name.
+            ConfigError: a time, a share or a number is none that a store may hold.
         """
         self._check_writable()
         if not writes:
             return
+        self._index.check(writes)
         sizes = [{name: (len(data), zlib.crc32(data)) for name, data in write.parts.items()} for write in writes]
         with self._writing:
             versions = range(self._last_version + 1, self._last_version + 1 + len(writes))
@@ -340,18 +341,9 @@ class GridStore:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a process has the store at `path` open for writing, as far as the number in its lock tells."""
-    try:
-        process = int(read_untrusted_text(path / _LOCK))
-    except (FormatError, ValueError):  # nobody ever wrote, or the last one has ended
-        return False
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+    """Whether somebody, perhaps this process, has the store at `path` open for writing: its lock tells, not the number
+    in it, which may since be another process's."""
+    return is_locked(path / _LOCK)
 
 
 def check_same_grid(path: Path, own: SubmapSettings, wanted: SubmapSettings) -> None:

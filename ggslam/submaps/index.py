@@ -18,7 +18,7 @@ import sqlite3
 import stat
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -27,7 +27,7 @@ from typing import Any, Final
 from ggslam.errors import ConfigError, FormatError, GgslamError, RunFolderError
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.cell_records import CellChange, CellRecord, CellWrite, PartRecord
-from ggslam.submaps.index_schema import NEWEST, SCHEMAS, check_rows, check_schema
+from ggslam.submaps.index_schema import NEWEST, SCHEMAS, check_rows, check_schema, check_values
 from ggslam.submaps.settings import SubmapSettings
 from ggslam.system.links import refuse_shared_file
 from ggslam.system.tuning import Tuning
@@ -175,7 +175,8 @@ class CellIndex:
         return rows[0][0] if rows else None
 
     def add_visit(self, name: str) -> int:
-        """The number of a visit, which is made if it is new."""
+        """The number of a visit, which is made if it is new. Raises ConfigError if none can have this name."""
+        check_values(self.path, visit_name=name)
         with self._transaction() as connection:
             connection.execute("INSERT INTO visits (name) VALUES (?) ON CONFLICT DO NOTHING", (name,))
         return int(self._rows("SELECT number FROM visits WHERE name = ?", (name,), "number")[0][0])
@@ -191,6 +192,15 @@ class CellIndex:
         )
         rows = self._rows(query, (since,), "x", "y", "z", "added", "changed")
         return [CellChange((x, y, z), bool(added), changed) for x, y, z, added, changed in rows]
+
+    def check(self, writes: Iterable[CellWrite]) -> None:
+        """Raises ConfigError if something that is to be written could not be read again."""
+        for write in writes:
+            check_values(self.path, **dict(zip("xyz", write.key, strict=True)))
+            for name, value in (("recorded_at", write.recorded_at), ("changed", write.changed)):
+                check_values(self.path, **{name: float(value) if isinstance(value, float) else value})  # of NumPy, too
+            for count in write.counts.values():
+                check_values(self.path, count=count)
 
     def commit(self, writes: Sequence[tuple[CellWrite, int, Mapping[str, tuple[int, int]]]], visit: int | None) -> None:
         """Makes written versions the current ones, all in one transaction.

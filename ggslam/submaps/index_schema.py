@@ -16,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from ggslam.errors import FormatError
+from ggslam.errors import ConfigError, FormatError
 from ggslam.submaps.cell_keys import is_coordinate
 from ggslam.system.tuning import Tuning
 
@@ -109,6 +109,18 @@ COLUMNS: dict[str, Reader] = {
     "visit_name": lambda value: value is None or _is_name(value),
 }
 """By what a value is; times in seconds."""
+
+
+def is_time(value: Any) -> bool:
+    """Whether a cell may have been recorded at this time, seconds or None."""
+    return COLUMNS["recorded_at"](value)
+
+
+def check_values(path: Path, **values: Any) -> None:
+    """Raises ConfigError if a value that is to be written, by name of `COLUMNS`, could not be read again."""
+    for name, value in values.items():
+        if not COLUMNS[name](value):
+            raise ConfigError(f"{path}: cannot hold {value!r:.40}: no {name} of a cell, a part or a visit")
 
 
 def check_rows(path: Path, rows: Iterable[tuple[Any, ...]], *columns: str) -> None:

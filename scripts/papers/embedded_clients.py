@@ -10,7 +10,7 @@ from pathlib import Path
 from gpu_mapping import run_command
 from rows import Paper
 
-from ggslam.jobs.submaps.cell_server import CellServer, send_store
+from ggslam.jobs.submaps.cell_server import CellServer, listen, send_store
 from ggslam.submaps.cell_keys import CellKey
 from ggslam.submaps.grid import GridStore
 
@@ -33,7 +33,7 @@ def add_clients(paper: Paper, recording: Path, frames: int) -> None:
     start = time.perf_counter()
     with (
         GridStore.create(folder / "server.grid", settings) as store,
-        CellServer(store, "127.0.0.1", 0, "paper") as server,
+        CellServer(store, listen("127.0.0.1", 0), "paper") as server,
         ThreadPoolExecutor(len(halves)) as pool,
     ):
         sent = list(pool.map(lambda name: send_store(folder / f"{name}.grid", *server.address, "paper"), halves))

@@ -2,9 +2,10 @@
 """Several clients send the cells of their stores to one process, which keeps them in one store.
 
 A cell is written whole or not at all, and acknowledged when it is on the disk: a client that dies leaves whole cells,
-and one that talks nonsense is refused and leaves nothing. A cell that the store has is taken as a later visit's is: if
-it was recorded longer than T (`SubmapSettings.refresh`) after the one that is there, or goes on with the same visit. It
-takes the old one's place, as cells of runs and clouds do; a recording that is added here keeps what it did not look at.
+and one that talks nonsense is refused and leaves nothing (`cell_checks`). A cell that the store has is taken as a later
+visit's is: if it was recorded longer than T (`SubmapSettings.refresh`) after the one that is there, or goes on with the
+same visit and was not recorded before. It takes the old one's place, as cells of runs and clouds do; a recording that
+is added here keeps what it did not look at.
 What stores know of runs and objects (`visits/`, `objects.json`) is not sent.
 """
 
@@ -15,11 +16,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from ggslam.errors import ConfigError, FormatError, RunFolderError
-from ggslam.jobs.submaps.cell_gaussians import GAUSSIANS, gaussians_from_bytes
+from ggslam.errors import ConfigError, GgslamError, RunFolderError
+from ggslam.jobs.submaps.cell_checks import check_cell
 from ggslam.submaps.cell_messages import (
     Kind,
     MessageTuning,
@@ -30,7 +32,6 @@ from ggslam.submaps.cell_messages import (
     send_message,
     send_text,
 )
-from ggslam.submaps.cell_points import POINTS, decode_points
 from ggslam.submaps.cell_records import CellWrite
 from ggslam.submaps.grid import GridStore, is_being_written
 from ggslam.system.plurals import quantity
@@ -44,6 +45,12 @@ class CellServerTuning(Tuning):
     """Most connections at once; others wait."""
     look_every_s = 0.5
     """Seconds between two looks at a store that is being written."""
+    hello_s = 3.0
+    """Seconds in which a client has to tell the token. It does so unasked, before anybody listens to it."""
+    idle_s = 600.0
+    """Longest silence between two cells, in seconds: a robot stands still."""
+    stop_s = 1.0
+    """Seconds that clients are given to be told that the server ends."""
 
 
 @dataclass
@@ -60,42 +67,46 @@ class CellServer:
 
     Args:
         store: open for writing.
-        host, port: to listen at; port 0: any free one, see `address`.
+        listener: of `listen`; it is closed at the end.
         token: that clients have to tell.
         tell: is given a line for people about every client.
-
-    Raises:
-        ConfigError: one cannot listen there.
     """
 
     def __init__(
-        self, store: GridStore, host: str, port: int, token: str, tell: Callable[[str], None] = lambda text: None
+        self, store: GridStore, listener: socket.socket, token: str, tell: Callable[[str], None] = lambda text: None
     ) -> None:
         self._store, self._token, self._tell = store, token, tell
         self._writing, self._stop = threading.Lock(), threading.Event()
         self._free = threading.Semaphore(CellServerTuning.clients)
         self._threads: list[threading.Thread] = []
-        try:
-            self._listener = socket.create_server((host, port))
-        except (OSError, OverflowError) as error:
-            raise ConfigError(f"cannot listen at {host}:{port}: {error}") from None
+        self._connections: set[socket.socket] = set()
+        self._listener = listener
         self._listener.settimeout(0.2)
         self.address: tuple[str, int] = self._listener.getsockname()[:2]
 
     def __enter__(self) -> CellServer:
-        self._begin(self._accept)
+        self._accepting = self._begin(self._accept)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        for thread in self._threads:
-            thread.join()
+        self._accepting.join()
         self._listener.close()
+        until = time.monotonic() + CellServerTuning.stop_s
+        for how in (socket.SHUT_RD, socket.SHUT_RDWR):  # first nothing is read any more, then nothing is sent either
+            for connection in list(self._connections):
+                with suppress(OSError):
+                    connection.shutdown(how)
+            for thread in self._threads:
+                thread.join(max(until - time.monotonic(), 0))
+        for thread in self._threads:  # one may still be writing a cell
+            thread.join()
 
-    def _begin(self, target: Callable[[], None]) -> None:
+    def _begin(self, target: Callable[[], None]) -> threading.Thread:
         thread = threading.Thread(target=target, name="cells", daemon=True)
         self._threads = [one for one in self._threads if one.is_alive()] + [thread]
         thread.start()
+        return thread
 
     def _accept(self) -> None:
         while not self._stop.is_set():
@@ -106,8 +117,8 @@ class CellServer:
             except OSError:  # nobody came
                 self._free.release()
                 continue
-            connection.settimeout(MessageTuning.timeout_s)
-            name = f"{address[0]}:{address[1]}"
+            self._connections.add(connection)
+            name = shown_address(*address[:2])
             self._begin(lambda connection=connection, name=name: self._serve(connection, name))  # type: ignore[misc]
 
     def _serve(self, connection: socket.socket, name: str) -> None:
@@ -118,38 +129,45 @@ class CellServer:
                 try:
                     self._take_all(connection, sent)
                     end = "done"
-                except OSError:
-                    raise
                 except Exception as error:  # whatever it sent, others are served on
-                    end = f"refused: {error}"
-                    send_text(connection, Kind.REFUSED, {"reason": str(error)[:1000]})
+                    if isinstance(error, OSError) and not self._stop.is_set():
+                        raise
+                    end, reason, code = self._refusal(error)
+                    send_text(connection, Kind.REFUSED, {"reason": reason[:1000], "exit_code": code})
         except OSError as error:
             end = f"lost: {error}"
         finally:
+            self._connections.discard(connection)
             self._free.release()
         self._tell(f"{name}: {quantity(sent.written, 'cell')} written, {sent.kept} kept, {sent.bytes} bytes; {end}")
 
+    def _refusal(self, error: Exception) -> tuple[str, str, int]:
+        """A line for people here, what a client is told, and whose fault it is (`GgslamError.exit_code`)."""
+        if self._stop.is_set():
+            return "the server ends", "the server ends", 1
+        return f"refused: {error}", str(error), error.exit_code if isinstance(error, GgslamError) else 1
+
     def _take_all(self, connection: socket.socket, sent: Sent) -> None:
-        self._check_hello(receive_message(connection))
+        limit = CellServerTuning.hello_s
+        self._check_hello(receive_message(connection, [Kind.HELLO], in_all_s=limit, stop=self._stop))
         send_text(connection, Kind.OK, {})
-        while not self._stop.is_set():
-            message = receive_message(connection)
+        while True:
+            message = receive_message(connection, [Kind.CELL], CellServerTuning.idle_s, stop=self._stop)
+            if self._stop.is_set():
+                raise RunFolderError("the server ends")
             if message is None:
                 return
-            kind, body = message
-            if kind is not Kind.CELL:
-                raise FormatError(f"expected a cell, found {kind.name}")
+            body = message[1]
             write, visit = cell_of_body(body)
             written = self._take(write, visit)
             sent.bytes += len(body)
             sent.written, sent.kept = sent.written + written, sent.kept + (not written)
             send_text(connection, Kind.OK, {"written": written})
-        raise RunFolderError("the server ends")
 
     def _check_hello(self, message: tuple[Kind, bytes] | None) -> None:
         """Raises ConfigError if the token or the grid is another one."""
-        if message is None or message[0] is not Kind.HELLO:
-            raise FormatError("expected HELLO first")
+        if message is None:
+            raise ConnectionError("the client said nothing")
         values, settings = read_text(message[1]), self._store.settings
         if not hmac.compare_digest(str(values.get("token")).encode(), self._token.encode()):
             raise ConfigError("the token is another one")
@@ -160,19 +178,33 @@ class CellServer:
 
     def _take(self, write: CellWrite, visit: str) -> bool:
         """Writes a cell if it is due; whether it was."""
-        what = f"cell {write.key}"
-        if POINTS in write.parts:
-            decode_points(write.parts[POINTS], what)
-        if GAUSSIANS in write.parts:
-            gaussians_from_bytes(write.parts[GAUSSIANS], what)
+        check_cell(write, self._store.settings)
         with self._writing:
-            store = self._store
-            is_others = write.key in store and store.cell(write.key).visit != visit
-            if is_others and (write.recorded_at is None or not store.due(write.key, write.recorded_at)):
+            if not self._is_due(write, visit):
                 return False
-            store.begin_visit(visit)
-            store.put_cells([write])
+            self._store.begin_visit(visit)
+            self._store.put_cells([write])
         return True
+
+    def _is_due(self, write: CellWrite, visit: str) -> bool:
+        if write.key not in self._store:
+            return True
+        there, at = self._store.cell(write.key), write.recorded_at
+        if there.visit != visit:
+            return at is not None and self._store.due(write.key, at)
+        return there.recorded_at is None or (at is not None and at >= there.recorded_at)
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket for `CellServer`; port 0: any free one, see `CellServer.address`.
+
+    Raises:
+        ConfigError: one cannot listen there.
+    """
+    try:
+        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise ConfigError(f"cannot listen at {shown_address(host, port)}: {error}") from None
 
 
 def send_store(path: Path, host: str, port: int, token: str) -> Sent:
@@ -183,7 +215,7 @@ def send_store(path: Path, host: str, port: int, token: str) -> Sent:
         ConfigError: nobody listens there, the server refuses, or the connection breaks; what it acknowledged it has.
         FormatError: the store is damaged.
     """
-    sent = Sent()
+    sent, accepted = Sent(), False
     with GridStore.open(path) as store:
         try:
             with socket.create_connection((host, port), MessageTuning.timeout_s) as connection:
@@ -191,14 +223,19 @@ def send_store(path: Path, host: str, port: int, token: str) -> Sent:
                 hello = {"token": token, "spacing": settings.spacing, "axes": settings.axes}
                 send_text(connection, Kind.HELLO, hello)
                 _answer(connection)
+                accepted = True
                 for write, visit in _cells_as_they_end(store):
                     body = cell_to_body(write, visit)
                     send_message(connection, Kind.CELL, body)
                     written = bool(_answer(connection).get("written"))
                     sent.bytes += len(body)
                     sent.written, sent.kept = sent.written + written, sent.kept + (not written)
-        except (OSError, OverflowError) as error:
-            raise ConfigError(f"{host}:{port}: {error}; {quantity(sent.written, 'cell')} written before") from None
+        except (OSError, OverflowError, UnicodeError, ConfigError) as error:
+            before = f"; {quantity(sent.written, 'cell')} written before" if accepted else ""
+            failure = ConfigError(f"{shown_address(host, port)}: {error}{before}")
+            if accepted:  # by a server that was there, and has gone, or says whose fault it is
+                failure.exit_code = error.exit_code if isinstance(error, ConfigError) else 1
+            raise failure from None
     return sent
 
 
@@ -225,22 +262,31 @@ def _cells_as_they_end(store: GridStore) -> Iterator[tuple[CellWrite, str]]:
 
 
 def _answer(connection: socket.socket) -> dict[str, object]:
-    message = receive_message(connection)
+    message = receive_message(connection, [Kind.OK, Kind.REFUSED])
     if message is None:
         raise ConnectionError("the server ended the connection")
     kind, values = message[0], read_text(message[1])
     if kind is not Kind.OK:
-        raise ConfigError(f"the server refuses: {values.get('reason')}")
+        refusal = ConfigError(f"the server refuses: {values.get('reason')}")
+        refusal.exit_code = 1 if values.get("exit_code") == 1 else 2
+        raise refusal
     return values
 
 
 def address_of(text: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT, or PORT on this machine.
+    """Host and port of HOST:PORT, of [HOST]:PORT where the host has colons, or of PORT on this machine.
 
     Raises:
         ConfigError: it is neither.
     """
     host, _, port = text.rpartition(":")
-    if not port.isdecimal() or int(port) > 65535:
-        raise ConfigError(f"expected HOST:PORT, found {text!r}")
+    bracketed = host.startswith("[") and host.endswith("]")
+    host = host[1:-1] if bracketed else host
+    if not port.isdecimal() or not port.isascii() or int(port) > 65535 or (":" in host) != bracketed:
+        raise ConfigError(f"expected HOST:PORT, or [HOST]:PORT for IPv6, found {text!r}")
     return host or "127.0.0.1", int(port)
+
+
+def shown_address(host: str, port: int) -> str:
+    """What `address_of` reads."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

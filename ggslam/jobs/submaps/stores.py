@@ -69,6 +69,14 @@ def cloud_voxel(path: Path) -> float:
     return read_octomap(path).resolution if path.suffix.lower() == OCTOMAP else 0.0
 
 
+def settings_of_store(path: Path) -> SubmapSettings:
+    """Those that the store of a folder was made with; the defaults if there is none."""
+    if not is_store(path):
+        return SubmapSettings()
+    with GridStore.open(path) as store:
+        return store.settings
+
+
 def open_or_create(path: Path, settings: SubmapSettings) -> GridStore:
     """The store of a folder, open for writing; a new one if there is none.
 
