@@ -35,9 +35,9 @@ from ggslam.slam.config import load_config
 from ggslam.slam.slam import Slam
 from ggslam.slam.step_log import COLUMNS
 from ggslam.synthetic import SCENES, RayCaster, camera_path
+from ggslam.synthetic.layouts import PLAIN
 from ggslam.synthetic.sensor import noisy_color, noisy_depth
 from ggslam.synthetic.trajectory import PathTuning
-from ggslam.synthetic.writer import SynthTuning
 from ggslam.system.process_memory import resident_bytes, trim
 
 TRAINING_PARTS = ("forward_ms", "loss_ms", "backward_ms", "identity_ms")
@@ -58,7 +58,7 @@ class Rounds:
         self, scene: str, frames: int, width: int, height: int, seed: int = 0, keep: Path | None = None
     ) -> None:
         kind = SCENES[scene]
-        focal = SynthTuning.focal * width
+        focal = PLAIN.focal * width
         self.camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         self.rate, self._seed = kind.frame_rate, seed
         built = kind.build(seed, frames)

@@ -67,7 +67,7 @@ def _check_positions(positions: np.ndarray, write: CellWrite, name: str, setting
     if np.abs(positions * ~grid.spans).max(initial=0) > PoseForm.FARTHEST_ON_EARTH_M:
         raise FormatError(f"cell {write.key}: {name}: lies beyond the Earth")
     if apart > slack:
-        hint = "; the server's --sensor-range tells how far they may lie" if name == POINTS else ""
+        hint = "; the range of the server's sensor tells how far they may lie" if name == POINTS else ""
         raise FormatError(f"cell {write.key}: {name}: {apart:.6g} m outside the cell, at most {slack:g} m{hint}")
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from ggslam.system.interrupts import delay_interrupts
 from ggslam.system.opencv import opencv_errors
 from ggslam.volumes.maps import VolumeMaps, VolumeTimesTuning
 from ggslam.volumes.output_frame import OutputFrame, output_frame
+from ggslam.volumes.settings import TsdfSettings
 from ggslam.volumes.tsdf_file import load_tsdf
 from ggslam.volumes.volume_settings import VolumeSettings
 
@@ -145,6 +147,8 @@ def make_volumes(request: VolumesRequest, observer: Observer | None = None) -> V
     for note in [] if request.live else settings_notes(_without_options(config), request.config, request.overrides):
         observer.note(note)  # a live run tells of them itself
     onto = None if request.onto is None else load_tsdf(request.onto)
+    if onto is not None:
+        _check_same_fusion(request.overrides, config.volumes.tsdf, onto.settings)
     maps = VolumeMaps(_set_pace(config.volumes, request), request.esdf, request.occupancy, onto, request.device)
     source = None if request.live else _source(request, is_run, body)
     out = None if request.live else _folder(request, is_run)
@@ -189,15 +193,21 @@ def _write(
 
 def _config(request: VolumesRequest) -> Config:
     config = load_config(request.config, request.overrides)
-    fused_as = [text.partition("=")[0] for text in request.overrides if text.startswith("volumes.tsdf.")]
-    if request.onto is not None and fused_as:
-        raise ConfigError(f"{fused_as[0]}: with `onto` depth is fused as in the file")
     if request.voxel is None:
         return config
     if request.onto is not None:
         raise ConfigError("`voxel`: with `onto` the voxels are those of the file")
     tsdf = replace(config.volumes.tsdf, voxel=request.voxel)
     return replace(config, volumes=replace(config.volumes, tsdf=tsdf))
+
+
+def _check_same_fusion(overrides: Sequence[str], asked: TsdfSettings, of_file: TsdfSettings) -> None:
+    """Raises ConfigError for a setting of the fusion that was given and is not the file's, which counts."""
+    for text in overrides:
+        setting = text.partition("=")[0]
+        name = setting.removeprefix("volumes.tsdf.")
+        if name != setting and getattr(asked, name, None) != getattr(of_file, name, None):
+            raise ConfigError(f"{setting}: with `onto` depth is fused as in the file, {getattr(of_file, name)}")
 
 
 def _without_options(config: Config) -> Config:
