@@ -11,7 +11,8 @@ namespace ggslam::volumes {
 namespace {
 
 // Rays that pass a voxel's centre farther away than this, in metres, tell of another place: the surface may bend between.
-// Found on a generated room with a Kinect's noise, voxels of 1 to 10 cm; another, and livingroom, agree.
+// Found on a generated room with a Kinect's noise, voxels of 1 to 10 cm; another room agrees. Where depth is exact rays
+// gain nothing.
 constexpr double kRadius = 0.02;
 
 // What all rays of a view have in common; lengths in voxels from the first voxel of the corner's block.
