@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ggslam.geometry.image_parts import coarse_grid
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.sight.margin import Margin
 from ggslam.sight.view import View
@@ -34,11 +35,9 @@ def covisible(keyframe: Keyframe, others: Sequence[Keyframe]) -> list[int]:
 
 def _surface(keyframe: Keyframe) -> np.ndarray:
     """World points of a keyframe's pixels on a coarse grid that have depth, [n, 3]."""
-    stride, depth = CovisibilityTuning.stride, keyframe.depth_m()
+    depth = keyframe.depth_m()
     points = View.of(depth, keyframe.camera, keyframe.T_world_camera, Margin.usual()).points()
-    grid = np.zeros(depth.shape, bool)
-    grid[stride // 2 :: stride, stride // 2 :: stride] = True
-    return points[(grid & (depth > 0)).reshape(-1)]
+    return points[(coarse_grid(depth.shape, CovisibilityTuning.stride) & (depth > 0)).reshape(-1)]
 
 
 def _share_on(points: np.ndarray, keyframe: Keyframe) -> float:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ggslam.geometry.image_parts import coarse_grid
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import quaternion_to_matrix, transform_points
@@ -119,7 +120,5 @@ def _unborn(rows: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 def sparse_pixels(where: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     """bool [H, W]: of the pixels to insert at (None: all) those on a coarse grid."""
-    stride = DensificationTuning.sparse_stride
-    grid = np.zeros(shape, bool)
-    grid[stride // 2 :: stride, stride // 2 :: stride] = True
+    grid = coarse_grid(shape, DensificationTuning.sparse_stride)
     return grid if where is None else grid & where

@@ -52,6 +52,10 @@ class KeyframeSampler:
         """
         if count < 1:
             raise IndexError("no keyframe to draw")
+        return self._next(count)
+
+    def _next(self, count: int) -> int:
+        """The same, of one keyframe or more."""
         self._draws += 1
         return int((self._offset + self._draws * GOLDEN_RATIO) % 1.0 * count)
 
@@ -78,9 +82,7 @@ class RandomSampler(KeyframeSampler):
         super().__init__()
         self._rng = np.random.default_rng([seed, 19])
 
-    def draw(self, count: int) -> int:
-        if count < 1:
-            raise IndexError("no keyframe to draw")
+    def _next(self, count: int) -> int:
         return int(self._rng.integers(count))
 
 
@@ -93,9 +95,7 @@ class NewestSampler(KeyframeSampler):
         super().__init__()
         self._count = 0
 
-    def draw(self, count: int) -> int:
-        if count < 1:
-            raise IndexError("no keyframe to draw")
+    def _next(self, count: int) -> int:
         if count != self._count:
             self._count, self._draws = count, 0
         self._draws += 1
