@@ -143,6 +143,10 @@ class OpenCvError(GgslamError):
     exit_code = 1
 
 
+class MiddlewareError(GgslamError):
+    """A message, topic or service of the network is not what it should be, or nobody answers."""
+
+
 class MissingDependency(GgslamError):
     """An optional package or file is needed for what was asked; the message says how to get it."""
 

@@ -17,15 +17,15 @@ FLOORS = (
     {"slam", "localization", "merging", "changes", "driving"},
     {"tracking", "mapping", "loops", "movers", "objects", "volumes", "submaps", "coding", "evaluation", "viewer",
      "reporting"},
-    {"rendering", "sequences", "formats", "features", "synthetic", "geometry", "sight"},
-    {"scene", "native", "cuda"},
+    {"rendering", "sequences", "formats", "features", "synthetic", "geometry", "sight", "messages"},
+    {"scene", "native", "cuda", "middleware"},
     {"system", "abi"},
     {"errors"},
 )
 """From the top down. A room imports from floors below its own only."""
 JOBS = (
     {"watch"},
-    {"view"},
+    {"view", "serve"},
     {"export", "plan"},
     {"volumes"},
     {"run"},

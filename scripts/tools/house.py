@@ -82,6 +82,7 @@ def circles() -> list[str]:
 PURPOSES = {
     "SLAM": "sight slam tracking mapping loops movers objects rendering scene geometry features native cuda",
     "recordings, files and stores": "sequences formats coding runs submaps system abi errors __init__ __main__",
+    "live messages": "messages middleware",
     "work on finished runs": "jobs localization merging changes driving volumes evaluation viewer reporting",
     "command line": "cli",
     "generated recordings": "synthetic",

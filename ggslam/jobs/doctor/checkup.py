@@ -65,6 +65,8 @@ EXTRAS = {
     "rerun": Extra(("rerun",), "ggslam run --log: a run streamed to rerun"),
     "phone": Extra(("liblzfse",), "recordings of Record3D (.r3d)"),
     "ros": Extra(("rosbags",), "ROS 1 and ROS 2 bags"),
+    "ros2": Extra(("rosbags", "zenoh", "cyclonedds"), "live topics of ROS 2 over Zenoh or DDS, without ROS"),
+    "foxglove": Extra(("foxglove",), "run --publish foxglove and serve: the map in Foxglove, and MCAP files"),
     "ray": Extra(("ray",), "batches on a Ray cluster"),
     "realsense": Extra(("pyrealsense2",), "RealSense cameras and their .bag files"),
     "docs": Extra(("zensical",), "building the pages of docs/", False),
