@@ -67,7 +67,7 @@ def cells(outcome: ScoredRun, reference: float) -> list[float | None]:
     return [
         metrics.number("images", "held_out", "psnr"), percent("held_out", "miou"), percent("held_out", "boundary_miou"),
         percent("held_out", "votes_miou"), percent("gaussians", "accuracy"),
-        outcome.timing.mapping_ms_per_iteration, outcome.wall_s, outcome.wall_s / reference,
+        outcome.timing.mapping_ms_per_iteration, outcome.timing.whole_s, outcome.timing.whole_s / reference,
     ]  # fmt: skip
 
 
@@ -97,8 +97,8 @@ def main() -> None:
         if arguments.only and name not in arguments.only:
             continue
         reference = run(NONE, arguments)
-        show("no identity", cells(reference, reference.wall_s))
-        show(name, cells(run(settings, arguments), reference.wall_s))
+        show("no identity", cells(reference, reference.timing.whole_s))
+        show(name, cells(run(settings, arguments), reference.timing.whole_s))
 
 
 if __name__ == "__main__":

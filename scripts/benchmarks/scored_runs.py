@@ -23,11 +23,6 @@ class ScoredRun:
     timing: TimingRecord
     lost: list[FrameRecord]
 
-    @property
-    def wall_s(self) -> float:
-        """Seconds from the first frame to the last identity step, scoring excluded."""
-        return self.timing.wall_s + self.timing.mapping.identity_finish
-
 
 def scored_run(
     recording: Path, settings: Sequence[str] = (), words: Sequence[str] = (), scale: float = 0.5,

@@ -59,7 +59,7 @@ def add_schedules(paper: Paper, recording: Path, short: list[str]) -> None:
     """Table 2."""
     for name, settings in list(SCHEDULES.items())[: 3 if short else None]:
         done = scored_run(recording, settings, short)
-        remark = f"{done.wall_s:.0f} s from the first frame to the last identity step"
+        remark = f"{done.timing.whole_s:.0f} s from the first frame to the last identity step"
         paper.add("table 2", name, "", scores(done.metrics), remark)
 
 
@@ -79,7 +79,7 @@ def add_ablation(paper: Paper, recording: Path, short: list[str]) -> None:
     words = short or ["--stop", str(ABLATION_FRAMES)]
     for name, settings in list(ABLATION.items())[:: 3 if short else 1]:
         done = scored_run(recording, [*NONE, *settings], words)
-        remark = f"{done.metrics.map.gaussians} Gaussians, {done.timing.wall_s:.0f} s"
+        remark = f"{done.metrics.map.gaussians} Gaussians, {done.timing.whole_s:.0f} s"
         paper.add("ablation", name, "", scores(done.metrics), remark)
 
 

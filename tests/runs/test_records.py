@@ -100,3 +100,8 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     assert MetricsRecord.read_if_there(tmp_path) is None
     with pytest.raises(RunFolderError, match=r"metrics\.json: .*missing"):
         MetricsRecord.read(tmp_path)
+
+
+def test_the_whole_time_of_a_run_has_its_refinement() -> None:
+    timing = TimingRecord.of({"wall_s": 2.0, "refinement_s": 3.0, "mapping": {"identity_finish": 0.5, "forward": 9.0}})
+    assert timing.whole_s == 5.5

@@ -105,6 +105,12 @@ class TimingRecord(RecordFile):
             "peak_rss_mb": peak_memory_mb(), "paging": result.paging,
         })  # fmt: skip
 
+    @property
+    def whole_s(self) -> float:
+        """Seconds of wall time from the first frame to the end of the last identity steps, the final refinement
+        included; scoring and reading the recording's list of frames are not."""
+        return self.wall_s + self.refinement_s + self.mapping.identity_finish
+
     def notes(self) -> list[str]:
         """What a user should know, a line each."""
         if not self.dropped_frames:
