@@ -71,8 +71,11 @@ class MessageTypes:
             if not any(line and "=" not in line.split("<=")[0] for line in lines):
                 text += f"\nuint8 {EMPTY_FIELD}\n"
             try:  # the package reads a name with another group than msg as a package's
-                parsed = self._parse(text, f"{package}/msg/{name}")
-                self._store.register({kind: parsed[f"{package}/msg/{name}"]})
+                parsed = self._parse(text, f"{package}/msg/{name}")[f"{package}/msg/{name}"]
+                for other in references(parsed[1]):
+                    if other not in self._store.types:
+                        raise MiddlewareError(f"no message type {other} is known")
+                self._store.register({kind: parsed})
             except Exception as error:  # the package raises many types
                 raise MiddlewareError(f"`{kind}`: its definition cannot be read: {error}") from None
 
@@ -123,6 +126,13 @@ class MessageTypes:
                 else:
                     raise MiddlewareError(f"no type {kind} is known")
             return self._hashes[kind]
+
+
+def references(fields: list[tuple[str, Any]]) -> set[str]:
+    """Types that fields refer to, as rosbags describes them: (node, rest), where nodes are BASE 1, NAME 2, ARRAY 3 and
+    SEQUENCE 4."""
+    inner = [desc[1][0] if int(desc[0]) in (3, 4) else desc for _, desc in fields]
+    return {desc[1] for desc in inner if int(desc[0]) == 2}
 
 
 @cache

@@ -17,7 +17,7 @@ CONFIG_FILE: Final = "ZENOH_SESSION_CONFIG_URI"
 QUEUE_BATCHES: Final = 16
 """Batches of 64 KiB that wait for a link: a picture of 1 MB fits, so only a link that stands still loses messages."""
 WAIT_US: Final = 1000
-"""Longest wait of a sender for room in a link's queue, microseconds; where a link stands still, only the first waits."""
+"""Longest wait of a sender for room in the queue of a link, microseconds."""
 FRAGMENTS_WAIT_US: Final = 20_000
 """The same, of a message of many batches."""
 
