@@ -47,6 +47,17 @@ def header(types: MessageTypes, frame: str, seconds: float) -> Any:
     return types.make("std_msgs/msg/Header", stamp=stamp_of(types, seconds), frame_id=frame)
 
 
+def with_stamp(content: bytes, seconds: float) -> bytes:
+    """A message in CDR, little-endian, that begins with a header: the same with another time in it."""
+    nanoseconds = round(seconds * 1e9)
+    return content[:4] + struct.pack("<iI", nanoseconds // 10**9, nanoseconds % 10**9) + content[12:]
+
+
+def with_infinity(depth: np.ndarray, no_return: np.ndarray | None) -> np.ndarray:
+    """Depth float32 [H, W] that says +inf where the sensor found nothing within its range (REP 117)."""
+    return depth if no_return is None else np.where(no_return, np.float32(np.inf), depth)
+
+
 def depth_mm(depth: np.ndarray) -> np.ndarray:
     """Depth float32 [H, W], metres -> uint16 millimetres, rounded; 0 where there is none, or more than fits."""
     units = np.rint(np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0) * np.float32(MM_PER_M))

@@ -62,7 +62,7 @@ def parse_address(text: str) -> TopicsAddress:
         role, equals, topic = word.rpartition("=")
         role = role if equals else TOPIC_ROLES[place] if place < len(TOPIC_ROLES) else ""
         if role not in TOPIC_ROLES or role in topics or not topic:
-            raise SequenceError(f"{text}: {_LAYOUT}, found `{word}`")
+            raise SequenceError(f"{text}: {_LAYOUT}, found {word!r}")
         topics[role] = full_name(node.namespace, topic)
     if not {"color", "depth"} <= set(topics):
         raise SequenceError(f"{text}: {_LAYOUT}")
@@ -84,12 +84,12 @@ def _values(text: str, query: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, value in parse_qsl(query, keep_blank_values=True):
         if name not in _KEYS:
-            raise SequenceError(f"{text}: expected one of {', '.join(_KEYS)} after the ?, found `{name}`")
+            raise SequenceError(f"{text}: expected one of {', '.join(_KEYS)} after the ?, found {name!r}")
         field_name, read = _KEYS[name]
         try:
             values[field_name] = read(value)
         except ValueError as error:
-            raise SequenceError(f"{text}: `{name}`: expected {error}, found {value!r}") from None
+            raise SequenceError(f"{text}: {name}: expected {error}, found {value!r}") from None
     return values
 
 
