@@ -221,9 +221,9 @@ def run(
     given = overrides_of(context.params)
     node = network.node_request(middleware, domain, namespace, address)
     request = replace(
-        _request(reading, record, node), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
-        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check, loss=loss,
-        energy=energy, encode=coded_as,
+        _request(reading, record, node), out=out, config=config, overrides=given, evaluate=evaluate,
+        overwrite=overwrite, map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check,
+        loss=loss, energy=energy, encode=coded_as,
     )  # fmt: skip
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
 

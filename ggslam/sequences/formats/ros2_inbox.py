@@ -152,4 +152,4 @@ class PairInbox:
         """Why images were left out, and how often."""
         with self._changed:
             damaged = {f"damaged, {topic}": count for topic, count in self.damaged.items()}
-            return {**self._matcher.unmatched, **damaged}
+            return {name: count for name, count in {**self._matcher.unmatched, **damaged}.items() if count}
