@@ -76,7 +76,7 @@ def add_network(place: Path, node: NodeRequest) -> Path:
     named, _, query = text.partition("?")
     own = dict(parse_qsl(query))
     asked = {name: str(getattr(node, name)) for name in _NODE if getattr(node, name) != getattr(plain, name)}
-    told = urlencode({**asked, **own}, safe="/:,")
+    told = urlencode({**own, **{name: asked[name] for name in asked if name not in own}}, safe="/:,")
     return Path(f"{named}?{told}" if told else named)
 
 

@@ -106,8 +106,8 @@ class PairInbox:
         with self._changed:
             self._changed.wait_for(lambda: self._slot is not None, timeout_s)
             if self._slot is None and time.monotonic() - self._last_at > InboxTuning.settle_s:
-                for pair in self._matcher.settle():
-                    self._put(*pair)
+                for settled in self._matcher.settle():
+                    self._put(*settled)
             pair, self._slot = self._slot, None
             self.taken += pair is not None
             return pair
