@@ -3,30 +3,15 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from pathlib import Path
 
-import numpy as np
 import pytest
+from networks import Network, end, image, wait_until
+from peer import IMAGE, PAIRS, TEXT, TRIGGER, register
 
-sys.path.insert(0, str(Path(__file__).parent))
-from conftest import Network, end, wait_until  # noqa: E402
-from peer import IMAGE, PAIRS, TEXT, TRIGGER, register  # noqa: E402
-
-from ggslam.errors import MiddlewareError  # noqa: E402
-from ggslam.middleware.node import LATCHED, Qos, Received  # noqa: E402
-from ggslam.middleware.types import message_types  # noqa: E402
-
-
-def image(number: int, height: int = 480, width: int = 640) -> bytes:
-    types = message_types("jazzy")
-    stamp = types.make("builtin_interfaces/msg/Time", sec=number, nanosec=0)
-    header = types.make("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
-    data = np.random.default_rng(number).integers(0, 255, height * width * 3, np.uint8)
-    return types.encode(IMAGE, types.make(
-        IMAGE, header=header, height=height, width=width, encoding="rgb8", is_bigendian=0, step=3 * width, data=data
-    ))  # fmt: skip
+from ggslam.errors import MiddlewareError
+from ggslam.middleware.node import LATCHED, Qos, Received
+from ggslam.middleware.types import message_types
 
 
 def test_images_go_and_come_back(network: Network) -> None:
