@@ -66,6 +66,7 @@ def check_equal(frames: list[Frame], sequence: Sequence) -> None:
         np.testing.assert_allclose(frame.depth, wanted.depth, atol=5.1e-4)
 
 
+@pytest.mark.long("starts `ggslam play` twice, in processes of their own")
 def test_frames_come_in_order_and_a_player_may_be_killed(room: Path, places: Places) -> None:
     """None is lost uncounted. The first player is killed; a second one is taken up by the same camera."""
     sequence = open_sequence(room)
