@@ -7,19 +7,23 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from live_topics import ADDRESS, CAMERA, COMPRESSED, IMAGE, INFO, PATIENT, TopicCamera, color_of, depth_of
+from live_topics import ADDRESS, CAMERA, COMPRESSED, IMAGE, INFO, PATIENT, TF, TopicCamera, color_of, depth_of
 
 pytest.importorskip("rosbags")
 sys.path.insert(0, str(Path(__file__).parent.parent / "middleware"))
 from local_node import LocalNetwork
 
 from ggslam.errors import GgslamError, SequenceError
+from ggslam.messages.contents import Lens
+from ggslam.messages.ros2_images import camera_info_message, header
 from ggslam.middleware.node import Qos, Received
 from ggslam.scene.camera import Camera
+from ggslam.sequences.formats.ros2_infos import InfoTuning
 from ggslam.sequences.formats.ros2_topics import LiveTopicsTuning, Ros2Camera
 from ggslam.sequences.live import LiveSequence
 from ggslam.system.tuning import overridden
@@ -111,9 +115,6 @@ def test_camera_info_without_calibration(network: LocalNetwork) -> None:
 
 
 def _zero(camera: TopicCamera) -> object:
-    from ggslam.messages.contents import Lens
-    from ggslam.messages.ros2_images import camera_info_message
-
     message = camera_info_message(camera.types, Lens("color_optical", CAMERA), 1.0)
     message.k[:] = 0
     return message
@@ -130,6 +131,59 @@ def test_other_camera_later(network: LocalNetwork) -> None:
     next(source.frames())
     assert [text for text in said if "another camera than at the start" in text] == said and len(said) == 1
     assert source.camera == CAMERA
+
+
+def tf_static(camera: TopicCamera, shift: float) -> bytes:
+    """/tf_static with the depth camera `shift` metres to the right of colour."""
+    make = camera.types.make
+    transform = make(
+        "geometry_msgs/msg/Transform", translation=make("geometry_msgs/msg/Vector3", x=shift, y=0.0, z=0.0),
+        rotation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+    )  # fmt: skip
+    link = make(
+        "geometry_msgs/msg/TransformStamped", header=header(camera.types, "color_optical", 0.0),
+        child_frame_id="depth_optical", transform=transform,
+    )  # fmt: skip
+    return camera.types.encode(TF, make(TF, transforms=[link]))
+
+
+def test_depth_of_another_camera(network: LocalNetwork) -> None:
+    """Where it stands is told by /tf_static, sent once, before or a moment after; without it that is said."""
+    camera = TopicCamera(network.node("camera"))
+    camera.frames = ("color_optical", "depth_optical")
+    with overridden(InfoTuning, transform_s=0.2):
+        source = started(network, camera)
+    assert len(source.warnings) == 1 and "/tf_static does not tell where it is" in source.warnings[0]
+    assert LiveSequence(source).warnings == source.warnings
+    source.close()
+    threading.Timer(0.5, lambda: camera.fixed.send(tf_static(camera, 2.0))).start()
+    source = started(network, camera)
+    beside = source._frames._recording.depth_camera
+    assert not source.warnings and beside is not None and beside.T_color_depth[0, 3] == 2.0
+    frame = next(source.frames())
+    assert frame.depth.shape == (48, 64) and (frame.depth[:, 0] == 0).all()  # it does not see the left border
+    source.close()
+
+
+def test_lens(network: LocalNetwork) -> None:
+    """Distortion is undone of plain images, not of rectified ones, whose camera is P."""
+    for name, distorted in (("camera", True), ("image_rect", False)):
+        camera = TopicCamera(network.node(f"{name}_node"), f"/{name}")
+        camera.send_info = partial(send_lens, camera)  # type: ignore[method-assign]
+        color = camera.color if distorted else camera.node.publisher("/image_rect/rect_color", IMAGE, Qos())
+        camera.color = color
+        camera.send_later(0, 10.0)
+        source = opened(network, f"ros2:/{color.topic},{camera.depth.topic}?wait=5")
+        assert (source._frames._recording.distortion is not None) is distorted
+        assert source.camera.fx == (60.0 if distorted else 50.0)
+        source.close()
+
+
+def send_lens(camera: TopicCamera) -> None:
+    message = camera_info_message(camera.types, Lens("color_optical", CAMERA), 1.0)
+    message.d[:2] = (0.1, -0.05)
+    message.p[0] = message.p[5] = 50.0
+    camera.info.send(camera.types.encode(INFO, message))
 
 
 def test_clock_that_goes_back(network: LocalNetwork) -> None:
