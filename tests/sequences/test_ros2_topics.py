@@ -229,8 +229,11 @@ def test_silence(network: LocalNetwork) -> None:
         again = TopicCamera(network.node("again"))
         threading.Timer(0.4, lambda: again.send(1, 11.0)).start()
         assert next(frames).timestamp == 11.0
-        assert "no pair of images from `/camera/color`" in said[0] and said[1].startswith("images come again after")
+        assert said[0].startswith("no images from `/camera/color` and `/camera/depth`, for ")
+        assert said[1].startswith("images come again after")
+        threading.Timer(0.1, lambda: again.send(2, 12.0, 0.3)).start()
         assert list(frames) == [] and "idle=0.8" in said[-1]
+        assert "no two images were taken within 0.02 s of one another; the closest are 0.300 s apart" in said[-2]
 
 
 def test_interrupt_while_nothing_comes(network: LocalNetwork) -> None:

@@ -166,7 +166,7 @@ class Ros2Camera:
 
     def _next_pair(self) -> ImagePair | None:
         """The newest pair, however long it takes; None: the frames end."""
-        began, told = time.monotonic(), False
+        began, told, before = time.monotonic(), False, self._inbox.received.total()
         while self._going_on():
             pair = self._inbox.take(LiveTopicsTuning.slice_s)
             for text in [*self._inbox.events(), *self._infos.events()]:
@@ -182,7 +182,8 @@ class Ros2Camera:
             if not told and silent > LiveTopicsTuning.silent_s:
                 told = True
                 names = f"`{self._topics['color']}` and `{self._topics['depth']}`"
-                self._say(f"no pair of images from {names} for {silent:.0f} s; waiting (Ctrl-C ends)")
+                why = f"no images from {names}" if self._inbox.received.total() == before else self._why_unpaired()
+                self._say(f"{why}, for {silent:.0f} s; waiting (Ctrl-C ends)")
         return None
 
     def counts(self) -> dict[str, int]:
