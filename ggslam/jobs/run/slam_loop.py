@@ -129,6 +129,7 @@ class SlamLoop:
     def _side_by_side(self, slam: Slam, frames: Iterator[Frame]) -> None:
         """All frames in real time."""
         paced = RealtimeSlam(slam, self.config.realtime_fps, live=isinstance(self.sequence, LiveSequence))
+        paced.clock.drops = not (isinstance(self.sequence, LiveSequence) and self.sequence.counts() is not None)
         if self.latency is None:
             self.latency = LatencyMeter(paced.clock.due, time.perf_counter)
         paced.mapped = self.latency.in_map
