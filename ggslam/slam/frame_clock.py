@@ -31,13 +31,16 @@ class FrameClock:
         live: whether the source keeps its own pace.
         now: tells the time, seconds.
         sleep: lets seconds pass.
+
+    Attributes:
+        drops: whether late frames are dropped; not of a source that itself hands out the newest one only.
     """
 
     def __init__(
         self, period: float, live: bool = False, now: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:  # fmt: skip
-        self.period, self.live = period, live
+        self.period, self.live, self.drops = period, live, True
         self._now, self._sleep = now, sleep
         self._begin = 0.0
         """When the frame of index or timestamp 0 is due."""
@@ -58,6 +61,10 @@ class FrameClock:
                 yield frame
             asked = self._now()
 
+    def due(self, frame: Frame) -> float:
+        """When a frame of a recording was due, by `now`; NaN of the first one, which starts the clock."""
+        return self._begin + self._offset(frame) if self._begin else float("nan")
+
     def _offset(self, frame: Frame) -> float:
         return frame.timestamp if self.live else frame.index * self.period
 
@@ -66,7 +73,7 @@ class FrameClock:
         late = self._now() - (self._begin + self._offset(frame))
         if late > ClockTuning.max_lag_frames * self.period:
             # Behind its buffer a recording has to be read, which takes a part of a period: that is catching up still.
-            self._catching_up = waited <= (
+            self._catching_up = self.drops and waited <= (
                 self.period / 2 if self._catching_up and not self.live else ClockTuning.waited_s
             )
             if self._catching_up:

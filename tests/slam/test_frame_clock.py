@@ -134,3 +134,10 @@ def test_frames_that_come_in_a_burst_after_a_stall_are_caught_up_with() -> None:
 
     kept, dropped = taken(clock_of(time, live=True), time, stamped, work)
     assert dropped == [] and max(lag) == pytest.approx(1.0) and lag[-1] == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_source_that_hands_out_the_newest_only_loses_none() -> None:
+    time = Time()
+    clock = clock_of(time, live=True)
+    clock.drops = False
+    assert taken(clock, time, camera(time, [0.1 * k for k in range(8)]), lambda index: 0.5) == (list(range(8)), [])
