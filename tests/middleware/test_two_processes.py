@@ -87,3 +87,13 @@ def test_a_peer_that_was_killed_is_found_again(network: Network) -> None:
     assert node.call("/trigger", TRIGGER, message_types("jazzy").make(TRIGGER + "_Request"), 8.0).success
     end(second)
     node.close()
+
+
+def test_a_request_is_answered_once(network: Network) -> None:
+    """A client that gets no answer does not ask again: the request may have done something."""
+    node, types, calls = network.node(), message_types("jazzy"), []
+    node.offer("/broken", TRIGGER, lambda request: calls.append(request))  # None is no response
+    with pytest.raises(MiddlewareError, match="/broken"):
+        node.call("/broken", TRIGGER, types.make(TRIGGER + "_Request"), 1.0)
+    assert len(calls) == 1
+    node.close()
