@@ -70,19 +70,21 @@ def test_services(network: Network) -> None:
     node.close()
 
 
-def test_a_peer_that_was_killed_is_found_again(network: Network) -> None:
-    node, got = network.node(), []
+@pytest.mark.parametrize("listens", [True, False])
+def test_a_peer_that_was_killed_is_found_again(network: Network, listens: bool) -> None:
+    """Of Zenoh, whichever of the two connects to the other."""
+    node, got = network.node(listens=listens), []
     node.subscribe("/latched", TEXT, LATCHED, got.append)
 
     def heard(process: int) -> bool:  # who listens already may get both messages of the peer
         decode = message_types("jazzy").decode
         return any(decode(TEXT, received.content).data == f"from {process}" for received in got)
 
-    peer = network.peer()
+    peer = network.peer(not listens)
     assert wait_until(lambda: heard(peer.pid))
     peer.kill()
     peer.wait(5)
-    second = network.peer()
+    second = network.peer(not listens)
     assert wait_until(lambda: heard(second.pid))
     assert node.call("/trigger", TRIGGER, message_types("jazzy").make(TRIGGER + "_Request"), 8.0).success
     end(second)
