@@ -125,6 +125,8 @@ def test_a_client_of_rmw_zenoh_is_answered(pair: tuple[ZenohNode, Any]) -> None:
         number, _, back = read_attachment(replies[0].ok.attachment.to_bytes())  # type: ignore[misc]
         assert (number, back) == (9, gid)
         assert [reply for reply in querier.get(payload=EMPTY_REQUEST) if reply.ok] == [], "it is no request of ROS 2"
+        for hostile in (b"", b"\xff" * 100, b"\0\1\0\0" + b"\xff" * 5000):
+            assert [reply for reply in querier.get(payload=hostile, attachment=attachment(9, 1, gid)) if reply.ok] == []
 
 
 def test_a_server_of_rmw_zenoh_is_called(pair: tuple[ZenohNode, Any]) -> None:
