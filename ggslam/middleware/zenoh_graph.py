@@ -34,15 +34,15 @@ class Graph:
     def hashes(self, entity: str, name: str, kind: str) -> list[str]:
         """Hash of the type of each such entity there is now: "MP", "MS", "SS" or "SC"."""
         with self._changed:
-            return self._listed(entity, name, kind)
+            return self._hashes(entity, name, kind)
 
     def wait_for(self, entity: str, name: str, kind: str, deadline: float) -> list[str]:
         """The same; waits until there is one, at most until `deadline` of the monotonic clock."""
         with self._changed:
-            self._changed.wait_for(lambda: self._listed(entity, name, kind), max(0.0, deadline - time.monotonic()))
-            return self._listed(entity, name, kind)
+            self._changed.wait_for(lambda: self._hashes(entity, name, kind), max(0.0, deadline - time.monotonic()))
+            return self._hashes(entity, name, kind)
 
-    def _listed(self, entity: str, name: str, kind: str) -> list[str]:
+    def _hashes(self, entity: str, name: str, kind: str) -> list[str]:
         wanted = (entity, name, kind)
         return [one.type_hash for one in self._shown.values() if (one.entity, one.name, one.kind) == wanted]
 
