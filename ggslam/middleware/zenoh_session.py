@@ -16,8 +16,10 @@ CONFIG_FILE: Final = "ZENOH_SESSION_CONFIG_URI"
 """Variable that names a configuration file of sessions, as for rmw_zenoh_cpp."""
 QUEUE_BATCHES: Final = 16
 """Batches of 64 KiB that wait for a link: a picture of 1 MB fits, so only a link that stands still loses messages."""
-WAIT_US: Final = 1000
-"""Longest wait of a sender for room in the queue of a link, microseconds."""
+WAIT_US: Final = 20_000
+"""Longest wait of a sender for room in the queue of a link, microseconds: once, when a link comes to a stand. A second
+picture right behind another waits for what a busy machine has not written yet; with 1 ms about five times as many are
+lost there."""
 FRAGMENTS_WAIT_US: Final = 50_000
 """The same, of a message of many batches."""
 
