@@ -45,9 +45,9 @@ class Network:
     def node(self, name: str = "own", listens: bool = True) -> Node:
         return open_node(NodeRequest(self.middleware, self.domain, "", self.address(listens), "jazzy"), name)
 
-    def peer(self) -> subprocess.Popen[str]:
-        """A peer that is ready; it connects to the node of this process."""
-        command = [sys.executable, str(PEER), self.middleware, self.address(False), str(self.domain)]
+    def peer(self, listens: bool = False) -> subprocess.Popen[str]:
+        """A peer that is ready; it connects to the node of this process, or is connected to."""
+        command = [sys.executable, str(PEER), self.middleware, self.address(listens), str(self.domain)]
         made = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert made.stdout is not None and made.stdout.readline() == "ready\n"
         return made

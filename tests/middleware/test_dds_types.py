@@ -91,6 +91,27 @@ def test_plain_cyclonedds_and_a_node_read_each_other(domain: int) -> None:
     node.close()
 
 
+def test_nodes_are_shown(domain: int) -> None:
+    """On the topic by which rmw_cyclonedds_cpp tells which node has which readers and writers."""
+    node = DdsNode(ours.NodeRequest("dds", domain, "robot", "127.0.0.1", "jazzy"), "own")
+    node.publisher("points", IMAGE, ours.Qos())
+    node.subscribe("/camera/color", IMAGE, ours.Qos(), print)
+    participant = DOMAINS.join(domain, "127.0.0.1")
+    kind = "rmw_dds_common/msg/ParticipantEntitiesInfo"
+    topic = Topic(participant, "ros_discovery_info", RawTypes(node.types).raw(kind))
+    latched = [Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal, Policy.History.KeepAll]
+    reader, got = DataReader(participant, topic, Qos(*latched)), []
+    assert wait_until(lambda: bool(got.extend(reader.take(10)) or got))
+    seen = node.types.decode(kind, got[-1].content)
+    (shown,) = seen.node_entities_info_seq
+    assert (shown.node_namespace, shown.node_name) == ("/robot", "own")
+    assert len(shown.reader_gid_seq) == len(shown.writer_gid_seq) == 1
+    assert bytes(seen.gid.data[:12]) == bytes(shown.writer_gid_seq[0].data[:12])
+    assert node.topics() == {"/robot/points": IMAGE, "/camera/color": IMAGE}
+    DOMAINS.leave(domain, participant)
+    node.close()
+
+
 def test_types_have_the_members_of_ros() -> None:
     raw = RawTypes(message_types("jazzy"))
     made = raw.raw(IMAGE)

@@ -70,20 +70,32 @@ def test_services(network: Network) -> None:
     node.close()
 
 
-def test_a_peer_that_was_killed_is_found_again(network: Network) -> None:
-    node, got = network.node(), []
+@pytest.mark.parametrize("listens", [True, False])
+def test_a_peer_that_was_killed_is_found_again(network: Network, listens: bool) -> None:
+    """Of Zenoh, whichever of the two connects to the other."""
+    node, got = network.node(listens=listens), []
     node.subscribe("/latched", TEXT, LATCHED, got.append)
 
     def heard(process: int) -> bool:  # who listens already may get both messages of the peer
         decode = message_types("jazzy").decode
         return any(decode(TEXT, received.content).data == f"from {process}" for received in got)
 
-    peer = network.peer()
+    peer = network.peer(not listens)
     assert wait_until(lambda: heard(peer.pid))
     peer.kill()
     peer.wait(5)
-    second = network.peer()
+    second = network.peer(not listens)
     assert wait_until(lambda: heard(second.pid))
     assert node.call("/trigger", TRIGGER, message_types("jazzy").make(TRIGGER + "_Request"), 8.0).success
     end(second)
+    node.close()
+
+
+def test_a_request_is_answered_once(network: Network) -> None:
+    """A client that gets no answer does not ask again: the request may have done something."""
+    node, types, calls = network.node(), message_types("jazzy"), []
+    node.offer("/broken", TRIGGER, lambda request: calls.append(request))  # None is no response
+    with pytest.raises(MiddlewareError, match="/broken"):
+        node.call("/broken", TRIGGER, types.make(TRIGGER + "_Request"), 1.0)
+    assert len(calls) == 1
     node.close()

@@ -69,13 +69,13 @@ def test_tokens_show_what_a_node_has(pair: tuple[ZenohNode, Any]) -> None:
         replies = session.liveliness().get("@ros2_lv/7/**", timeout=2)
         return {"/".join(str(r.ok.key_expr).split("/")[5:]) for r in replies if r.ok}
 
-    shown = tokens()
-    assert shown == {
+    wanted = {
         "NN/%/%/own",
         f"MP/%/%/own/%chatter/{TEXT_KEY}/{type_hash}/2::,5:,:,:,,",
         f"MS/%/%/own/%map/{TEXT_KEY}/{type_hash}/:1:,1:,:,:,,",
         f"SS/%/%/own/%trigger/std_srvs::srv::dds_::Trigger_/{service_hash}/::,10:,:,:,,",
     }
+    assert wait_until(lambda: tokens() == wanted), tokens()
     subscription.close()
     assert wait_until(lambda: not any(token.startswith("MS") for token in tokens()))
 
@@ -125,6 +125,8 @@ def test_a_client_of_rmw_zenoh_is_answered(pair: tuple[ZenohNode, Any]) -> None:
         number, _, back = read_attachment(replies[0].ok.attachment.to_bytes())  # type: ignore[misc]
         assert (number, back) == (9, gid)
         assert [reply for reply in querier.get(payload=EMPTY_REQUEST) if reply.ok] == [], "it is no request of ROS 2"
+        for hostile in (b"", b"\xff" * 100, b"\0\1\0\0" + b"\xff" * 5000):
+            assert [reply for reply in querier.get(payload=hostile, attachment=attachment(9, 1, gid)) if reply.ok] == []
 
 
 def test_a_server_of_rmw_zenoh_is_called(pair: tuple[ZenohNode, Any]) -> None:
@@ -139,8 +141,12 @@ def test_a_server_of_rmw_zenoh_is_called(pair: tuple[ZenohNode, Any]) -> None:
         query.reply(where, content, attachment=query.attachment.to_bytes())
 
     session.declare_queryable(where, reply, complete=True)
+    place = "@ros2_lv/7/aac3178e146ba6f1fc6e6a4085e77f21/0/10/SS/%/%/server"
+    shown = f"{place}/%trigger/std_srvs::srv::dds_::Trigger_/RIHS01_other/::,10:,:,:,,"
+    token = session.liveliness().declare_token(shown)
     assert node.call("/trigger", TRIGGER, node.types.make(TRIGGER + "_Request"), 5) == response
-    assert seen[0][0] == EMPTY_REQUEST and seen[0][1] is not None
+    assert len(seen) == 1 and seen[0][0] == EMPTY_REQUEST and seen[0][1] is not None
+    token.undeclare()
 
 
 def test_latched_messages_are_those_of_advanced_publishers(pair: tuple[ZenohNode, Any]) -> None:
