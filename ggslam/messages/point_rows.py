@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Points and Gaussians as rows of a packed table, the content of point clouds in ROS 2 and Foxglove.
 
-Gaussians are written as 3DGS's PLY files have them, so that who reads those reads these: `x y z`, `scale_0..2` (natural
-logarithm of metres), `rot_0..3` (quaternion w x y z), `opacity` (logit), `f_dc_0..2` and `f_rest_*` (colour by spherical
-harmonics, all of red first), and `id`. A colour in front lets viewers of plain clouds show them, too.
+Gaussians are written as 3DGS's PLY files have them, so that who reads those reads these: `x y z`, `scale_0..2`
+(natural logarithm of metres), `rot_0..3` (quaternion w x y z), `opacity` (logit), `f_dc_0..2` and `f_rest_*` (colour
+by spherical harmonics, all of red first), and `id`. A colour in front lets viewers of plain clouds show them, too.
 """
 
 from __future__ import annotations
