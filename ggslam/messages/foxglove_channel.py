@@ -95,7 +95,7 @@ class FoxgloveChannel:
                 self._sink.log(self._last[0], log_time=self._last[1])
 
     def _message(self, content: Content, stamp: float) -> bytes:
-        write: Callable[[Any, float], bytes] = {
+        writers: dict[type, Callable[..., bytes]] = {
             Transforms: self._transforms,
             Pose: pose_message,
             Path: path_message,
@@ -107,8 +107,8 @@ class FoxgloveChannel:
             Grid: self._grid_message,
             Things: self._things,
             Verdicts: verdicts_message,
-        }[type(content)]
-        return write(content, stamp)
+        }
+        return writers[type(content)](content, stamp)
 
     def _transforms(self, content: Transforms, stamp: float) -> bytes:
         edges: list[Edge] = [(*edge, stamp) for edge in content.edges]

@@ -128,14 +128,14 @@ class Ros2Channel:
 
     def messages(self, content: Content, stamp: float) -> Messages:
         """The messages that tell a content, by topic."""
-        write: Callable[[Content, float], Messages] = {
+        writers: dict[type, Callable[..., Messages]] = {
             Transforms: self._transforms,
             Picture: self._picture,
             Grid: self._grid,
             Things: self._things,
             Mesh: self._mesh,
-        }.get(type(content), self._single)  # type: ignore[assignment]
-        return write(content, stamp)
+        }
+        return writers.get(type(content), self._single)(content, stamp)
 
     def _single(self, content: Content, stamp: float) -> Messages:
         """Contents of one topic."""
