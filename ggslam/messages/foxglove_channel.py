@@ -138,7 +138,8 @@ class FoxgloveChannel:
         if content.at is not None and self._grid is not None:
             (row, column), (height, width) = content.at, content.cells.shape
             whole = self._grid.cells.copy()
-            whole[row : row + height, column : column + width] = content.cells
+            place = whole[row : row + height, column : column + width]  # what lies outside has no place
+            place[:] = content.cells[: place.shape[0], : place.shape[1]]
             content = replace(self._grid, cells=whole)
         if content.at is None:
             self._grid = content

@@ -64,10 +64,10 @@ def picture_message(content: Picture, stamp: float) -> bytes:
     if image.ndim == 2:
         form, stored, options = "png", depth_mm(image), [cv2.IMWRITE_PNG_COMPRESSION, PictureTuning.png_level]
     elif content.compressed:
-        form, stored, options = "jpeg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, PictureTuning.jpeg_quality]
+        form, stored, options = "jpeg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, PictureTuning.jpeg_quality]
     else:
-        form, stored, options = "png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, PictureTuning.png_level]
-    data = cv2.imencode(f".{form}", np.ascontiguousarray(stored), options)[1].tobytes()
+        form, stored, options = "png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, PictureTuning.png_level]
+    data = cv2.imencode(f".{form}", stored, options)[1].tobytes()
     made = foxglove_messages().CompressedImage(
         timestamp=timestamp(stamp), frame_id=plain_text(content.frame), data=data, format=form
     )

@@ -178,7 +178,8 @@ def test_things(tmp_path: Path) -> None:
 
 def test_grid_and_parts_of_it(tmp_path: Path) -> None:
     whole, part = sample_grid(), sample_grid(2, 3, at=(4, 5))
-    first, second = told(tmp_path, Channel("grid", Grid), whole, part)
+    outside = sample_grid(2, 3, at=(6, 9))
+    first, second, third = told(tmp_path, Channel("grid", Grid), whole, part, outside)
     assert np.array_equal(np.frombuffer(first.data, np.int8).reshape(7, -1), whole.cells)
     assert (first.column_count, first.row_stride, first.cell_stride) == (11, 11, 1)
     assert (first.cell_size.x, first.cell_size.y) == (0.05, 0.05)
@@ -186,6 +187,8 @@ def test_grid_and_parts_of_it(tmp_path: Path) -> None:
     expected = whole.cells.copy()
     expected[4:6, 5:8] = part.cells
     assert np.array_equal(np.frombuffer(second.data, np.int8).reshape(7, -1), expected)
+    expected[6:, 9:] = outside.cells[:1, :2]
+    assert np.array_equal(np.frombuffer(third.data, np.int8).reshape(7, -1), expected)
 
 
 def test_verdicts(tmp_path: Path) -> None:
