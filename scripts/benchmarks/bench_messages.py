@@ -23,7 +23,7 @@ from ggslam.messages.ros2_grids import GRID, grid_message
 from ggslam.messages.ros2_images import COMPRESSED, IMAGE, compressed_message, image_message
 from ggslam.messages.ros2_markers import MARKERS, markers_message, mesh_marker
 from ggslam.messages.ros2_points import CLOUD, cloud_message
-from ggslam.middleware.types import MessageTypes, message_types
+from ggslam.middleware.types import message_types
 
 STAMP = 1_700_000_000.25
 
@@ -38,11 +38,12 @@ def processor_ms(work: Callable[[], Any], least_s: float = 0.5) -> float:
     return best * 1000
 
 
-def by_objects(types: MessageTypes, kind: str, content: bytes) -> Callable[[], bytes]:
+def by_objects(kind: str, content: bytes) -> Callable[[], bytes]:
     """The same message written by mcap-ros2-support from its objects."""
     from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
+    from rosbags.typesys import Stores, get_typestore
 
-    text = types._store.generate_msgdef(kind, ros_version=2)[0]
+    text = get_typestore(Stores.ROS2_JAZZY).generate_msgdef(kind, ros_version=2)[0]
     message = generate_dynamic(kind, text)[kind](content)
     write = serialize_dynamic(kind, text)[kind]
     return lambda: write(message)
@@ -92,7 +93,7 @@ def ros2_rows(points: Points, grid: Grid, mesh: Mesh, path: Path, color: Picture
          lambda: types.encode(COMPRESSED, compressed_message(types, depth, STAMP)), False),
     ]  # fmt: skip
     return [
-        row(f"ROS 2: {name}", write, by_objects(types, kind, write()) if compare else None)
+        row(f"ROS 2: {name}", write, by_objects(kind, write()) if compare else None)
         for name, kind, write, compare in writers
     ]
 

@@ -12,19 +12,52 @@ from typing import Any
 
 import numpy as np
 
-from ggslam.middleware.types import ADDED
+LINE = "=" * 80
+OTHERS = {
+    "map_msgs/msg/OccupancyGridUpdate": ("""std_msgs/Header header
+int32 x
+int32 y
+uint32 width
+uint32 height
+int8[] data
+""", ("std_msgs/msg/Header",)),
+    "vision_msgs/msg/Detection3DArray": (f"""std_msgs/Header header
+vision_msgs/Detection3D[] detections
+{LINE}
+MSG: vision_msgs/Detection3D
+std_msgs/Header header
+vision_msgs/ObjectHypothesisWithPose[] results
+vision_msgs/BoundingBox3D bbox
+string id
+{LINE}
+MSG: vision_msgs/ObjectHypothesisWithPose
+vision_msgs/ObjectHypothesis hypothesis
+geometry_msgs/PoseWithCovariance pose
+{LINE}
+MSG: vision_msgs/ObjectHypothesis
+string class_id
+float64 score
+{LINE}
+MSG: vision_msgs/BoundingBox3D
+geometry_msgs/Pose center
+geometry_msgs/Vector3 size
+""", ("std_msgs/msg/Header", "geometry_msgs/msg/PoseWithCovariance", "geometry_msgs/msg/Vector3")),
+}  # fmt: skip
+"""Definitions as map_msgs and vision_msgs 4 publish them, and the types of the distribution that they are made of."""
 
 
 @cache
 def definition(kind: str, distribution: str = "jazzy") -> bytes:
     """The definition of a type of ROS 2, with those that it is made of."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores[f"ROS2_{distribution.upper()}"])
-    for added, text in ADDED.items():
-        if added not in store.types:
-            store.register(get_types_from_msg(text, added))
-    return store.generate_msgdef(kind, ros_version=2)[0].encode()
+    if kind not in OTHERS:
+        return store.generate_msgdef(kind, ros_version=2)[0].encode()
+    text, parts = OTHERS[kind]
+    for part in parts:
+        text += f"{LINE}\nMSG: {part.replace('/msg/', '/')}\n{store.generate_msgdef(part, ros_version=2)[0]}"
+    return text.encode()
 
 
 def read_ros2(kind: str, content: bytes, distribution: str = "jazzy") -> Any:
