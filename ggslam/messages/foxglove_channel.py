@@ -74,7 +74,6 @@ class FoxgloveChannel:
         self._fixed: dict[str, Edge] = {}
         self._shown: set[str] = set()
         self._grid: Grid | None = None
-        self._parts: dict[str, bytes] = {}
         self._last: tuple[bytes, int] | None = None
 
     def send(self, content: Content, stamp: float) -> int:
@@ -82,14 +81,14 @@ class FoxgloveChannel:
         with self._lock:
             message = self._message(content, stamp)
             at = whole_nanoseconds(stamp)
-            if self.channel.latched:
-                whole = scene_message(self._parts.values()) if self.channel.kind is Mesh else message
-                self._last = (whole, at)
+            if self.channel.latched and not (isinstance(content, Mesh) and content.part):
+                self._last = (message, at)
             self._sink.log(message, log_time=at)
         return len(message)
 
     def resend(self) -> None:
-        """Sends the last content again, if it is latched. To everybody: the package does not tell how to reach one."""
+        """Sends the last content again, if it is latched and not a part of a mesh, of which there are many. To
+        everybody: the package does not tell how to reach one."""
         with self._lock:
             if self._last is not None:
                 self._sink.log(self._last[0], log_time=self._last[1])
@@ -126,12 +125,8 @@ class FoxgloveChannel:
     def _mesh(self, content: Mesh, stamp: float) -> bytes:
         name = mesh_id(content)
         if not len(content.triangles):
-            self._parts.pop(name, None)
             return scene_message([], [name], stamp + AFTER_S)
-        entity = mesh_entity(content, stamp)
-        if self.channel.latched:
-            self._parts[name] = entity
-        return scene_message([entity])
+        return scene_message([mesh_entity(content, stamp)])
 
     def _grid_message(self, content: Grid, stamp: float) -> bytes:
         """A part is put into the whole, which is sent: Foxglove has no message for parts."""

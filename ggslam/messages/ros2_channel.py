@@ -66,8 +66,8 @@ class Ros2QueueTuning(Tuning):
     """Of images: newer ones are wanted."""
     updates = 100
     """Of parts of grids: none may be left out."""
-    mesh_parts = 200
-    """Of parts of meshes; who joins late gets as many."""
+    mesh_parts = 50
+    """Of parts of meshes; of a latched channel who joins late gets as many."""
     others = 10
     """Of everything else."""
 
