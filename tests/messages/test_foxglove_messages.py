@@ -34,12 +34,12 @@ pytest.importorskip("mcap")
 pytest.importorskip("google.protobuf")
 
 
-def told(folder: Path, channel: Channel, *contents: Content, stamp: float = STAMP) -> list[Any]:
-    """What contents of one channel say, as read from a file."""
+def told(folder: Path, channel: Channel, *contents: Content) -> list[Any]:
+    """What contents of one channel, all of one time, say, as read from a file."""
     outlet = FileOutlet(folder / "told.mcap", overwrite=True)
     outlet.open(channel)
-    for k, content in enumerate(contents):
-        outlet.send(channel, content, stamp + k)
+    for content in contents:
+        outlet.send(channel, content, STAMP)
     outlet.close()
     (messages,) = read_foxglove(folder / "told.mcap").values()
     return messages
@@ -173,6 +173,7 @@ def test_things(tmp_path: Path) -> None:
         assert text.text and "\0" not in text.text
         assert len(entity.arrows) == (thing.velocity is not None)
     assert {deletion.id for deletion in second.deletions} == {str(HUGE), "7"}
+    assert stamp_ns(second.deletions[0].timestamp) > stamp_ns(first.entities[0].timestamp)
     assert [entity.id for entity in second.entities] == ["5"]
 
 
