@@ -119,7 +119,7 @@ class FoxgloveChannel:
     def _things(self, content: Things, stamp: float) -> bytes:
         shown = {str(thing.id) for thing in content.things}
         gone, self._shown = sorted(self._shown - shown), shown
-        entities = [thing_entity(content.frame, thing, stamp) for thing in content.things]
+        entities = [thing_entity(content.frame, thing, stamp, content.up) for thing in content.things]
         return scene_message(entities, gone, stamp + AFTER_S)
 
     def _mesh(self, content: Mesh, stamp: float) -> bytes:

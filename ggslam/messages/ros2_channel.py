@@ -182,7 +182,7 @@ class Ros2Channel:
         for thing in content.things:
             number = self._ids.of(thing.id)
             shown.add(number)
-            markers += thing_markers(frame, thing, number)
+            markers += thing_markers(frame, thing, number, content.up)
         for number in sorted(self._shown - shown):
             markers += thing_deletions(frame, number)
         self._shown = shown

@@ -8,11 +8,13 @@ import math
 import numpy as np
 import pytest
 
+from ggslam.messages.contents import Thing
 from ggslam.messages.marker_ids import MarkerIds
 from ggslam.messages.pose_numbers import position_and_quaternion
 from ggslam.messages.protobuf_rows import length
 from ggslam.messages.sound_content import plain_text
 from ggslam.messages.stamps import seconds_and_nanoseconds, whole_nanoseconds
+from ggslam.messages.thing_looks import ThingTuning, label_place
 from ggslam.scene.poses import quaternion_to_matrix
 
 
@@ -63,6 +65,16 @@ def test_numbers_of_markers() -> None:
     assert len(set(numbers)) == len(keys)
     assert all(-(2**31) <= number < 2**31 for number in numbers)
     assert [ids.of(key) for key in keys] == numbers
+
+
+def test_names_stand_above_boxes_if_somebody_knows_where_that_is() -> None:
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # the box's first side is along y
+    T[:3, 3] = 1, 2, 3
+    thing = Thing(1, "cup", T, np.array([0.4, 0.2, 0.6]))
+    assert np.array_equal(label_place(thing, None), [1, 2, 3])
+    assert np.allclose(label_place(thing, (0, -1, 0)), [1, 2 - 0.2 - ThingTuning.text_m, 3])
+    assert np.allclose(label_place(thing, (0, 0, 1)), [1, 2, 3 + 0.1 + ThingTuning.text_m])
 
 
 def test_texts() -> None:
