@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ from message_samples import STAMP, sample_contents, sample_mesh, sample_points
 from second_readers import cloud_table, read_protobuf
 from websocket_client import FoxgloveClient
 
-from ggslam.errors import MiddlewareError
+from ggslam.errors import MiddlewareError, MissingDependency
 from ggslam.messages.contents import Channel, Mesh, Points, Pose
 from ggslam.messages.foxglove_outlet import FoxgloveOutlet, FoxgloveTuning
 from ggslam.messages.stamps import whole_nanoseconds
@@ -138,6 +139,12 @@ def test_a_port_that_is_taken_is_told(outlet: FoxgloveOutlet) -> None:
     with pytest.raises(MiddlewareError, match="cannot listen at no.address"):
         FoxgloveOutlet("no.address.here.invalid", 0)
     assert str(outlet.port) in outlet.url()
+
+
+def test_without_the_package_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(MissingDependency, match=r"pip install 'ggslam\[foxglove\]'"):
+        FoxgloveOutlet(port=0)
 
 
 def test_two_servers_of_a_process_do_not_mix(outlet: FoxgloveOutlet) -> None:
