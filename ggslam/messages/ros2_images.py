@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from ggslam.messages.contents import Lens, Picture
+from ggslam.messages.stamps import seconds_and_nanoseconds
 from ggslam.middleware.types import MessageTypes
 from ggslam.system.tuning import Tuning
 
@@ -38,8 +39,8 @@ class PictureTuning(Tuning):
 
 def stamp_of(types: MessageTypes, seconds: float) -> Any:
     """builtin_interfaces/Time of a time in seconds."""
-    nanoseconds = round(seconds * 1e9)
-    return types.make("builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+    whole, nanoseconds = seconds_and_nanoseconds(seconds)
+    return types.make("builtin_interfaces/msg/Time", sec=whole, nanosec=nanoseconds)
 
 
 def header(types: MessageTypes, frame: str, seconds: float) -> Any:
@@ -49,8 +50,7 @@ def header(types: MessageTypes, frame: str, seconds: float) -> Any:
 
 def with_stamp(content: bytes, seconds: float) -> bytes:
     """A message in CDR, little-endian, that begins with a header: the same with another time in it."""
-    nanoseconds = round(seconds * 1e9)
-    return content[:4] + struct.pack("<iI", nanoseconds // 10**9, nanoseconds % 10**9) + content[12:]
+    return content[:4] + struct.pack("<iI", *seconds_and_nanoseconds(seconds)) + content[12:]
 
 
 def with_infinity(depth: np.ndarray, no_return: np.ndarray | None) -> np.ndarray:
