@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points and splats of a map: the whole of it now and then, thinned, and the tiles that changed in full."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.jobs.serve.channels import MAP, POINT_TILES, POINTS, SPLAT_TILES, SPLATS
+from ggslam.jobs.serve.publishing import MapPublisher
+from ggslam.jobs.serve.tiles import (
+    SentTiles,
+    ThinPoints,
+    Tile,
+    TileTuning,
+    at_most,
+    middle_of,
+    rows_by_key,
+    thin_points,
+    tile_of,
+)
+from ggslam.messages.contents import Channel, Points, Splats
+from ggslam.rendering.types import Gaussians
+from ggslam.scene.gaussian_map import SH_C0
+from ggslam.system.tuning import Tuning
+from ggslam.viewer.splats import colors_to_uint8, most_visible, opacities_of
+
+
+class MapContentsTuning(Tuning):
+    """How often, and how much, of a growing map is sent."""
+
+    whole_every_s = 5.0
+    """Seconds between two messages with the whole map."""
+    max_splats = 15_000
+    """Most splats of a message with the whole map: the most visible ones."""
+
+
+@dataclass(frozen=True)
+class MapCopy:
+    """A map that nobody changes any more.
+
+    Attributes:
+        gaussians: on the CPU.
+        ids: uint16 [N], object of each, 0: none.
+    """
+
+    gaussians: Gaussians
+    ids: np.ndarray
+
+
+class MapContents:
+    """Hands a map's points and splats over to a publisher, as far as somebody listens.
+
+    Args:
+        publisher: that takes them.
+    """
+
+    def __init__(self, publisher: MapPublisher) -> None:
+        self._publisher = publisher
+        self._tiles = {channel.name: SentTiles() for channel in (POINT_TILES, SPLAT_TILES)}
+        self._whole_at: dict[str, float] = {}
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is anything to do for a map."""
+        return any(self._is_due(channel) for channel in (POINTS, SPLATS)) or any(
+            self._publisher.wanted(channel) for channel in (POINT_TILES, SPLAT_TILES)
+        )
+
+    def show(self, shown: MapCopy, stamp: float, final: bool = False, harmonics: int = 1) -> None:
+        """Publishes what changed.
+
+        Args:
+            shown: the map as it is.
+            stamp: when it was so, seconds.
+            final: whether it stays so: the least change counts, and all is sent at once.
+            harmonics: most coefficients of a splat's colour.
+        """
+        g = shown.gaussians
+        surface = opacities_of(g) >= TileTuning.min_opacity
+        means, rgb = g.means.numpy(), colors_to_uint8(0.5 + SH_C0 * g.sh.numpy()[:, 0])
+        solid = means[surface], rgb[surface], shown.ids[surface]
+        if self._publisher.wanted(POINT_TILES) or self._publisher.wanted(SPLAT_TILES):
+            thin = thin_points(*solid)
+            self._point_tiles(thin, stamp, final)
+            self._splat_tiles(shown, thin, stamp, final, harmonics)
+        if self._is_due(POINTS, final):
+            self._whole_at[POINTS.name] = time.monotonic()
+            self._publisher.put(POINTS, points_of(at_most(*solid, TileTuning.max_points)), stamp)
+        if self._is_due(SPLATS, final):
+            self._whole_at[SPLATS.name] = time.monotonic()
+            rows = most_visible(g, MapContentsTuning.max_splats)
+            self._publisher.put(SPLATS, splats_of(shown, rows, harmonics), stamp)
+
+    def _is_due(self, channel: Channel, final: bool = False) -> bool:
+        rested = time.monotonic() - self._whole_at.get(channel.name, -1e9) > MapContentsTuning.whole_every_s
+        return self._publisher.wanted(channel) and (final or rested)
+
+    def _point_tiles(self, thin: ThinPoints, stamp: float, final: bool) -> None:
+        if not self._publisher.wanted(POINT_TILES):
+            return
+        for tile, rows in self._tiles[POINT_TILES.name].changed(thin, final).items():
+            if len(rows):
+                self._publisher.put(POINT_TILES, points_of(thin, rows), stamp, part_name(tile))
+            else:
+                self._gone(POINT_TILES, tile, _no_points(tile), stamp)
+
+    def _splat_tiles(self, shown: MapCopy, thin: ThinPoints, stamp: float, final: bool, harmonics: int) -> None:
+        """Splats of the tiles whose points changed."""
+        if not self._publisher.wanted(SPLAT_TILES):
+            return
+        changed = self._tiles[SPLAT_TILES.name].changed(thin, final)
+        if not changed:
+            return
+        seen = most_visible(shown.gaussians, len(shown.ids))
+        of_tiles = rows_by_key(tile_of(shown.gaussians.means.numpy()[seen]))
+        for tile in changed:
+            rows = of_tiles.get(tile)
+            if rows is not None and len(changed[tile]):
+                self._publisher.put(SPLAT_TILES, splats_of(shown, seen[rows], harmonics), stamp, part_name(tile))
+            else:
+                self._gone(SPLAT_TILES, tile, _no_splats(tile), stamp)
+
+    def _gone(self, channel: Channel, tile: Tile, empty: Points | Splats, stamp: float) -> None:
+        self._publisher.put(channel, empty, stamp, part_name(tile), keep=False)
+        self._publisher.forget(channel, part_name(tile))
+
+
+def part_name(tile: Tile) -> str:
+    """Name of a tile."""
+    return ",".join(map(str, tile))
+
+
+def points_of(thin: ThinPoints, rows: np.ndarray | None = None) -> Points:
+    """Some points, or all; `count` tells how many Gaussians one stands for, `id` its object."""
+    chosen = slice(None) if rows is None else rows
+    values = {"count": thin.count[chosen], "id": thin.ids[chosen]}
+    return Points(MAP, thin.xyz[chosen], thin.rgb[chosen], values)
+
+
+def splats_of(shown: MapCopy, rows: np.ndarray, harmonics: int) -> Splats:
+    """Some Gaussians [M] of a map."""
+    g = shown.gaussians
+    quaternions = g.quaternions.numpy()[rows]
+    quaternions = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    opacities = (1 / (1 + np.exp(-np.clip(g.opacity_logits.numpy()[rows], -30, 30)))).astype(np.float32)
+    return Splats(MAP, g.means.numpy()[rows], np.exp(g.log_scales.numpy()[rows]), quaternions.astype(np.float32),
+                  opacities, np.ascontiguousarray(g.sh.numpy()[rows, :harmonics]), shown.ids[rows])  # fmt: skip
+
+
+def _no_points(tile: Tile) -> Points:
+    nothing = np.zeros(1, np.uint16)
+    return Points(MAP, middle_of(tile), np.zeros((1, 3), np.uint8), {"count": nothing, "id": nothing})
+
+
+def _no_splats(tile: Tile) -> Splats:
+    one = np.zeros((1, 4), np.float32)
+    one[0, 0] = 1
+    return Splats(MAP, middle_of(tile), np.full((1, 3), 1e-3, np.float32), one, np.zeros(1, np.float32),
+                  np.zeros((1, 1, 3), np.float32), np.zeros(1, np.uint16))  # fmt: skip
