@@ -40,8 +40,8 @@ LivePath = Annotated[
     Path | None,
     typer.Argument(
         metavar="SEQUENCE|LIVE",
-        help="Folder or file of the recording, or a camera: realsense:[SERIAL], python:MODULE:CALLABLE. With --resume: "
-        "where the recording is now, if it was moved.",
+        help="Folder or file of the recording, or a camera: realsense:[SERIAL], ros2://COLOR,DEPTH (topics of ROS 2), "
+        "python:MODULE:CALLABLE. With --resume: where the recording is now, if it was moved.",
     ),
 ]
 MapPath = Annotated[

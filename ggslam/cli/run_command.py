@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from rich.markup import escape
 
-from ggslam.cli import options, settings_help
+from ggslam.cli import network, options, settings_help
 from ggslam.cli.console import console, progress_bar
 from ggslam.cli.observer import ProgressObserver
 from ggslam.cli.summary import print_scores, print_verdict
@@ -23,6 +23,7 @@ from ggslam.errors import ConfigError, TrackingLostError
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.jobs.run.encoding import EncodeRequest
     from ggslam.jobs.run.pipeline import RunOutcome, RunRequest
+    from ggslam.middleware.opening import NodeRequest
     from ggslam.runs.recordings import SequenceRequest
 
 EPILOG = """
@@ -41,6 +42,8 @@ EPILOG = """
   ggslam run data/redkitchen --scale 0.5 --view
 
   ggslam run realsense: --stop 900 --record data/desk --out runs/desk
+
+  ggslam run ros2://camera/color,camera/depth --realtime 30 --out runs/robot
 
   ggslam run data/redkitchen --scale 0.5 --energy
 
@@ -180,6 +183,8 @@ def run(
     min_confidence: options.MinConfidence = None,
     topics: options.Topics = None,
     record: Record = None,
+    middleware: network.Middleware = network.MiddlewareName.zenoh, domain: network.Domain = 0,
+    namespace: network.Namespace = "", address: network.Address = "",
     iterations: Iterations = None,
     refine: Refine = None,
     realtime: Realtime = None,
@@ -214,10 +219,11 @@ def run(
         camera, intrinsics, depth_kind, depth_delay, upright, void_id,
     )  # fmt: skip
     given = overrides_of(context.params)
+    node = network.node_request(middleware, domain, namespace, address)
     request = replace(
-        _request(reading, record), out=out, config=config, overrides=given, evaluate=evaluate, overwrite=overwrite,
-        map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check, loss=loss,
-        energy=energy, encode=coded_as,
+        _request(reading, record, node), out=out, config=config, overrides=given, evaluate=evaluate,
+        overwrite=overwrite, map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check,
+        loss=loss, energy=energy, encode=coded_as,
     )  # fmt: skip
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
 
@@ -282,8 +288,8 @@ def refuse_other_options(context: typer.Context, more: Iterable[str] = ()) -> se
     return given
 
 
-def _request(reading: SequenceRequest, record: Path | None) -> RunRequest:
-    """A run of a recording, or of a live camera.
+def _request(reading: SequenceRequest, record: Path | None, node: NodeRequest) -> RunRequest:
+    """A run of a recording, or of a live camera, which one of ROS 2 is found by `node`.
 
     Raises:
         ConfigError: what is no live camera is to be recorded.
@@ -293,7 +299,7 @@ def _request(reading: SequenceRequest, record: Path | None) -> RunRequest:
     from ggslam.sequences.live import is_live
 
     if is_live(reading.path):
-        return RunRequest(LiveRequest(**vars(reading), record=record))
+        return RunRequest(LiveRequest(**vars(reading), record=record).join(node))
     if record is not None:
         raise ConfigError("--record is for live cameras: a recording is kept already")
     return RunRequest(reading)
@@ -342,6 +348,8 @@ def _print(outcome: RunOutcome) -> None:
         print_scores(outcome.metrics)
     if outcome.energy is not None:
         console.print(outcome.energy.text(), highlight=False, markup=False)
+    if outcome.latency is not None:
+        console.print(outcome.latency.text(), highlight=False, markup=False)
     for verdict in outcome.verdicts:
         console.print(f"[yellow]{verdict.severity}:[/] {escape(verdict.text)}", highlight=False)
     if outcome.verdict is not None:

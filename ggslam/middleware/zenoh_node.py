@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ggslam.errors import MiddlewareError
 from ggslam.middleware import zenoh_keys as keys
 from ggslam.middleware.definitions import request_of, response_of
+from ggslam.middleware.leaving import close_at_exit
 from ggslam.middleware.names import check_kind, check_node_name, full_name, full_namespace
 from ggslam.middleware.node import Qos, Received
 from ggslam.middleware.services import SERVICE_QOS, Answers
@@ -41,6 +42,7 @@ class ZenohNode:
         self._clients: dict[tuple[str, str], tuple[Any, bytes]] = {}
         self._tokens = [self._session.liveliness().declare_token(self._mark.node_token())]
         self._graph = Graph(self._session, request.domain)
+        close_at_exit(self)
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> ZenohPublisher:
         """Begins to send."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ggslam.errors import ConfigError, FormatError, RunFolderError, SequenceError
+from ggslam.middleware.opening import NodeRequest
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.sequence import OpenRecord, PartRecord, SequenceRecord
 from ggslam.scene.arrays import read_all_arrays
@@ -88,6 +89,13 @@ class LiveRequest(SequenceRequest):
     """A live camera as the recording of a run; `record`: folder that its frames are kept in."""
 
     record: Path | None = None
+
+    def join(self, node: NodeRequest) -> LiveRequest:
+        """The same over a network: addresses of ROS 2 topics are completed by it."""
+        from ggslam.sequences.formats.ros2_address import SCHEME, add_network
+
+        ros2 = str(self.path).startswith(f"{SCHEME}:")
+        return replace(self, path=add_network(self.path, node)) if ros2 else self
 
     def open(self, truth: bool = True) -> LiveSequence:  # type: ignore[override]
         """Starts the camera; what comes back has what a run needs of a sequence.

@@ -16,10 +16,11 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final, Literal, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -31,10 +32,22 @@ from ggslam.scene.frame import Frame
 from ggslam.sequences.sequence import SkippedFrame
 from ggslam.system.atomic import make_folder, write_bytes, write_text
 from ggslam.system.named_code import load_named
+from ggslam.system.tuning import Tuning
 
-SCHEMES = ("realsense", "python")
+SCHEMES = ("realsense", "ros2", "python")
 DEPTH_SCALE: Final = 1000.0
 """Units per metre of recorded depth images: this is our own format."""
+
+
+class LiveTuning(Tuning):
+    """What is taken for the time of a picture."""
+
+    late_s = 10.0
+    """Seconds after its stamp up to which a frame may come for the stamp to be of the wall clock."""
+    early_s = 1.0
+    """Seconds before it: clocks of two machines differ."""
+    warnings = 100
+    """Things that are told in all; then it is quiet."""
 
 
 @runtime_checkable
@@ -58,9 +71,32 @@ class LiveSource(Protocol):
         ...
 
 
+@runtime_checkable
+class WaitingSource(LiveSource, Protocol):
+    """A source that may wait long for the next frame, and drops what nobody took.
+
+    Attributes:
+        arrived: when the last frame was there, seconds since 1970.
+    """
+
+    arrived: float
+
+    def follow(self, going_on: Callable[[], bool], say: Callable[[str], None]) -> None:
+        """While nothing comes, frames are waited for as long as `going_on()`; `say` is told what happens."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """What came and what became of it, so far."""
+        ...
+
+    def reasons(self) -> dict[str, int]:
+        """Why images were left out, and how often."""
+        ...
+
+
 def is_live(place: str | Path) -> bool:
-    """Whether a text names a live source: "realsense:", "realsense:SERIAL", "python:MODULE:CALLABLE" (or
-    python:FILE.py:CALLABLE)."""
+    """Whether a text names a live source: "realsense:", "realsense:SERIAL", "ros2://COLOR,DEPTH" (see
+    `formats.ros2_address`), "python:MODULE:CALLABLE" (or python:FILE.py:CALLABLE)."""
     scheme, colon, _ = str(place).partition(":")
     return bool(colon) and scheme in SCHEMES
 
@@ -81,6 +117,10 @@ def open_live(place: str | Path, scale: float = 1.0) -> LiveSource:
         from ggslam.sequences.formats.realsense import RealSenseCamera
 
         return RealSenseCamera(rest, scale)
+    if scheme == "ros2":
+        from ggslam.sequences.formats.ros2_topics import Ros2Camera
+
+        return Ros2Camera(str(place), scale)
     if scheme != "python":
         raise SequenceError(f"{place}: expected a live source of {', '.join(f'{name}:' for name in SCHEMES)}")
     return _call(str(place), rest)
@@ -104,6 +144,11 @@ class LiveSequence:
         source: the camera.
         stop: number of frames; None: until Ctrl-C or until the source ends.
         record: folder that frames are written to as they come, a plain folder that can be opened later.
+
+    Attributes:
+        say: is told what happens to the camera meanwhile; `warnings` keep it.
+        goes_on: whether frames are still waited for while none comes.
+        since: what `taken` tells: "stamp", where stamps are of the wall clock, else "arrival".
     """
 
     format = "live"
@@ -114,11 +159,15 @@ class LiveSequence:
         self.source, self.name, self.camera, self.native_camera = source, source.name, source.camera, source.camera
         self.path = Path(source.name) if record is None else record
         self.record, self._stop = record, stop
-        self.warnings: list[str] = []
+        self.warnings: list[str] = list(getattr(source, "warnings", ()))
+        self.say: Callable[[str], None] = lambda text: None
+        self.goes_on: Callable[[], bool] = lambda: True
+        self.since: Literal["", "stamp", "arrival"] = ""
         self.skipped_frames: list[SkippedFrame] = []
         self.mask_problems: dict[int, str] = {}
         self.instance_names: dict[int, str] = {}
         self._times: list[float] = []
+        self._taken: list[float] = []
         self._ended = threading.Event()
         if record is not None:
             _begin_recording(record, source.camera)
@@ -134,9 +183,12 @@ class LiveSequence:
         """Frames as they come (there is nothing to read ahead); the camera is stopped at the end."""
         in_main = threading.current_thread() is threading.main_thread()
         before = signal.signal(signal.SIGINT, self.end) if in_main else None
+        if isinstance(self.source, WaitingSource):
+            self.source.follow(lambda: self.goes_on() and not self._ended.is_set(), self._note)
         try:
             for frame in self.source.frames():
                 self._times.append(frame.timestamp)
+                self._note_time(frame)
                 if self.record is not None:
                     _record(self.record, frame)
                 yield frame
@@ -147,7 +199,32 @@ class LiveSequence:
                 signal.signal(signal.SIGINT, before)
             self.source.close()
             if self.record is not None:
-                write_text(self.record / "timestamps.txt", "".join(f"{time:.6f}\n" for time in self._times))
+                write_text(self.record / "timestamps.txt", "".join(f"{at:.6f}\n" for at in self._times))
+
+
+    def _note(self, text: str) -> None:
+        if len(self.warnings) < LiveTuning.warnings:
+            self.warnings.append(text)
+            self.say(text)
+
+    def _note_time(self, frame: Frame) -> None:
+        arrived = self.source.arrived if isinstance(self.source, WaitingSource) else time.time()
+        if not self.since:
+            delay = arrived - frame.timestamp
+            self.since = "stamp" if -LiveTuning.early_s < delay < LiveTuning.late_s else "arrival"
+        self._taken.append(frame.timestamp if self.since == "stamp" else arrived)
+
+    def taken(self, frame: Frame) -> float:
+        """When a frame was taken, or came, seconds since 1970; see `since`."""
+        return self._taken[frame.index]
+
+    def counts(self) -> dict[str, int] | None:
+        """What came and what became of it; None: the source does not tell."""
+        return self.source.counts() if isinstance(self.source, WaitingSource) else None
+
+    def reasons(self) -> dict[str, int]:
+        """Why images were left out, and how often."""
+        return self.source.reasons() if isinstance(self.source, WaitingSource) else {}
 
 
 def _begin_recording(folder: Path, camera: Camera) -> None:

@@ -58,6 +58,10 @@ class FrameClock:
                 yield frame
             asked = self._now()
 
+    def due(self, frame: Frame) -> float:
+        """When a frame of a recording was due, by `now`; NaN of the first one, which starts the clock."""
+        return self._begin + self._offset(frame) if self._begin else float("nan")
+
     def _offset(self, frame: Frame) -> float:
         return frame.timestamp if self.live else frame.index * self.period
 

@@ -63,11 +63,17 @@ class RealtimeSlam:
         slam: a fresh `Slam`; its parts are used from two threads.
         frames_per_second: rate at which frames arrive.
         live: whether they come at a camera's own pace; else they are delivered at that rate.
+
+    Attributes:
+        clock: when frames are due.
+        mapped: is told of every keyframe that is in the map, in the mapper's thread.
     """
 
     def __init__(self, slam: Slam, frames_per_second: float, live: bool = False) -> None:
         self.slam, self.live = slam, live
         self.period = 1.0 / frames_per_second
+        self.clock = FrameClock(self.period, live)
+        self.mapped: Callable[[Frame], None] = lambda frame: None
         self._jobs: queue.Queue[NewKeyframe | None] = queue.Queue()
         self._mapper_error: BaseException | None = None
         slam.schedule = _InAnotherThread(self._jobs, slam.mapper.beside_others())
@@ -91,8 +97,8 @@ class RealtimeSlam:
     # --- tracker's thread --------------------------------------------------------------------------------------------
 
     def _track(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
-        slam, clock = self.slam, FrameClock(self.period, self.live)
-        for frame in clock.pace(frames, lambda late: slam.dropped_frames.append(late.index)):
+        slam = self.slam
+        for frame in self.clock.pace(frames, lambda late: slam.dropped_frames.append(late.index)):
             with opencv_errors(f"frame {frame.index}"):
                 if not slam.frames:
                     self._first(frame, report)
@@ -128,5 +134,6 @@ class RealtimeSlam:
             return False
         with opencv_errors(f"frame {job.frame.index}"):
             slam.map_keyframe(job)
+        self.mapped(job.frame)
         self._jobs.task_done()
         return True

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from ggslam.jobs.report.change_section import changes_part
+from ggslam.jobs.report.latency_section import latency_part
 from ggslam.jobs.report.metrics import MEANINGS, METRICS, TILES
 from ggslam.jobs.report.mover_section import movers_part
 from ggslam.jobs.report.run_data import RunData, stage_seconds
@@ -219,7 +220,7 @@ def _time(run: RunData) -> Html:
     ]  # fmt: skip
     listed = p.table(["stage", "seconds", "ms a frame", "%", ""], rows, text_columns=(4,))
     course = p.figures(time_plots([run])) if run.steps else p.tag("p", _NO_STEPS)
-    return p.join([bar, listed, *_energy(run), course])
+    return p.join([bar, listed, *latency_part(run.timing), *_energy(run), course])
 
 
 def _energy(run: RunData) -> list[Html]:

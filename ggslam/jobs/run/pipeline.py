@@ -31,7 +31,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.runs.recordings import LiveRequest, SequenceRequest, describe, open_recording_of
 from ggslam.runs.records.loops import LoopsRecord
 from ggslam.runs.records.metrics import MetricsRecord
-from ggslam.runs.records.timing import EnergyRecord, TimingRecord
+from ggslam.runs.records.timing import EnergyRecord, LatencyRecord, TimingRecord
 from ggslam.runs.records.verdict import RunVerdict
 from ggslam.runs.starting import ancestors
 from ggslam.runs.writing import REPORT_FILE, RunToWrite
@@ -40,6 +40,7 @@ from ggslam.sequences.live import LiveSequence
 from ggslam.sequences.rig import RigSequence
 from ggslam.sequences.verdicts import Verdict
 from ggslam.slam.config import Config, load_config, settings_notes
+from ggslam.slam.latency import LatencyMeter
 from ggslam.slam.result import SlamResult
 from ggslam.slam.saved_state import reason_against_saving
 from ggslam.system.energy import EnergyMeter
@@ -77,8 +78,9 @@ class RunRequest:
 class RunOutcome:
     """A finished run, or what was saved of one that stopped early (`error` says why). If it could not be saved as it
     should be, `failure` says so, and where it is. `verdicts` tell what seems wrong with it or its recording, `verdict`
-    how good it is; None: that could not be told. `energy`: what each part used, if that was asked for. `encoded`: a
-    line on the stream that was asked for, `encode_failure`: why there is none."""
+    how good it is; None: that could not be told. `energy`: what each part used, if that was asked for; `latency`: of a
+    camera, and in real time. `encoded`: a line on the stream that was asked for, `encode_failure`: why there is none.
+    """
 
     folder: RunFolder
     result: SlamResult
@@ -90,6 +92,7 @@ class RunOutcome:
     encoded: str = ""
     encode_failure: GgslamError | None = None
     energy: EnergyRecord | None = None
+    latency: LatencyRecord | None = None
 
     def headline(self) -> str:
         """One line for people."""
@@ -206,6 +209,7 @@ class _Run:
     saw_all: bool = False
     told: list[str] = field(default_factory=list)
     spent: Spent | None = None
+    latency: LatencyMeter | None = None
 
     def run(self, resumption: Resumption | None) -> RunOutcome:
         """From the first frame, or from where it was, to the report."""
@@ -229,7 +233,7 @@ class _Run:
             if resumption is not None and checkpointing is not None:
                 loop.resume = lambda slam: resumption.restore(slam, checkpoints, checkpointing, observer)
             result, error = loop.run()
-            self.saw_all, self.told = loop.saw_all, loop.told
+            self.saw_all, self.told, self.latency = loop.saw_all, loop.told, loop.latency
         except GgslamError:  # before the first frame: settings that do not fit the recording, a model that is none
             if resumption is None:
                 checkpoints.remove()
@@ -350,11 +354,22 @@ class _Run:
         if outcome.verdict is not None:
             with self.folder.change_files(RunVerdict.FILE):
                 outcome.verdict.write(self.folder.path)
-        if self.spent is not None:
-            outcome.energy = EnergyRecord.of_spent(self.spent)
+        outcome.energy = None if self.spent is None else EnergyRecord.of_spent(self.spent)
+        outcome.latency = self._latency_record()
+        counted = {"energy": outcome.energy, "latency": outcome.latency}
+        if update := {name: record for name, record in counted.items() if record is not None}:
             with self.folder.change_files(TimingRecord.FILE):
-                self.folder.timing().model_copy(update={"energy": outcome.energy}).write(self.folder.path)
+                self.folder.timing().model_copy(update=update).write(self.folder.path)
         write_report(self.folder, kept)
+
+    def _latency_record(self) -> LatencyRecord | None:
+        sequence = self.sequence
+        if self.latency is None:
+            return None
+        if isinstance(sequence, LiveSequence):
+            since = sequence.since or "arrival"
+            return LatencyRecord.of_meter(self.latency, since, sequence.counts(), sequence.reasons())
+        return LatencyRecord.of_meter(self.latency, "due")
 
     def _score(self, outcome: RunOutcome, name: str) -> Sequence | None:
         """Scores a run that ended, if that was asked for and its frames can be read again; returns its recording.

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from ggslam.sequences import Sequence
 from ggslam.sequences.live import LiveSequence
 from ggslam.sequences.rig import RigSequence, by_instant
 from ggslam.slam.config import Config
+from ggslam.slam.latency import LatencyMeter
 from ggslam.slam.realtime import RealtimeSlam
 from ggslam.slam.result import SlamResult, StepReport, tracked_poses
 from ggslam.slam.rig_slam import RigSlam
@@ -54,6 +56,7 @@ class SlamLoop:
         told: notes of the run that were told at its start.
         loss: a loss of the user's own that joins the mapper's.
         saw_all: whether all frames were tracked, and what is left is the refinement.
+        latency: of a camera, and in real time: how long poses and map take.
     """
 
     sequence: Sequence | LiveSequence
@@ -69,6 +72,7 @@ class SlamLoop:
     told: list[str] = field(default_factory=list)
     loss: NamedLoss | None = None
     saw_all: bool = False
+    latency: LatencyMeter | None = None
     _between_steps: bool = False
 
     def run(self) -> tuple[SlamResult, BaseException | None]:
@@ -110,11 +114,11 @@ class SlamLoop:
             frames = sequence.stream(masks="lazy", begin=begin)  # only those of keyframes are read
         else:
             frames = sequence.stream(masks="lazy")
+            sequence.say, sequence.goes_on = observer.note, lambda: self.stop.number is None
+            self.latency = LatencyMeter(sequence.taken)
         self._between_steps = self.config.realtime_fps == 0
         if self.config.realtime_fps > 0:
-            paced = RealtimeSlam(slam, self.config.realtime_fps, live=isinstance(sequence, LiveSequence))
-            with part("tracking and mapping, side by side", whole=True):
-                paced.run(frames, lambda *step: self._report(slam, *step))
+            self._side_by_side(slam, frames)
             return
         for together in by_instant(frames):
             self._between_steps = False
@@ -122,8 +126,21 @@ class SlamLoop:
             for frame, step in zip(together, steps, strict=True):
                 self._report(slam, frame, step, whole=frame is together[-1])
 
+    def _side_by_side(self, slam: Slam, frames: Iterator[Frame]) -> None:
+        """All frames in real time."""
+        paced = RealtimeSlam(slam, self.config.realtime_fps, live=isinstance(self.sequence, LiveSequence))
+        if self.latency is None:
+            self.latency = LatencyMeter(paced.clock.due, time.perf_counter)
+        paced.mapped = self.latency.in_map
+        with part("tracking and mapping, side by side", whole=True):
+            paced.run(frames, lambda *step: self._report(slam, *step))
+
     def _report(self, slam: Slam, frame: Frame, step: StepReport, whole: bool = True) -> None:
         """After every frame; `whole`: no other one was part of the same step and is still to come."""
+        if self.latency is not None:
+            self.latency.pose_known(frame)
+            if step.is_keyframe and self.config.realtime_fps == 0:
+                self.latency.in_map(frame)
         self.observer.frame(step)
         if self.follower is not None:
             self.follower(slam, frame, step)

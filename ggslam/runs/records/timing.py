@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from ggslam.runs.records.record import Number, NumberOrNone, Record, RecordFile
+from ggslam.slam.latency import LatencyMeter, Since
 from ggslam.slam.result import SlamResult
 from ggslam.system.plurals import quantity, word_for
 from ggslam.system.process_memory import peak_memory_mb
@@ -63,10 +65,77 @@ class EnergyRecord(Record):
         return f"energy {total} ({self.source}, the whole machine): {words}"
 
 
+class DelaysRecord(Record):
+    """See `slam.latency.Delays`."""
+
+    count: int = 0
+    median_s: Number = 0.0
+    p95_s: Number = 0.0
+
+
+class ArrivalsRecord(Record):
+    """What came from a camera over the network: images of colour and depth, pairs of them, pairs that the run took;
+    images without a partner in time, pairs that a newer one overwrote before the run was free, damaged messages, and
+    messages that were sent and did not come. `reasons`: why images were left out."""
+
+    color: int = 0
+    depth: int = 0
+    pairs: int = 0
+    taken: int = 0
+    unmatched: int = 0
+    overwritten: int = 0
+    damaged: int = 0
+    lost: int = 0
+    reasons: dict[str, int] = {}
+
+
+class LatencyRecord(Record):
+    """Delays of a camera, or of a run in real time. `since`: see `slam.latency.Since`; `pose`: until a frame's pose was
+    known, `map`: until a keyframe was in the map; `arrivals`: null where the source does not count them."""
+
+    since: str = "stamp"
+    pose: DelaysRecord | None = None
+    map: DelaysRecord | None = None
+    arrivals: ArrivalsRecord | None = None
+
+    @staticmethod
+    def of_meter(
+        meter: LatencyMeter, since: Since, counts: Mapping[str, int] | None = None,
+        reasons: Mapping[str, int] | None = None,
+    ) -> LatencyRecord:  # fmt: skip
+        """What was measured, and what a source counted."""
+        delays = {name: None if found is None else asdict(found)
+                  for name, found in (("pose", meter.pose()), ("map", meter.map()))}  # fmt: skip
+        arrivals = None if counts is None else {**counts, "reasons": dict(reasons or {})}
+        return LatencyRecord.of({"since": since, **delays, "arrivals": arrivals})
+
+    def text(self) -> str:
+        """One line for people."""
+        parts = [
+            f"{word} {1e3 * found.median_s:.0f} ms (95 %: {1e3 * found.p95_s:.0f} ms)"
+            for word, found in (("pose", self.pose), ("map", self.map)) if found is not None
+        ]  # fmt: skip
+        line = f"latency since {SINCE.get(self.since, self.since)}: {', '.join(parts) or 'not measured'}"
+        a = self.arrivals
+        if a is None:
+            return line
+        return (
+            f"{line}; {quantity(a.pairs, 'pair')} of {a.color} + {a.depth} images, {a.taken} taken, {a.overwritten} "
+            f"overwritten; images: {a.unmatched} unmatched, {a.damaged} damaged, {a.lost} lost"
+        )
+
+
+SINCE: Final = {
+    "stamp": "the picture's time stamp", "arrival": "the picture came (stamps are of another clock)",
+    "due": "the frame was due",
+}  # fmt: skip
+"""What latency counts from, in words."""
+
+
 class TimingRecord(RecordFile):
     """Seconds by part; see `slam.result.SlamTimes`. `peak_rss_mb` is in MB (10^6 bytes). Of a merged run they are the
     sums over its runs, and `merge_s` says what merging took, `seam_iterations` the steps it made. `energy` is there
-    if it was asked for."""
+    if it was asked for, `latency` of cameras and of runs in real time."""
 
     FILE: ClassVar[str] = "timing.json"
     frames: int = 0
@@ -89,6 +158,7 @@ class TimingRecord(RecordFile):
     merge_s: dict[str, Number] | None = None
     seam_iterations: int | None = None
     energy: EnergyRecord | None = None
+    latency: LatencyRecord | None = None
 
     @staticmethod
     def of_result(result: SlamResult) -> TimingRecord:

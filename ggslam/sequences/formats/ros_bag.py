@@ -7,7 +7,6 @@ their frame comes. Depth of a camera beside the colour camera is registered by /
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,18 @@ import numpy as np
 
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import is_valid_pose
 from ggslam.sequences.association import pair_images, poses_at
-from ggslam.sequences.camera_files.lens_models import distortion_of
+from ggslam.sequences.formats.ros_calibration import (
+    DepthInfo,
+    Lens,
+    is_calibrated,
+    is_registered,
+    lens_of,
+    place_of_depth,
+)
 from ggslam.sequences.formats.ros_images import color_image, depth_in_unit, in_metres
 from ggslam.sequences.formats.ros_messages import Bag, BagImage
 from ggslam.sequences.formats.ros_topics import (
-    REGISTERED,
     Topics,
     check_holds_poses,
     find_topics,
@@ -33,14 +37,7 @@ from ggslam.sequences.formats.ros_topics import (
 from ggslam.sequences.images import read_color
 from ggslam.sequences.json_files import camera_of
 from ggslam.sequences.pixel_grid import image_size
-from ggslam.sequences.recording import (
-    NO_OPTIONS,
-    DepthCamera,
-    FrameFiles,
-    OwnCamera,
-    ReadOptions,
-    Recording,
-)
+from ggslam.sequences.recording import NO_OPTIONS, FrameFiles, OwnCamera, ReadOptions, Recording
 from ggslam.system.untrusted_files import open_untrusted
 
 STORAGES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
@@ -104,7 +101,7 @@ def _read(name: str, path: Path, bag: Bag, options: ReadOptions) -> Recording:
         )
         for i, j in pairs
     ]
-    lens = options.recorded_camera(lambda: _color_lens(bag, topics)) or _Lens(None)
+    lens = options.recorded_camera(lambda: _color_lens(bag, topics)) or Lens(None)
     recording = Recording(
         name, path, files, color_times[[i for i, _ in pairs]],
         1.0 if metres else 1000.0, lens.camera, time_source=time_source, warnings=warnings,
@@ -137,7 +134,7 @@ def _first_info(bag: Bag, topic: str) -> Any:
     all are zeros, the first."""
     first = info = bag.message(topic, 0)
     number = 0
-    while not (np.asarray(_value(info, "k"), float).reshape(-1)[0] > 0 and info.width > 0):
+    while not is_calibrated(info):
         number += 1
         try:
             info = bag.message(topic, number)
@@ -146,27 +143,11 @@ def _first_info(bag: Bag, topic: str) -> Any:
     return info
 
 
-def _value(info: Any, name: str) -> Any:
-    """Field of a camera_info: ROS 1 writes K, D, P in capitals."""
-    return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
-
-
-@dataclass(frozen=True)
-class _Lens:
-    """The content of a camera_info message."""
-
-    camera: Camera | None
-    distortion: np.ndarray | None = None
-    fisheye: bool = False
-
-
-def _color_lens(bag: Bag, topics: Topics) -> _Lens:
+def _color_lens(bag: Bag, topics: Topics) -> Lens:
     if topics.color_info is None:
         raise SequenceError(f"{bag.path}: no camera_info belongs to {topics.color}; `topics` color_info=TOPIC names it")
-    info, rectified = _first_info(bag, topics.color_info), is_rectified(topics.color)
-    place = f"{bag.path}, {topics.color_info}"
-    camera = _camera(place, info, rectified)
-    return _Lens(camera) if rectified else _Lens(camera, *_distortion(place, info))
+    info = _first_info(bag, topics.color_info)
+    return lens_of(f"{bag.path}, {topics.color_info}", info, is_rectified(topics.color))
 
 
 def _color_camera(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera | None) -> Camera | None:
@@ -182,49 +163,19 @@ def _color_camera(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera
     return None if own.calibration is None else camera_of(own.source, width, height, *own.calibration)
 
 
-def _camera(place: str, info: Any, rectified: bool) -> Camera:
-    K = np.asarray(_value(info, "p" if rectified else "k"), float).reshape(3, -1)
-    numbers = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    camera = camera_of(place, int(info.width), int(info.height), *numbers)
-    region = info.roi
-    sizes = (int(region.width), int(region.height))
-    if sizes == (camera.width, camera.height) or min(sizes) <= 0 or region.width > camera.width:
-        return camera
-    # K and P are those of the whole sensor; the images are a part of it.
-    cx, cy = camera.cx - int(region.x_offset), camera.cy - int(region.y_offset)
-    return camera_of(place, *sizes, camera.fx, camera.fy, cx, cy)
-
-
-def _distortion(place: str, info: Any) -> tuple[np.ndarray | None, bool]:
-    return distortion_of(place, str(info.distortion_model), np.asarray(_value(info, "d"), float).reshape(-1))
-
-
 def _place_depth(recording: Recording, bag: Bag, topics: Topics, own: OwnCamera | None) -> None:
     """Tells whether depth is registered, or how the depth camera stands to the colour camera, or warns."""
-    if topics.depth_info is None or any(word in topics.depth for word in REGISTERED):
+    if topics.depth_info is None or is_registered(topics.depth):
         return
     camera = _color_camera(recording, bag, topics, own)
     if camera is None:
         return
-    place = f"{bag.path}, {topics.depth_info}"
     info = _first_info(bag, topics.depth_info)
-    depth_camera = _camera(place, info, is_rectified(topics.depth))
-    depth_frame = bag.message(topics.depth, 0).header.frame_id
-    color_frame = bag.message(topics.color, 0).header.frame_id
-    if depth_frame == color_frame and np.allclose(
-        depth_camera.resize(camera.width, camera.height).matrix(), camera.matrix(), atol=0.5
-    ):
-        return
-    T = np.eye(4) if depth_frame == color_frame else static_transform(bag, color_frame, depth_frame)
-    if T is not None and is_valid_pose(T):
-        distortion, fisheye = (None, False) if is_rectified(topics.depth) else _distortion(place, info)
-        recording.depth_camera = DepthCamera(depth_camera, T, distortion, fisheye)
-        return
-    recording.warnings.append(
-        f"depth ({depth_frame}) is of another camera than colour ({color_frame}), and /tf_static does not tell where "
-        "it is: taken as if both stood at one place (`depth_camera` tells it)"
-    )
-    recording.depth_camera = DepthCamera(depth_camera, np.eye(4))
+    told = DepthInfo(f"{bag.path}, {topics.depth_info}", info, is_rectified(topics.depth))
+    frames = [str(bag.message(topic, 0).header.frame_id) for topic in (topics.color, topics.depth)]
+    stand = place_of_depth(camera, told, frames[0], frames[1], partial(static_transform, bag))
+    recording.depth_camera = stand.camera
+    recording.warnings += [f"{stand.doubt} (`depth_camera` tells it)"] if stand.doubt else []
 
 
 def _add_poses(recording: Recording, bag: Bag, topic: str) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,8 +56,9 @@ def find_topics(bag: Bag, given: Mapping[str, str]) -> Topics:
     held = {topic: kind for topic, (_, kind) in kinds.items()}
     color = given.get("color") or _best(bag, "color", colors, held)
     depth = given.get("depth") or _best(bag, "depth", depths, held)
-    color_info = given.get("color_info") or _info(bag, color)
-    return Topics(color, depth, color_info, given.get("depth_info") or _info(bag, depth), given.get("pose"))
+    color_info = given.get("color_info") or info_above(color, bag.types)
+    depth_info = given.get("depth_info") or info_above(depth, bag.types)
+    return Topics(color, depth, color_info, depth_info, given.get("pose"))
 
 
 def _kind(bag: Bag, topic: str) -> tuple[bool | None, str]:
@@ -105,13 +106,14 @@ def _best(bag: Bag, role: str, scores: dict[str, float], kinds: dict[str, str]) 
     return ranked[0]
 
 
-def _info(bag: Bag, topic: str) -> str | None:
-    """The camera_info nearest above an image topic: /camera/color/image_raw -> /camera/color/camera_info."""
+def info_above(topic: str, types: Mapping[str, str]) -> str | None:
+    """The camera_info nearest above an image topic: /camera/color/image_raw -> /camera/color/camera_info. `types`:
+    topic -> type of its messages, without /msg/."""
     parts = topic.split("/")
     for end in range(len(parts) - 1, 0, -1):
         base = "/".join(parts[:end])
         for name in (f"{base}/camera_info", f"{base}/info/camera_info"):
-            if bag.types.get(name) == INFO_TYPE:
+            if types.get(name) == INFO_TYPE:
                 return name
     return None
 
@@ -171,8 +173,13 @@ def static_transform(bag: Bag, to_frame: str, from_frame: str) -> np.ndarray | N
     """T_to_from [4, 4] by the fixed frames of the bag; None if they do not connect the two."""
     if STATIC_FRAMES not in bag.types:
         return None
+    return fixed_transform(bag.messages(STATIC_FRAMES), to_frame, from_frame)
+
+
+def fixed_transform(messages: Iterable[Any], to_frame: str, from_frame: str) -> np.ndarray | None:
+    """T_to_from [4, 4] by messages of /tf_static; None if they do not connect the two."""
     steps: dict[str, list[tuple[str, np.ndarray]]] = {}
-    for message in bag.messages(STATIC_FRAMES):
+    for message in messages:
         for link in message.transforms:
             parent, child = link.header.frame_id.lstrip("/"), link.child_frame_id.lstrip("/")
             T = pose_of(link.transform)
