@@ -7,7 +7,7 @@ import itertools
 import secrets
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ggslam.middleware.dds_domain import DOMAINS
 from ggslam.middleware.dds_services import DdsClient, DdsOffered
@@ -16,12 +16,9 @@ from ggslam.middleware.dds_types import RawTypes
 from ggslam.middleware.definitions import request_of, response_of
 from ggslam.middleware.leaving import close_at_exit
 from ggslam.middleware.names import check_kind, check_node_name, full_name, full_namespace, ros_kind
-from ggslam.middleware.node import Qos, Received
+from ggslam.middleware.node import NodeRequest, Qos, Received
 from ggslam.middleware.services import SERVICE_QOS, Answers
 from ggslam.middleware.types import message_types
-
-if TYPE_CHECKING:
-    from ggslam.middleware.opening import NodeRequest
 
 TOPIC, REQUEST, REPLY = "rt", "rq", "rr"
 """Prefixes of ROS 2 to names of topics in DDS."""

@@ -133,7 +133,12 @@ class DdsPublisher:
 
 
 class DdsSubscription:
-    """Takes messages of a topic. DDS gives no numbers of messages to Python; it counts itself what was lost."""
+    """Takes messages of a topic. DDS gives no numbers of messages to Python; it counts itself what was lost.
+
+    Attributes:
+        lost: messages that DDS knows were sent and did not come, or that had to make room for newer ones here; counted
+            when a message comes.
+    """
 
     def __init__(
         self, topic: str, kind: str, qos: Qos, reader: Any, reading: Reading, take: Callable[[Received], None]
@@ -141,20 +146,14 @@ class DdsSubscription:
         self.topic, self.kind = topic, kind
         self._reader, self._reading = reader, reading
         self._delivery = Delivery(topic, qos.depth, take)
-        self._lost = 0
+        self.lost = 0
         self._condition = reading.add(reader, self._put)
         self._closed = False
 
     def _put(self, sample: Any) -> None:
         writer = f"{sample.sample_info.publication_handle & (1 << 64) - 1:016x}"
         self._delivery.put(Received(sample.content, time.time(), writer))
-
-    @property
-    def lost(self) -> int:
-        """Messages that DDS knows were sent and did not come, or that had to make room for newer ones here."""
-        if not self._closed:
-            self._lost = int(self._reader.get_sample_lost_status().total_count)
-        return self._lost + self._delivery.overrun
+        self.lost = int(self._reader.get_sample_lost_status().total_count) + self._delivery.overrun
 
     @property
     def failures(self) -> int:
@@ -164,7 +163,6 @@ class DdsSubscription:
     def close(self) -> None:
         """Takes no more."""
         if not self._closed:
-            _ = self.lost
             self._closed = True
             self._reading.remove(self._condition)
             self._delivery.close()

@@ -51,8 +51,9 @@ class RawTypes:
     def _member(self, desc: Any) -> Any:
         """Type of a member by rosbags' description: (node, rest), where nodes are BASE 1, NAME 2, ARRAY 3, SEQUENCE
         4."""
-        from cyclonedds.idl import types
+        from cyclonedds.idl import types as idl
 
+        types: Any = idl
         node, rest = int(desc[0]), desc[1]
         if node == 3:
             return types.array[self._member(rest[0]), rest[1]]

@@ -5,7 +5,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
+
+Middleware = Literal["zenoh", "dds"]
+
+
+@dataclass(frozen=True)
+class NodeRequest:
+    """How to join the network.
+
+    Attributes:
+        middleware: as rmw_zenoh_cpp, or as rmw_cyclonedds_cpp does.
+        domain: ROS_DOMAIN_ID.
+        namespace: of topics that have none, such as `/robot1`.
+        address: of Zenoh's router or of another peer, such as `tcp/192.168.1.2:7447`, and with `listen:` in front one
+            to listen on; several are separated by commas; empty: a router on this machine whenever there is one, and
+            peers nearby. Of DDS the address or name of the network interface; 127.0.0.1 leaves multicast off.
+        distribution: of ROS 2; None: of ROS_DISTRO.
+    """
+
+    middleware: Middleware = "zenoh"
+    domain: int = 0
+    namespace: str = ""
+    address: str = ""
+    distribution: str | None = None
 
 
 @dataclass(frozen=True)
@@ -68,14 +91,19 @@ class Publisher(Protocol):
 
 
 class Subscription(Protocol):
-    """Takes messages of one topic."""
+    """Takes messages of one topic.
+
+    Attributes:
+        lost: messages that were sent and did not come, or that came and had to make room for newer ones.
+        failures: messages whose `take` raised. The first is written to the log.
+    """
 
     topic: str
     kind: str
+    lost: int
 
     @property
-    def lost(self) -> int:
-        """Messages that were sent and did not come, as far as their numbers tell."""
+    def failures(self) -> int: ...
 
     def close(self) -> None:
         """Takes no more."""

@@ -3,33 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 from ggslam.errors import MiddlewareError
-from ggslam.middleware.node import Node
+from ggslam.middleware.node import Middleware, Node, NodeRequest
 
-Middleware = Literal["zenoh", "dds"]
-
-
-@dataclass(frozen=True)
-class NodeRequest:
-    """How to join the network.
-
-    Attributes:
-        middleware: as rmw_zenoh_cpp, or as rmw_cyclonedds_cpp does.
-        domain: ROS_DOMAIN_ID.
-        namespace: of topics that have none, such as `/robot1`.
-        address: of Zenoh's router or of another peer, such as `tcp/192.168.1.2:7447`; empty: a router on this machine
-            if there is one, and peers nearby. Of DDS the address of the network interface.
-        distribution: of ROS 2; None: of ROS_DISTRO.
-    """
-
-    middleware: Middleware = "zenoh"
-    domain: int = 0
-    namespace: str = ""
-    address: str = ""
-    distribution: str | None = None
+__all__ = ["Middleware", "Node", "NodeRequest", "open_node"]
 
 
 def open_node(request: NodeRequest, name: str) -> Node:

@@ -8,22 +8,19 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ggslam.errors import MiddlewareError
 from ggslam.middleware import zenoh_keys as keys
 from ggslam.middleware.definitions import request_of, response_of
 from ggslam.middleware.leaving import close_at_exit
 from ggslam.middleware.names import check_kind, check_node_name, full_name, full_namespace
-from ggslam.middleware.node import Qos, Received
+from ggslam.middleware.node import NodeRequest, Qos, Received
 from ggslam.middleware.services import SERVICE_QOS, Answers
 from ggslam.middleware.types import message_types
 from ggslam.middleware.zenoh_graph import Graph
 from ggslam.middleware.zenoh_session import open_session
 from ggslam.middleware.zenoh_topics import ZenohPublisher, ZenohSubscription
-
-if TYPE_CHECKING:
-    from ggslam.middleware.opening import NodeRequest
 
 
 class ZenohNode:

@@ -89,12 +89,17 @@ class ZenohPublisher:
 
 
 class ZenohSubscription:
-    """Takes messages of a topic."""
+    """Takes messages of a topic.
+
+    Attributes:
+        lost: messages that were sent and did not come, or had to make room for newer ones here.
+    """
 
     def __init__(
         self, session: Any, topic: str, kind: str, qos: Qos, where: str, token: str, take: Callable[[Received], None]
     ) -> None:
         self.topic, self.kind = topic, kind
+        self.lost = 0
         self._gaps = Gaps()
         self._delivery = Delivery(topic, qos.depth, take)
         if qos.latched:
@@ -119,11 +124,7 @@ class ZenohSubscription:
         number, _, gid = found or (None, 0, b"")
         if self._gaps.note(gid.hex(), number):
             self._delivery.put(Received(sample.payload.to_bytes(), at, gid.hex(), number))
-
-    @property
-    def lost(self) -> int:
-        """Messages that were sent and did not come, or had to make room for newer ones here."""
-        return self._gaps.lost + self._delivery.overrun
+            self.lost = self._gaps.lost + self._delivery.overrun
 
     @property
     def failures(self) -> int:

@@ -110,6 +110,10 @@ class LocalSubscription:
     def lost(self) -> int:
         return self.gaps.lost + self.delivery.overrun
 
+    @property
+    def failures(self) -> int:
+        return self.delivery.failures
+
     def close(self) -> None:
         with self.network.lock:
             if self in self.network.subscriptions:
