@@ -44,8 +44,8 @@ camera_optical: z forward, its pose in map is trajectory.txt's.
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote.")]
 Publish = Annotated[
     str | None,
-    typer.Option(metavar="LIST", help="Where to publish: foxglove, ros2, FILE.mcap, with commas between them. Default: "
-                 "foxglove, if it is installed."),
+    typer.Option(metavar="LIST", help="Where to publish: foxglove[:PORT], ros2, FILE.mcap, with commas between them. "
+                 "Default: foxglove, if it is installed."),
 ]  # fmt: skip
 FoxglovePort = Annotated[
     int, typer.Option(help="Port that Foxglove connects to; 0 takes any free one.", min=0, max=65535)
@@ -80,20 +80,21 @@ def serve(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of --publish that is there.")] = False,
 ) -> None:
     """Publish a finished run to Foxglove, ROS 2 or an MCAP file, and answer what robots ask of it."""
-    from ggslam.jobs.serve.outlets import PublishRequest, parse_outlets
+    from ggslam.jobs.serve.outlets import Places, PublishRequest, parse_places
     from ggslam.jobs.serve.serving import ServeRequest, serve_map
     from ggslam.jobs.view.serve import wait_for_interrupt
     from ggslam.runs.folder import RunFolder
 
-    names = ("foxglove",) if publish is None else parse_outlets(publish)
+    places = Places(("foxglove",)) if publish is None else parse_places(publish)
     node = network.node_request(middleware, domain, namespace, address)
-    through = PublishRequest(names, host, foxglove_port, node, overwrite, optional=publish is None)
-    request = ServeRequest(through, host, port if http else None, tuple(robot or ()), changes)
-    only_files = not http and all(name not in ("foxglove", "ros2") for name in names)
+    foxglove = foxglove_port if places.foxglove_port is None else places.foxglove_port
+    through = PublishRequest(places.names, host, foxglove, node, overwrite, optional=publish is None)
+    asked = places.http_port if places.http_port is not None else port if http else None
+    request = ServeRequest(through, host, asked, tuple(robot or ()), changes)
     with serve_map(RunFolder.open(run), request) as serving:
         for line in serving.lines:
             console.print(line, highlight=False, markup=False, soft_wrap=True)
-        if only_files:
+        if asked is None and places.only_files:
             serving.finish_files()
         else:
             wait_for_interrupt(_announce)

@@ -3,26 +3,26 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path as FilePath
+from shutil import copytree
 
 import numpy as np
+from serve_tools import KeptOutlet, chain, until
 
-sys.path.insert(0, str(FilePath(__file__).parents[1] / "messages"))
-from kept_outlet import KeptOutlet  # noqa: E402
-
-from ggslam.jobs.serve import channels as c  # noqa: E402
-from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA  # noqa: E402
-from ggslam.jobs.serve.publishing import MapPublisher  # noqa: E402
-from ggslam.jobs.serve.run_contents import RunContents, ServedRun  # noqa: E402
-from ggslam.jobs.serve.run_volumes import RunVolumes  # noqa: E402
-from ggslam.jobs.serve.tiles import TileTuning, tile_of  # noqa: E402
-from ggslam.messages.contents import Transforms  # noqa: E402
-from ggslam.runs.folder import RunFolder  # noqa: E402
-from ggslam.scene.poses import inverse  # noqa: E402
+from ggslam.jobs.serve import channels as c
+from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA
+from ggslam.jobs.serve.publishing import MapPublisher
+from ggslam.jobs.serve.run_contents import RunContents, ServedRun
+from ggslam.jobs.serve.run_volumes import VOLUMES, RunVolumes
+from ggslam.jobs.serve.tiles import TileTuning, tile_of
+from ggslam.jobs.volumes.fuse_volumes import fuse_volumes
+from ggslam.runs.folder import RunFolder
+from ggslam.scene.poses import inverse, transform_points
+from ggslam.volumes.esdf import DistanceField
+from ggslam.volumes.tsdf_file import load_tsdf
 
 
 @contextmanager
@@ -35,22 +35,6 @@ def served(run: RunFolder, outlet: KeptOutlet) -> Iterator[tuple[RunContents, Ma
     serving.close()
     publisher.close()
     volumes.close()
-
-
-def until(happened: object, seconds: float = 10.0) -> None:
-    end = time.monotonic() + seconds
-    while not happened():  # type: ignore[operator]
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.01)
-
-
-def chain(transforms: Transforms, *frames: str) -> np.ndarray:
-    """T_first_last along edges parent to child."""
-    edges = {(parent, child): T for parent, child, T in transforms.edges}
-    T = np.eye(4)
-    for parent, child in zip(frames[:-1], frames[1:], strict=True):
-        T = T @ edges[parent, child]
-    return T
 
 
 def test_a_run_is_published(room_run: RunFolder) -> None:
@@ -88,3 +72,39 @@ def test_nothing_is_made_that_nobody_listens_to_and_who_joins_gets_all(room_run:
         outlet.join(c.POINT_TILES.name)  # a second one: all tiles again
         until(lambda: len(outlet.of(c.POINT_TILES.name)) == 2 * first)
         assert not outlet.of(c.POINTS.name)
+
+
+def test_volumes_are_those_of_the_files(room_run: RunFolder, tmp_path: FilePath) -> None:
+    """Of the files that `ggslam volumes` wrote: distances, grids, mesh, the floor's frame."""
+    run = RunFolder.open(copytree(room_run.path, tmp_path / "run"))
+    fuse_volumes(run.path, esdf=True, objects=False, voxel=0.04, robots=["low:0.4,0.2"])
+    volumes = RunVolumes(run, ["tall:1.2,0.3"])
+    assert volumes.robots() == ["low", "tall"] and volumes.place() == run.path / VOLUMES
+    contents = RunContents(run, volumes)
+    field = DistanceField(load_tsdf(run.path / VOLUMES / "tsdf.npz"))
+    field.update()
+    cut = volumes.distance_slice(contents.poses)
+    np.testing.assert_allclose(cut.values["distance"], field.query(cut.xyz).distance, atol=2e-5)
+    assert len(cut.xyz) > 100
+    heights = transform_points(cut.xyz, volumes.floor())[:, 2]
+    assert np.ptp(heights) < 1e-4  # a level slice
+    low, tall = volumes.grid("low"), volumes.grid("tall")
+    assert low.cell_m == tall.cell_m and low.frame == c.FLOOR
+    assert (low.cells == 0).any() and (tall.cells == 100).sum() >= (low.cells == 100).sum() > 0
+    made = RunVolumes(run, ["low:0.4,0.2"]).grid("low")  # from the field instead of the file
+    np.testing.assert_array_equal(made.cells, low.cells)
+    np.testing.assert_allclose(made.T_frame_origin, low.T_frame_origin, atol=1e-6)
+    parts = volumes.mesh_parts()
+    assert len({part.part for part in parts}) == len(parts) and sum(len(part.triangles) for part in parts) > 100
+    assert np.abs(field.query(np.concatenate([part.vertices for part in parts])).distance).max() < 0.04
+    np.testing.assert_array_equal(
+        volumes.T_floor_map(run.gaussians, contents.poses), volumes.floor(), err_msg="floor.yaml is what counts"
+    )
+
+
+def test_a_run_without_volumes_gets_them_when_asked(room_run: RunFolder) -> None:
+    volumes = RunVolumes(room_run)
+    place = volumes.place()
+    assert (place / "tsdf.npz").is_file() and not (room_run.path / VOLUMES).exists()
+    volumes.close()
+    assert not place.exists()

@@ -18,7 +18,6 @@ from ggslam.viewer.page_requests import PageRequests
 from ggslam.viewer.page_server import PageServer
 from ggslam.viewer.page_source import NothingYet
 
-DEFAULT_PORT: Final = 8090
 _ASKED: Final = ("status", "verdicts")
 """What a GET may ask: it changes nothing."""
 

@@ -17,7 +17,8 @@ from ggslam.middleware.types import MessageTypes, message_types
 
 FOXGLOVE_PORT: Final = 8765
 """That Foxglove itself suggests."""
-_FILE = ".mcap"
+HTTP_PORT: Final = 8090
+_PORTS: Final = {"foxglove": FOXGLOVE_PORT, "http": HTTP_PORT}
 
 
 @dataclass(frozen=True)
@@ -57,19 +58,44 @@ class Opened:
     lines: list[str] = field(default_factory=list)
 
 
-def parse_outlets(text: str) -> tuple[str, ...]:
-    """Names of a list with commas.
+@dataclass(frozen=True)
+class Places:
+    """Where to publish: names of outlets, and the ports that were told."""
+
+    names: tuple[str, ...]
+    foxglove_port: int | None = None
+    http_port: int | None = None
+
+    @property
+    def only_files(self) -> bool:
+        """Whether nobody can join."""
+        return self.http_port is None and all(_is_file(name) for name in self.names)
+
+
+def parse_places(text: str) -> Places:
+    """Of a list with commas: foxglove[:PORT], ros2, http[:PORT], FILE.mcap.
 
     Raises:
-        ConfigError: one is none, or there twice.
+        ConfigError: one is none of these, or there twice.
     """
-    names = tuple(name.strip() for name in text.split(",") if name.strip())
-    for name in names:
-        if name not in ("foxglove", "ros2") and Path(name).suffix.lower() != _FILE:
-            raise ConfigError(f"`publish`: expected foxglove, ros2 or FILE{_FILE}, found {name[:80]!r}")
-    if not names or len(set(names)) < len(names):
-        raise ConfigError(f"`publish`: expected foxglove, ros2 or FILE{_FILE}, each once, found {text[:80]!r}")
-    return names
+    names, ports = [], dict[str, int]()
+    for word in (word.strip() for word in text.split(",")):
+        name, _, port = word.partition(":")
+        if name in ("foxglove", "http") and (not port or (port.isdecimal() and int(port) < 65536)):
+            ports[name] = int(port) if port else _PORTS[name]
+            names.append(name)
+        elif word == "ros2" or _is_file(word):
+            names.append(word)
+        else:
+            expected = "foxglove[:PORT], ros2, http[:PORT] or FILE.mcap"
+            raise ConfigError(f"`publish`: expected {expected}, found {word[:80]!r}")
+    if len(set(names)) < len(names):
+        raise ConfigError(f"`publish`: expected each place once, found {text[:80]!r}")
+    return Places(tuple(name for name in names if name != "http"), ports.get("foxglove"), ports.get("http"))
+
+
+def _is_file(word: str) -> bool:
+    return Path(word).suffix.lower() == ".mcap"
 
 
 @contextmanager

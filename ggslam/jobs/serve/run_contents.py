@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -113,8 +113,8 @@ class RunContents:
             elif channel.name in self.grids:
                 grid = self.volumes.grid(self.grids[channel.name])
                 publisher.put(channel, grid, self.stamp)
-            else:
-                self._makers[channel.name](publisher, channel)
+            elif maker := self._makers.get(channel.name):
+                maker(publisher, channel)
         except GgslamError as error:
             self.problems[channel.name] = str(error)
 
@@ -192,12 +192,13 @@ class ServedRun:
     Args:
         contents: of the run.
         publisher: that takes them.
+        made: names of channels whose content is published already.
     """
 
-    def __init__(self, contents: RunContents, publisher: MapPublisher) -> None:
+    def __init__(self, contents: RunContents, publisher: MapPublisher, made: Iterable[str] = ()) -> None:
         self.contents, self._publisher = contents, publisher
         self._asked: queue.SimpleQueue[Channel | None] = queue.SimpleQueue()
-        self._made: set[str] = set()
+        self._made = set(made)
         publisher.on_join(self._asked.put)
         for channel in publisher.channels:
             if publisher.wanted(channel):

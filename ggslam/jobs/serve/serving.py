@@ -8,8 +8,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ggslam.jobs.serve.http_face import DEFAULT_PORT, serve_functions
-from ggslam.jobs.serve.outlets import Opened, PublishRequest, open_outlets
+from ggslam.jobs.serve.http_face import serve_functions
+from ggslam.jobs.serve.outlets import HTTP_PORT, Opened, PublishRequest, open_outlets
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.ros_face import RosFace
 from ggslam.jobs.serve.run_contents import RunContents, ServedRun
@@ -41,7 +41,7 @@ class ServeRequest:
 
     publish: PublishRequest
     host: str = DEFAULT_HOST
-    port: int | None = DEFAULT_PORT
+    port: int | None = HTTP_PORT
     robots: Sequence[str] = ()
     changes: Path | None = None
 
