@@ -142,7 +142,7 @@ class RunFunctions:
             raise ConfigError(f"`depth_scale`: expected units per metre, found {str(scale)[:40]}")
         if depth.dtype != np.uint16 or depth.ndim != 2:
             raise ConfigError("`depth`: expected a PNG of one channel with 16 bits")
-        metres = depth.astype(np.float32) / np.float32(scale)
+        metres = depth.astype(np.float32) * np.float32(1 / scale)
         return self.locate(np.ascontiguousarray(color), metres, _camera(values.get("camera")))
 
     def locate(self, color: np.ndarray, depth: np.ndarray, camera: Camera | None) -> dict[str, Any]:
