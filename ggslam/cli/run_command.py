@@ -201,11 +201,9 @@ def run(
     loops: Loops = None,
     threads: Threads = None, seed: Seed = None,
     skip_bad_frames: options.SkipBadFrames = False, check: Check = True,
-    log: Log = None,
-    view: ShowPage = False, publish: Publish = None,
+    log: Log = None, view: ShowPage = False, publish: Publish = None,
     host: options.Host = "127.0.0.1", port: options.Port = 8080,
-    evaluate: Evaluate = True,
-    overwrite: Overwrite = False,
+    evaluate: Evaluate = True, overwrite: Overwrite = False,
     strict: Strict = False, energy: Energy = False,
     resume: Resume = None, checkpoint_every: CheckpointEvery = None,
     encode: EncodeTo = None, encode_with: EncodeWith = None,
@@ -216,8 +214,8 @@ def run(
     from ggslam.runs.recordings import SequenceRequest
 
     node = network.node_request(middleware, domain, namespace, address)
-    served = None if publish is None else _serve_request(publish, host, node, overwrite)
-    watched = _Watched(log, (host, port) if view else None, strict, energy, served, out)
+    page, served = (host, port) if view else None, _serve_request(publish, host, node, overwrite)
+    watched = _Watched(log, page, strict, energy, served, out)
     coded_as = _encode_request(context, encode, encode_with)
     if resume is not None:
         return _go_on(context, resume, sequence, checkpoint_every, evaluate, settings, loss, coded_as, watched)
@@ -235,8 +233,10 @@ def run(
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
 
 
-def _serve_request(publish: str, host: str, node: NodeRequest, overwrite: bool) -> ServeRequest:
-    """How the run is published. Raises ConfigError for places that are none."""
+def _serve_request(publish: str | None, host: str, node: NodeRequest, overwrite: bool) -> ServeRequest | None:
+    """How the run is published; None: it is not. Raises ConfigError for places that are none."""
+    if publish is None:
+        return None
     from ggslam.jobs.serve.outlets import FOXGLOVE_PORT, PublishRequest, parse_places
     from ggslam.jobs.serve.serving import ServeRequest
 
