@@ -16,7 +16,7 @@ MOVE = se3_exp(np.array([0.5, 0.1, -0.2, 0, 0.2, 0]))
 
 
 def chain(tree: FramesTree) -> np.ndarray:
-    edges = {(parent, child): T for parent, child, T in (*tree.moving.edges, *fixed_frames(None).edges)}
+    edges = {(parent, child): T for parent, child, T in (*tree.transforms.edges, *fixed_frames(None).edges)}
     return np.asarray(edges[MAP, ODOM] @ edges[ODOM, CAMERA] @ edges[CAMERA, OPTICAL])
 
 

@@ -81,14 +81,14 @@ def test_a_budget_bounds_the_bytes_and_a_file_has_none() -> None:
 def test_who_joins_gets_all_parts() -> None:
     outlet = KeptOutlet(everybody=0)
     publisher = MapPublisher([(outlet, False)], CHANNELS)
-    assert not publisher.wanted(c.POINT_TILES)
+    assert not publisher.is_wanted(c.POINT_TILES)
     for k in range(3):
         publisher.put(c.POINT_TILES, points(k), 0.0, part=str(k))
     publisher.put(c.POINT_TILES, points(9), 1.0, part="1")
     publisher.forget(c.POINT_TILES, "2")
     assert publisher.wait_idle(1.0) and not outlet.sent
     outlet.join(c.POINT_TILES.name)
-    assert publisher.wanted(c.POINT_TILES)
+    assert publisher.is_wanted(c.POINT_TILES)
     assert publisher.wait_idle(1.0)
     assert sorted(float(p.xyz[0, 0]) for p in outlet.of(c.POINT_TILES.name)) == [0, 9]
     publisher.close()

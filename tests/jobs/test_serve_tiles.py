@@ -40,26 +40,26 @@ def test_one_point_for_each_cell() -> None:
 
 def test_only_what_changed_is_sent() -> None:
     sent = SentTiles()
-    first = sent.changed(thin(MEANS))
+    first = sent.find_changes(thin(MEANS))
     assert sum(len(rows) for rows in first.values()) == len(thin(MEANS))
-    assert sent.changed(thin(MEANS)) == {}
+    assert sent.find_changes(thin(MEANS)) == {}
     moved = MEANS.copy()
     inside = (tile_of(MEANS) == [1, 0, 1]).all(axis=1)
     moved[inside] += np.float32(0.07)
-    changed = sent.changed(thin(moved))
+    changed = sent.find_changes(thin(moved))
     assert (1, 0, 1) in changed and len(changed) <= 8  # and neighbours that got some of its points
     gone = moved[~(tile_of(moved) == [-2, 0, 0]).all(axis=1)]
-    changed = sent.changed(thin_points(gone, COLORS[: len(gone)], IDS[: len(gone)]))
+    changed = sent.find_changes(thin_points(gone, COLORS[: len(gone)], IDS[: len(gone)]))
     assert len(changed[-2, 0, 0]) == 0
 
 
 def test_noise_is_no_change_unless_it_is_the_end() -> None:
     sent = SentTiles()
-    sent.changed(thin(MEANS))
+    sent.find_changes(thin(MEANS))
     brighter = COLORS + np.uint8(3)
-    assert sent.changed(thin(MEANS, brighter)) == {}
-    assert len(sent.changed(thin(MEANS, brighter), exactly=True)) == len(np.unique(tile_of(MEANS), axis=0))
-    assert len(sent.changed(thin(MEANS, brighter + np.uint8(20)))) == len(np.unique(tile_of(MEANS), axis=0))
+    assert sent.find_changes(thin(MEANS, brighter)) == {}
+    assert len(sent.find_changes(thin(MEANS, brighter), exactly=True)) == len(np.unique(tile_of(MEANS), axis=0))
+    assert len(sent.find_changes(thin(MEANS, brighter + np.uint8(20)))) == len(np.unique(tile_of(MEANS), axis=0))
 
 
 def gaussians(means: np.ndarray) -> GaussianTensors:

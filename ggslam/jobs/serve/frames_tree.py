@@ -57,7 +57,7 @@ class FramesTree:
         self.T_map_odom = T_map_optical @ inverse(self.T_odom_optical)
 
     @property
-    def moving(self) -> Transforms:
+    def transforms(self) -> Transforms:
         """The edges that change, for /tf."""
         T_odom_camera = self.T_odom_optical @ T_OPTICAL_CAMERA
         return Transforms(((MAP, ODOM, self.T_map_odom), (ODOM, CAMERA, T_odom_camera)))

@@ -37,7 +37,7 @@ class Functions(NothingYet):
         """See `PageSource`."""
         return {"ok": True, **self._services.call(action, values)}
 
-    def listing(self) -> dict[str, Any]:
+    def functions(self) -> dict[str, Any]:
         """The functions that there are."""
         known = {name: FUNCTIONS[name] for name in self._services.names}
         return {"functions": {name: {"takes": takes, "does": does} for name, (takes, does) in known.items()}}
@@ -54,7 +54,7 @@ class FunctionRequests(PageRequests):
         name = urlsplit(self.path).path.strip("/")
         source = self.server.source
         if not name:
-            self._send_json(source.listing())
+            self._send_json(source.functions())
         elif name in _ASKED:
             self._send_json(source.answer(name, None))
         elif name in FUNCTIONS:

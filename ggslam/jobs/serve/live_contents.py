@@ -137,7 +137,7 @@ class LiveContents:
             self._publisher.put(LENS, Lens(OPTICAL, slam.camera), stamp)
         T = self._locate(slam, report)
         if T is not None:
-            self._publisher.put(TF, self.tree.moving, stamp, keep=False)
+            self._publisher.put(TF, self.tree.transforms, stamp, keep=False)
             self._publisher.put(POSE, Pose(MAP, T @ T_OPTICAL_CAMERA), stamp, keep=False)
             self._send_movers(slam, frame, T)
         now = time.monotonic()
@@ -165,7 +165,7 @@ class LiveContents:
 
     def _send_movers(self, slam: Slam, frame: Frame, T_map_optical: np.ndarray) -> None:
         tracks = slam.movers.tracks.tracks
-        if not (tracks or self._has_movers) or not self._publisher.wanted(MOVERS):
+        if not (tracks or self._has_movers) or not self._publisher.is_wanted(MOVERS):
             return
         seen = {track.number: track.sights[-1] for track in tracks if track.sights}
         things = self._movers.step(seen, frame.index, frame.timestamp, T_map_optical)
@@ -175,7 +175,7 @@ class LiveContents:
 
     def _send_pictures(self, frame: Frame) -> None:
         for channel, image in ((RECORDED, frame.color), (DEPTH, frame.depth)):
-            if self._publisher.wanted(channel):
+            if self._publisher.is_wanted(channel):
                 self._publisher.put(channel, Picture(OPTICAL, image), frame.timestamp, keep=False)
 
     def _verdicts(self, slam: Slam, report: StepReport) -> Verdicts:
@@ -196,7 +196,7 @@ class LiveContents:
 
     def _copy(self, slam: Slam, report: StepReport, T: np.ndarray | None, stamp: float) -> None:
         """Copies the map if the other thread is ready and anybody wants what is made of it."""
-        heavy = self._map.wanted or any(self._publisher.wanted(c) for c in (OBJECTS, PATH, RENDERED))
+        heavy = self._map.is_wanted or any(self._publisher.is_wanted(c) for c in (OBJECTS, PATH, RENDERED))
         if not self._ready.is_set() or not slam.mapper.keyframes or not (heavy or self._floor_due):
             return
         self._ready.clear()
@@ -214,7 +214,7 @@ class LiveContents:
         with slam.mapper.in_turn():
             copies = GaussianTensors(*(view[:count].to("cpu", copy=True) for view in views))
             ids = np.zeros(count, np.uint16)
-            if self._publisher.wanted(OBJECTS) and slam.mapper.identity is not None:
+            if self._publisher.is_wanted(OBJECTS) and slam.mapper.identity is not None:
                 labels = slam.mapper.vote_labels()[:count]
                 ids[: len(labels)] = labels
         poses, stamps = _path_of(slam)
@@ -241,7 +241,7 @@ class LiveContents:
             self._ready.set()
 
     def _show(self, s: _Snapshot) -> None:
-        put, wanted = self._publisher.put, self._publisher.wanted
+        put, wanted = self._publisher.put, self._publisher.is_wanted
         if self._floor_due and len(s.poses) >= LiveContentsTuning.floor_keyframes:
             self._floor_due = False
             self._send_floor(s.gaussians, s.poses, s.stamp)
@@ -286,7 +286,7 @@ class LiveContents:
         stamp = float(stamps[known][-1])
         self.tree.correct(poses[known][-1])
         put = self._publisher.put
-        put(TF, self.tree.moving, stamp)
+        put(TF, self.tree.transforms, stamp)
         put(POSE, Pose(MAP, poses[known][-1] @ T_OPTICAL_CAMERA), stamp)
         put(PATH, Path(MAP, poses[known] @ T_OPTICAL_CAMERA, stamps[known]), stamp)
         if len(result.gaussians):

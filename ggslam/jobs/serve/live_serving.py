@@ -93,7 +93,7 @@ class LiveServing:
     def finish(self, outcome: RunOutcome) -> None:
         """Publishes what came out, and notes in timing.json what was sent."""
         self._functions.end()
-        made = {channel.name for channel in LIVE if self.publisher.wanted(channel)} - {OBJECTS.name, VERDICTS.name}
+        made = {channel.name for channel in LIVE if self.publisher.is_wanted(channel)} - {OBJECTS.name, VERDICTS.name}
         self.contents.finish(outcome.result)
         if outcome.failure is not None:
             return

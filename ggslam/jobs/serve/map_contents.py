@@ -63,10 +63,10 @@ class MapContents:
         self._whole_at: dict[str, float] = {}
 
     @property
-    def wanted(self) -> bool:
+    def is_wanted(self) -> bool:
         """Whether there is anything to do for a map."""
         return any(self._is_due(channel) for channel in (POINTS, SPLATS)) or any(
-            self._publisher.wanted(channel) for channel in (POINT_TILES, SPLAT_TILES)
+            self._publisher.is_wanted(channel) for channel in (POINT_TILES, SPLAT_TILES)
         )
 
     def show(self, shown: MapCopy, stamp: float, final: bool = False, harmonics: int = 1) -> None:
@@ -82,7 +82,7 @@ class MapContents:
         surface = opacities_of(g) >= TileTuning.min_opacity
         means, rgb = g.means.numpy(), colors_to_uint8(0.5 + SH_C0 * g.sh.numpy()[:, 0])
         solid = means[surface], rgb[surface], shown.ids[surface]
-        if self._publisher.wanted(POINT_TILES) or self._publisher.wanted(SPLAT_TILES):
+        if self._publisher.is_wanted(POINT_TILES) or self._publisher.is_wanted(SPLAT_TILES):
             thin = thin_points(*solid)
             self._point_tiles(thin, stamp, final)
             self._splat_tiles(shown, thin, stamp, final, harmonics)
@@ -96,22 +96,22 @@ class MapContents:
 
     def _is_due(self, channel: Channel, final: bool = False) -> bool:
         rested = time.monotonic() - self._whole_at.get(channel.name, -1e9) > MapContentsTuning.whole_every_s
-        return self._publisher.wanted(channel) and (final or rested)
+        return self._publisher.is_wanted(channel) and (final or rested)
 
     def _point_tiles(self, thin: ThinPoints, stamp: float, final: bool) -> None:
-        if not self._publisher.wanted(POINT_TILES):
+        if not self._publisher.is_wanted(POINT_TILES):
             return
-        for tile, rows in self._tiles[POINT_TILES.name].changed(thin, final).items():
+        for tile, rows in self._tiles[POINT_TILES.name].find_changes(thin, final).items():
             if len(rows):
                 self._publisher.put(POINT_TILES, points_of(thin, rows), stamp, part_name(tile))
             else:
-                self._gone(POINT_TILES, tile, _no_points(tile), stamp)
+                self._send_empty(POINT_TILES, tile, _no_points(tile), stamp)
 
     def _splat_tiles(self, shown: MapCopy, thin: ThinPoints, stamp: float, final: bool, harmonics: int) -> None:
         """Splats of the tiles whose points changed."""
-        if not self._publisher.wanted(SPLAT_TILES):
+        if not self._publisher.is_wanted(SPLAT_TILES):
             return
-        changed = self._tiles[SPLAT_TILES.name].changed(thin, final)
+        changed = self._tiles[SPLAT_TILES.name].find_changes(thin, final)
         if not changed:
             return
         seen = most_visible(shown.gaussians, len(shown.ids))
@@ -121,9 +121,9 @@ class MapContents:
             if rows is not None and len(changed[tile]):
                 self._publisher.put(SPLAT_TILES, splats_of(shown, seen[rows], harmonics), stamp, part_name(tile))
             else:
-                self._gone(SPLAT_TILES, tile, _no_splats(tile), stamp)
+                self._send_empty(SPLAT_TILES, tile, _no_splats(tile), stamp)
 
-    def _gone(self, channel: Channel, tile: Tile, empty: Points | Splats, stamp: float) -> None:
+    def _send_empty(self, channel: Channel, tile: Tile, empty: Points | Splats, stamp: float) -> None:
         self._publisher.put(channel, empty, stamp, part_name(tile), keep=False)
         self._publisher.forget(channel, part_name(tile))
 

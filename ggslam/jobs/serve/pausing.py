@@ -52,14 +52,14 @@ class Pause:
             return
         began = time.monotonic()
         self.times += 1
-        with _released_by_signals(self._goes_on):
+        with _end_on_signal(self._goes_on):
             while not self._goes_on.wait(PauseTuning.look_s):
                 meanwhile()
         self.seconds += time.monotonic() - began
 
 
 @contextmanager
-def _released_by_signals(goes_on: threading.Event) -> Iterator[None]:
+def _end_on_signal(goes_on: threading.Event) -> Iterator[None]:
     """A signal to stop ends the pause, and does what it would do without."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -34,7 +34,7 @@ class MapPublisher:
             OutletSender(outlet, self.channels, self.newest, self._tell_joined, is_file) for outlet, is_file in outlets
         ]
 
-    def wanted(self, channel: Channel) -> bool:
+    def is_wanted(self, channel: Channel) -> bool:
         """Whether anybody listens to a channel: of others nothing need be computed."""
         return any(sender.listens(channel) for sender in self.senders)
 

@@ -130,7 +130,7 @@ class RosFace:
         for point in found.get("points", []):
             T = np.eye(4)
             T[:3, 3] = point
-            poses.append(self._stamped(frame, T))
+            poses.append(self._pose_in(frame, T))
         path = self._types.make("nav_msgs/msg/Path", header=self._header(frame), poses=poses)
         return self._types.make(response_of(GET_PLAN), plan=path)
 
@@ -143,7 +143,7 @@ class RosFace:
         error = error or ("" if found["located"] else found["reason"])
         T = np.array(found.get("T_map_optical", np.eye(4)))
         return self._types.make(
-            response_of(LOCALIZE), success=not error, message=error, pose=self._stamped(MAP, T),
+            response_of(LOCALIZE), success=not error, message=error, pose=self._pose_in(MAP, T),
             overlap=float(found.get("overlap", 0.0)),
         )  # fmt: skip
 
@@ -153,7 +153,7 @@ class RosFace:
         time = self._types.make("builtin_interfaces/msg/Time", sec=0, nanosec=0)
         return self._types.make("std_msgs/msg/Header", stamp=time, frame_id=frame)
 
-    def _stamped(self, frame: str, T: np.ndarray) -> Any:
+    def _pose_in(self, frame: str, T: np.ndarray) -> Any:
         made = pose(self._types, T)
         return self._types.make("geometry_msgs/msg/PoseStamped", header=self._header(frame), pose=made)
 

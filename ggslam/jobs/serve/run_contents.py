@@ -201,7 +201,7 @@ class ServedRun:
         self._made = set(made)
         publisher.on_join(self._asked.put)
         for channel in publisher.channels:
-            if publisher.wanted(channel):
+            if publisher.is_wanted(channel):
                 self._asked.put(channel)
         self._thread = threading.Thread(target=self._work, name="publish-run", daemon=True)
         self._thread.start()
@@ -211,7 +211,7 @@ class ServedRun:
             try:
                 channel = self._asked.get(timeout=RunContentsTuning.verdict_every_s)
             except queue.Empty:
-                if self._publisher.wanted(VERDICTS):
+                if self._publisher.is_wanted(VERDICTS):
                     self.contents.make(self._publisher, VERDICTS)
                 continue
             if channel is None:

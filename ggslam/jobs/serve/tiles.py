@@ -122,7 +122,7 @@ class SentTiles:
     def __init__(self) -> None:
         self._sent: dict[Tile, _Sent] = {}
 
-    def changed(self, thin: ThinPoints, exactly: bool = False) -> dict[Tile, np.ndarray]:
+    def find_changes(self, thin: ThinPoints, exactly: bool = False) -> dict[Tile, np.ndarray]:
         """Rows of the tiles that are to be sent, by tile; no rows: it has become empty. They count as sent.
 
         Args:
