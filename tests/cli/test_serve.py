@@ -45,6 +45,22 @@ def test_a_run_goes_into_a_file(room_run: RunFolder, tmp_path: Path) -> None:
     assert "is there already" in refusal("serve", room_run.path, "--publish", path, "--no-http")
 
 
+def test_a_run_is_published_as_it_goes_on(room: Path, tmp_path: Path) -> None:
+    pytest.importorskip("foxglove")
+    mcap = pytest.importorskip("mcap.reader")
+    path = tmp_path / "run.mcap"
+    few = ("--set", "mapping.iterations_per_frame=2", "--refine", "5", "--no-eval", "--stop", "6")
+    said = succeed("run", room, "--out", tmp_path / "run", "--publish", path, *few)
+    assert f"file: {path}" in said and "published file" in said
+    with path.open("rb") as file:
+        summary = mcap.make_reader(file).get_summary()
+    counts = summary.statistics.channel_message_counts
+    by_topic = {channel.topic: counts.get(key, 0) for key, channel in summary.channels.items()}
+    assert by_topic["/tf"] == 7 and by_topic["/ggslam/pose"] == 7 and by_topic["/ggslam/points"] >= 1, by_topic
+    record = RunFolder.open(tmp_path / "run").timing().model_dump()["publishing"]["outlets"]["file"]
+    assert record["channels"]["/tf"]["messages"] == 7 and record["not_taken"] == 0
+
+
 def test_it_serves_until_ctrl_c(room_run: RunFolder, tmp_path: Path) -> None:
     from urllib.request import urlopen
 

@@ -63,6 +63,7 @@ def test_a_forced_correction_moves_odom_and_not_the_camera_in_it(room: Path, tmp
 
     outcome = run_of(room, tmp_path / "run", follow)
     contents.finish(outcome.result)
+    assert publisher.wait_idle(10.0)
     trees = [kept.content for kept in outlet.sent if kept.channel == c.TF]
     publisher.close()
     assert len(trees) == 25  # one a frame, and as it came out
@@ -86,10 +87,11 @@ def test_a_forced_correction_moves_odom_and_not_the_camera_in_it(room: Path, tmp
 def test_everything_is_told_and_the_end_is_the_map_as_saved(room: Path, tmp_path: Path) -> None:
     outlet = KeptOutlet()
     publisher = MapPublisher([(outlet, True)], LIVE)
-    with overridden(LiveContentsTuning, min_rest_s=0.0, processor_share=1.0, picture_every_s=0.0):
+    with overridden(LiveContentsTuning, min_rest_s=0.0, processor_share=10.0, picture_every_s=0.0):
         contents = LiveContents(publisher)
         outcome = run_of(room, tmp_path / "run", contents.follow)
         contents.finish(outcome.result)
+    assert publisher.wait_idle(10.0)
     publisher.close()
     told = {kept.channel.name for kept in outlet.sent}
     assert told == {channel.name for channel in LIVE} - {c.MOVERS.name}
@@ -101,6 +103,20 @@ def test_everything_is_told_and_the_end_is_the_map_as_saved(room: Path, tmp_path
     level = [verdict.level for verdict in outlet.of(c.VERDICTS.name)[0].verdicts]
     assert level == ["ok", "ok"]
     assert {child for _, child, _ in outlet.of(c.TF_STATIC.name)[-1].edges} == {c.OPTICAL, c.FLOOR}
+
+
+def test_what_it_costs_is_bounded(room: Path, tmp_path: Path) -> None:
+    """With a budget of nothing, one copy of the map is made and no image is sent; poses go out all the same."""
+    outlet = KeptOutlet()
+    publisher = MapPublisher([(outlet, True)], LIVE)
+    with overridden(LiveContentsTuning, min_rest_s=0.0, processor_share=0.0, ahead_s=0.0):
+        contents = LiveContents(publisher)
+        run_of(room, tmp_path / "run", contents.follow, 12)
+        contents.stop()
+    assert publisher.wait_idle(10.0)
+    publisher.close()
+    assert contents.copies == 1 and not outlet.of(c.RECORDED.name) and len(outlet.of(c.POSE.name)) == 12
+    assert contents.cpu_s > 0
 
 
 def test_nothing_is_copied_while_nobody_listens(room: Path, tmp_path: Path) -> None:

@@ -2,8 +2,9 @@
 """Follows a run and publishes it as it grows, at a small, bounded cost.
 
 Poses and frames go out after every frame. For the rest the thread of the run copies the map now and then, and another
-thread makes contents of the copy; that one rests until it has used no more than `LiveContentsTuning.processor_share` of
-a processor. What nobody listens to is neither copied nor made.
+thread makes contents of the copy. Images and copies wait until all of publishing, writing messages included, has used
+no more than `LiveContentsTuning.processor_share` of the program's processor time. What nobody listens to is neither
+copied nor made.
 """
 
 from __future__ import annotations
@@ -59,8 +60,12 @@ _log = logging.getLogger(__name__)
 class LiveContentsTuning(Tuning):
     """What publishing a growing map costs and shows."""
 
-    processor_share = 0.02
-    """Share of one processor that making contents of the map may take."""
+    processor_share = 0.035
+    """Share of the program's processor time that publishing may take."""
+    ahead_s = 0.2
+    """Processor seconds that may be used before."""
+    look_s = 0.2
+    """Seconds between two looks whether there is time for the next copy."""
     min_rest_s = 1.0
     """Shortest rest between two copies of the map, in seconds."""
     picture_every_s = 0.2
@@ -73,8 +78,6 @@ class LiveContentsTuning(Tuning):
     """Seconds between two verdicts."""
     floor_keyframes = 5
     """Keyframes from which the floor is looked for."""
-    end_s = 30.0
-    """Seconds that the map as it came out may take to be sent."""
 
 
 @dataclass
@@ -88,6 +91,7 @@ class _Snapshot:
     camera: Camera
     T_map_optical: np.ndarray | None
     stamp: float
+    whole: bool
 
 
 class LiveContents:
@@ -117,6 +121,7 @@ class LiveContents:
         """How many times the map was copied."""
         self.follow_s = 0.0
         """Seconds that the run's own thread spent here."""
+        self._cpu_s, self._began_cpu = 0.0, time.process_time()
         self._thread = threading.Thread(target=self._work, name="publish-map", daemon=True)
         self._thread.start()
 
@@ -124,10 +129,20 @@ class LiveContents:
 
     def follow(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         """After a frame. Of a rig the first camera is followed."""
-        began = time.perf_counter()
+        began, began_cpu = time.perf_counter(), time.thread_time()
         if frame.camera_number == 0:
             self._follow(slam, frame, report)
         self.follow_s += time.perf_counter() - began
+        self._cpu_s += time.thread_time() - began_cpu
+
+    @property
+    def cpu_s(self) -> float:
+        """Processor seconds that publishing took so far."""
+        return self._cpu_s + self._publisher.cpu_s
+
+    def _may_spend(self) -> bool:
+        used = time.process_time() - self._began_cpu
+        return self.cpu_s < LiveContentsTuning.ahead_s + LiveContentsTuning.processor_share * used
 
     def _follow(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         stamp = frame.timestamp
@@ -141,7 +156,7 @@ class LiveContents:
             self._publisher.put(POSE, Pose(MAP, T @ T_OPTICAL_CAMERA), stamp, keep=False)
             self._send_movers(slam, frame, T)
         now = time.monotonic()
-        if now - self._picture_at >= LiveContentsTuning.picture_every_s:
+        if now - self._picture_at >= LiveContentsTuning.picture_every_s and self._may_spend():
             self._picture_at = now
             self._send_pictures(frame)
         if now - self._verdict_at >= LiveContentsTuning.verdict_every_s:
@@ -218,7 +233,7 @@ class LiveContents:
                 labels = slam.mapper.vote_labels()[:count]
                 ids[: len(labels)] = labels
         poses, stamps = _path_of(slam)
-        return _Snapshot(copies, ids, poses, stamps, slam.camera, T, stamp)
+        return _Snapshot(copies, ids, poses, stamps, slam.camera, T, stamp, slam.pager is None)
 
     # --- the thread that makes contents ------------------------------------------------------------------------------
 
@@ -229,16 +244,23 @@ class LiveContents:
                 snapshot, self._snapshot = self._snapshot, None
                 if self._ended or snapshot is None:
                     return
-            began = time.thread_time()
+            began, began_cpu = time.monotonic(), time.thread_time()
             try:
                 self._show(snapshot)
             except Exception:  # the run goes on
                 _log.exception("a map could not be published")
-            spent = time.thread_time() - began
-            rest = max(LiveContentsTuning.min_rest_s, spent / LiveContentsTuning.processor_share)
-            with self._given:
-                self._given.wait_for(lambda: self._ended, timeout=rest)
+            self._cpu_s += time.thread_time() - began_cpu
+            self._rest(began)
             self._ready.set()
+
+    def _rest(self, since: float) -> None:
+        """Returns when the next copy may be made."""
+        with self._given:
+            while not self._ended:
+                rested = time.monotonic() - since >= LiveContentsTuning.min_rest_s
+                if rested and self._may_spend():
+                    return
+                self._given.wait(LiveContentsTuning.look_s)
 
     def _show(self, s: _Snapshot) -> None:
         put, wanted = self._publisher.put, self._publisher.is_wanted
@@ -247,7 +269,7 @@ class LiveContents:
             self._send_floor(s.gaussians, s.poses, s.stamp)
         if wanted(PATH) and len(s.poses):
             put(PATH, Path(MAP, s.poses @ T_OPTICAL_CAMERA, s.stamps), s.stamp)
-        self._map.show(MapCopy(s.gaussians, s.ids), s.stamp)
+        self._map.show(MapCopy(s.gaussians, s.ids, s.whole), s.stamp)
         if wanted(OBJECTS) and s.ids.any():
             solid = opacities_of(s.gaussians) >= TileTuning.min_opacity
             put(OBJECTS, growing_objects(s.gaussians.means.numpy()[solid], s.ids[solid], self._names), s.stamp)
@@ -276,8 +298,7 @@ class LiveContents:
         self._thread.join(timeout=10.0)
 
     def finish(self, result: SlamResult) -> None:
-        """The run ended: publishes poses and map as they came out, and waits until they are sent or
-        `LiveContentsTuning.end_s` have passed."""
+        """The run ended: publishes poses and map as they came out."""
         self.stop()
         poses, stamps = result.trajectory()[:: self._cameras], result.timestamps()[:: self._cameras]
         known = np.isfinite(poses).all(axis=(1, 2))
@@ -296,7 +317,6 @@ class LiveContents:
             self._send_floor(copies, poses[known], stamp)
             ids = g.object_id.cpu().numpy().astype(np.uint16)
             self._map.show(MapCopy(copies, ids), stamp, final=True)
-        self._publisher.wait_idle(LiveContentsTuning.end_s)
 
 
 def _path_of(slam: Slam) -> tuple[np.ndarray, np.ndarray]:

@@ -46,6 +46,7 @@ from ggslam.runs.records.timing import TimingRecord
 from ggslam.scene.frame import Frame
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
+from ggslam.system.tuning import Tuning
 
 LIVE: tuple[Channel, ...] = (
     TF, TF_STATIC, POSE, PATH, LENS, RECORDED, DEPTH, RENDERED, POINTS, POINT_TILES, SPLATS, SPLAT_TILES, OBJECTS,
@@ -54,6 +55,13 @@ LIVE: tuple[Channel, ...] = (
 """Channels of a run that goes on."""
 AFTER: tuple[Channel, ...] = (MESH, DISTANCE, CHANGES)
 """Channels that have something when it has ended, besides grids."""
+
+
+class LiveServingTuning(Tuning):
+    """The end of a run."""
+
+    end_s = 30.0
+    """Seconds that sending the map as it came out may take, if nobody waits for Ctrl-C."""
 
 
 class LiveServing:
@@ -95,13 +103,15 @@ class LiveServing:
         self._functions.end()
         made = {channel.name for channel in LIVE if self.publisher.is_wanted(channel)} - {OBJECTS.name, VERDICTS.name}
         self.contents.finish(outcome.result)
+        if not self.stays:
+            self.publisher.wait_idle(LiveServingTuning.end_s)
         if outcome.failure is not None:
             return
         folder = outcome.folder
         with folder.change_files(TimingRecord.FILE):
             record = folder.timing().model_copy(update={"publishing": self.publisher.record()})
             record.write(folder.path)
-        if outcome.error is None:
+        if outcome.error is None and self.stays:
             volumes = RunVolumes(folder, self._request.robots)
             self._opened.callback(volumes.close)
             try:

@@ -44,10 +44,12 @@ class MapCopy:
     Attributes:
         gaussians: on the CPU.
         ids: uint16 [N], object of each, 0: none.
+        whole: whether there is nothing else: of a run whose memory is limited parts are on disk.
     """
 
     gaussians: Gaussians
     ids: np.ndarray
+    whole: bool = True
 
 
 class MapContents:
@@ -84,7 +86,7 @@ class MapContents:
         solid = means[surface], rgb[surface], shown.ids[surface]
         if self._publisher.is_wanted(POINT_TILES) or self._publisher.is_wanted(SPLAT_TILES):
             thin = thin_points(*solid)
-            self._point_tiles(thin, stamp, final)
+            self._point_tiles(shown, thin, stamp, final)
             self._splat_tiles(shown, thin, stamp, final, harmonics)
         if self._is_due(POINTS, final):
             self._whole_at[POINTS.name] = time.monotonic()
@@ -98,10 +100,10 @@ class MapContents:
         rested = time.monotonic() - self._whole_at.get(channel.name, -1e9) > MapContentsTuning.whole_every_s
         return self._publisher.is_wanted(channel) and (final or rested)
 
-    def _point_tiles(self, thin: ThinPoints, stamp: float, final: bool) -> None:
+    def _point_tiles(self, shown: MapCopy, thin: ThinPoints, stamp: float, final: bool) -> None:
         if not self._publisher.is_wanted(POINT_TILES):
             return
-        for tile, rows in self._tiles[POINT_TILES.name].find_changes(thin, final).items():
+        for tile, rows in self._tiles[POINT_TILES.name].find_changes(thin, final, shown.whole).items():
             if len(rows):
                 self._publisher.put(POINT_TILES, points_of(thin, rows), stamp, part_name(tile))
             else:
@@ -111,7 +113,7 @@ class MapContents:
         """Splats of the tiles whose points changed."""
         if not self._publisher.is_wanted(SPLAT_TILES):
             return
-        changed = self._tiles[SPLAT_TILES.name].find_changes(thin, final)
+        changed = self._tiles[SPLAT_TILES.name].find_changes(thin, final, shown.whole)
         if not changed:
             return
         seen = most_visible(shown.gaussians, len(shown.ids))

@@ -85,6 +85,11 @@ class MapPublisher:
 
     # --- figures -----------------------------------------------------------------------------------------------------
 
+    @property
+    def cpu_s(self) -> float:
+        """Processor seconds that writing messages took."""
+        return sum(sender.cpu_s for sender in self.senders)
+
     def counts(self) -> dict[str, dict[str, ChannelCounts]]:
         """By outlet and channel."""
         return {sender.outlet.name: dict(sender.counts) for sender in self.senders}

@@ -48,6 +48,8 @@ class RunVolumesTuning(Tuning):
     """Most points of a slice through the distance field."""
     most_cells = 4_000_000
     """Most cells of a grid."""
+    close_s = 1.0
+    """Longest wait for volumes that are being made."""
 
 
 class RunVolumes:
@@ -183,12 +185,16 @@ class RunVolumes:
         return Points(MAP, places[cut.known].astype(np.float32), None, {"distance": cut.distance[cut.known]})
 
     def close(self) -> None:
-        """Removes what was made."""
-        with self._lock:
+        """Removes what was made; what is being made goes when the program ends."""
+        if not self._lock.acquire(timeout=RunVolumesTuning.close_s):
+            return
+        try:
             self._field = None
             if self._made is not None:
                 self._made.cleanup()
                 self._made = None
+        finally:
+            self._lock.release()
 
 
 def _grid_of_file(found: RosMap) -> Grid:

@@ -95,6 +95,8 @@ class OutletSender:
     ) -> None:  # fmt: skip
         self.outlet, self.is_file, self._joined = outlet, is_file, joined
         self.counts: dict[str, ChannelCounts] = {}
+        self.cpu_s = 0.0
+        """Processor seconds that this thread spent on messages."""
         self.failure = ""
         """Why something could not be sent, the first time."""
         self._newest = newest
@@ -201,6 +203,13 @@ class OutletSender:
             return None
 
     def _send(self, given: Given) -> None:
+        began = time.thread_time()
+        try:
+            self._try(given)
+        finally:
+            self.cpu_s += time.thread_time() - began
+
+    def _try(self, given: Given) -> None:
         try:
             count = self.outlet.send(given.channel, given.content, given.stamp)
         except Exception as error:  # whatever an outlet does, the run goes on

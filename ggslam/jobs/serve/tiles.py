@@ -122,12 +122,13 @@ class SentTiles:
     def __init__(self) -> None:
         self._sent: dict[Tile, _Sent] = {}
 
-    def find_changes(self, thin: ThinPoints, exactly: bool = False) -> dict[Tile, np.ndarray]:
+    def find_changes(self, thin: ThinPoints, exactly: bool = False, whole: bool = True) -> dict[Tile, np.ndarray]:
         """Rows of the tiles that are to be sent, by tile; no rows: it has become empty. They count as sent.
 
         Args:
-            thin: the whole map, in cells of `TileTuning.point_m`.
+            thin: the map, in cells of `TileTuning.point_m`.
             exactly: whether the least difference counts.
+            whole: whether tiles that are not there have become empty.
         """
         found = {}
         tiles = rows_by_tile(thin)
@@ -136,7 +137,7 @@ class SentTiles:
             if before is None or _differs(before, now, exactly):
                 found[tile] = rows
                 self._sent[tile] = now
-        for tile in self._sent.keys() - tiles.keys():
+        for tile in self._sent.keys() - tiles.keys() if whole else ():
             found[tile] = np.zeros(0, np.int64)
             del self._sent[tile]
         return found
