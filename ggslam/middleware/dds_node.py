@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ggslam.middleware.dds_domain import DOMAINS
+from ggslam.middleware.dds_presence import Presence
 from ggslam.middleware.dds_services import DdsClient, DdsOffered
 from ggslam.middleware.dds_topics import READ_DEPTH, DdsPublisher, DdsSubscription, Reading, dds_qos
 from ggslam.middleware.dds_types import RawTypes
@@ -43,6 +44,7 @@ class DdsNode:
         self._closed = False
         self._graph = self._builtin_readers()
         self._reading = Reading(self._participant, name)
+        self._presence = Presence(self._participant, self.types, self._raw, self.namespace, name)
         close_at_exit(self)
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> DdsPublisher:
@@ -112,13 +114,17 @@ class DdsNode:
     def _writer(self, name: str, kind: str, qos: Qos, mark: str) -> Any:
         from cyclonedds.pub import DataWriter
 
-        return DataWriter(self._participant, self._topic(name, kind), dds_qos(qos, qos.depth, mark))
+        writer = DataWriter(self._participant, self._topic(name, kind), dds_qos(qos, qos.depth, mark))
+        self._presence.add_writer(writer)
+        return writer
 
     def _reader(self, name: str, kind: str, qos: Qos, mark: str) -> Any:
         from cyclonedds.sub import DataReader
 
         depth = qos.depth if qos.latched else max(qos.depth, READ_DEPTH)
-        return DataReader(self._participant, self._topic(name, kind), dds_qos(qos, depth, mark))
+        reader = DataReader(self._participant, self._topic(name, kind), dds_qos(qos, depth, mark))
+        self._presence.add_reader(reader)
+        return reader
 
     def _topic(self, name: str, kind: str) -> Any:
         from cyclonedds.topic import Topic

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -13,11 +14,14 @@ from ggslam.middleware.dds_domain import delete
 from ggslam.middleware.delivery import Delivery
 from ggslam.middleware.node import Qos, Received
 
+log = logging.getLogger(__name__)
 READ_DEPTH: Final = 16
 """Messages that wait, at least, for the thread that reads; those beyond the topic's depth are counted as lost there."""
 READ_ONCE: Final = 8
 CLOSE_S: Final = 2.0
 FOREVER_NS: Final = 2**62
+PAUSE_S: Final = 0.1
+"""After an error of DDS, so that one that comes again does not take the processor."""
 
 
 def dds_qos(qos: Qos, depth: int, user_data: str) -> Any:
@@ -80,11 +84,17 @@ class Reading:
             self._thread.join(CLOSE_S)
 
     def _run(self) -> None:
+        from cyclonedds.core import DDSException
+
         while not self._closed:
-            self._waitset.wait(FOREVER_NS)
-            with self._lock:
-                for condition, (reader, take) in self._readers.items():
-                    self._take_all(reader, condition, take)
+            try:
+                self._waitset.wait(FOREVER_NS)
+                with self._lock:
+                    for condition, (reader, take) in self._readers.items():
+                        self._take_all(reader, condition, take)
+            except DDSException as error:
+                log.warning("DDS: messages could not be read: %s", error.msg)
+                time.sleep(PAUSE_S)
 
     def _take_all(self, reader: Any, condition: Any, take: Callable[[Any], None]) -> None:
         while not self._closed:

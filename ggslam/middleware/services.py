@@ -72,3 +72,4 @@ class Answers:
                 job()
             except Exception as error:  # of the network: whoever asked may be gone
                 self._note(error)
+            del job  # what it holds of the network ends with it

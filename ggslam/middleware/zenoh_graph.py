@@ -31,20 +31,20 @@ class Graph:
                 self._shown[token] = found
             self._changed.notify_all()
 
-    def count(self, entity: str, name: str, kind: str) -> int:
-        """How many there are of an entity: "MP", "MS", "SS" or "SC"."""
-        wanted = Shown(entity, name, kind)
+    def hashes(self, entity: str, name: str, kind: str) -> list[str]:
+        """Hash of the type of each such entity there is now: "MP", "MS", "SS" or "SC"."""
         with self._changed:
-            return sum(shown == wanted for shown in self._shown.values())
+            return self._hashes(entity, name, kind)
 
-    def wait_for(self, entity: str, name: str, deadline: float) -> bool:
-        """Waits until there is such an entity, at most until `deadline` of the monotonic clock; whether there is."""
-
-        def there() -> bool:
-            return any((shown.entity, shown.name) == (entity, name) for shown in self._shown.values())
-
+    def wait_for(self, entity: str, name: str, kind: str, deadline: float) -> list[str]:
+        """The same; waits until there is one, at most until `deadline` of the monotonic clock."""
         with self._changed:
-            return self._changed.wait_for(there, max(0.0, deadline - time.monotonic()))
+            self._changed.wait_for(lambda: self._hashes(entity, name, kind), max(0.0, deadline - time.monotonic()))
+            return self._hashes(entity, name, kind)
+
+    def _hashes(self, entity: str, name: str, kind: str) -> list[str]:
+        wanted = (entity, name, kind)
+        return [one.type_hash for one in self._shown.values() if (one.entity, one.name, one.kind) == wanted]
 
     def topics(self) -> dict[str, str]:
         """Topics and their types."""

@@ -66,6 +66,7 @@ class Shown:
     entity: str
     name: str
     kind: str
+    type_hash: str
 
 
 def read_token(token: str) -> Shown | None:
@@ -74,7 +75,7 @@ def read_token(token: str) -> Shown | None:
     if len(parts) < 13 or parts[0] != SPACE or parts[5] not in ("MP", "MS", "SS", "SC"):
         return None
     kind = ros_kind(parts[10])
-    return Shown(parts[5], parts[9].replace("%", "/"), kind) if kind else None
+    return Shown(parts[5], parts[9].replace("%", "/"), kind, parts[11]) if kind else None
 
 
 def gid_of(token: str) -> bytes:

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from ggslam.errors import MiddlewareError
 from ggslam.middleware import zenoh_keys as keys
@@ -21,6 +22,9 @@ from ggslam.middleware.types import message_types
 from ggslam.middleware.zenoh_graph import Graph
 from ggslam.middleware.zenoh_session import open_session
 from ggslam.middleware.zenoh_topics import ZenohPublisher, ZenohSubscription
+
+LOOK_S: Final = 0.01
+"""How often a client looks whether Zenoh knows the way to a service that shows itself."""
 
 
 class ZenohNode:
@@ -66,17 +70,17 @@ class ZenohNode:
         concrete = keys.key(self._domain, name, kind, type_hash)
 
         def reply(query: Any) -> None:
-            sent = query.attachment.to_bytes() if query.attachment is not None else b""
-            found = keys.read_attachment(sent)
-            if found is None or query.payload is None:
-                answers.refuse("a request is not as rmw_zenoh_cpp sends it")
-                return
-            number, _, gid = found
-            # a client that asks for any hash takes ours, one that asks for its own takes only that
-            where = concrete if "*" in str(query.key_expr) else query.key_expr
-            with query:
+            with query:  # afterwards the client waits no longer
+                sent = query.attachment.to_bytes() if query.attachment is not None else b""
+                found = keys.read_attachment(sent)
+                if found is None or query.payload is None:
+                    answers.refuse("a request is not as rmw_zenoh_cpp sends it")
+                    return
                 response = answers.response(query.payload.to_bytes())
                 if response is not None:
+                    # a client that asks for any hash takes ours, one that asks for its own takes only that
+                    where = concrete if "*" in str(query.key_expr) else query.key_expr
+                    number, _, gid = found
                     query.reply(where, response, attachment=keys.attachment(number, time.time_ns(), gid))
 
         queryable = self._session.declare_queryable(
@@ -87,33 +91,39 @@ class ZenohNode:
 
     def call(self, service: str, kind: str, request: Any, timeout_s: float = 5.0) -> Any:
         """Calls a service, of any hash of the type."""
-        import zenoh
-
         name = full_name(self.namespace, service)
         content = self.types.encode(request_of(check_kind(kind)), request)
         gid = self._client(name, kind)
-        replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
         deadline = time.monotonic() + timeout_s
-        while (left := deadline - time.monotonic()) > 0:
-            self._session.get(
-                keys.key(self._domain, name, kind, "*"),
-                zenoh.handlers.Callback(replies.put, lambda: replies.put(None)),
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                payload=content,
-                attachment=keys.attachment(next(self._numbers), time.time_ns(), gid),
-                timeout=left,
-            )
-            try:
-                while (reply := replies.get(timeout=left + 0.1)) is not None:
-                    if reply.ok is not None:
-                        return self.types.decode(response_of(kind), reply.ok.payload.to_bytes())
-            except queue.Empty:
-                break
-            if not self._graph.wait_for("SS", name, deadline):
-                break  # whoever offers it may be found only now
-            time.sleep(0.02)
+        offered = self._graph.wait_for("SS", name, kind, deadline)
+        if offered:
+            where = keys.key(self._domain, name, kind, sorted(offered)[0])
+            attached = keys.attachment(next(self._numbers), time.time_ns(), gid)
+            response = self._ask(where, content, attached, deadline)
+            if response is not None:
+                return self.types.decode(response_of(kind), response)
         raise MiddlewareError(f"`{name}`: nobody answered in {timeout_s:g} s")
+
+    def _ask(self, where: str, content: bytes, attached: bytes, deadline: float) -> bytes | None:
+        """The response to a request, which is sent once; None: there is none by the deadline of the monotonic clock."""
+        import zenoh
+
+        replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        querier = self._session.declare_querier(
+            where, target=zenoh.QueryTarget.ALL_COMPLETE, consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=max(LOOK_S, deadline - time.monotonic()),
+        )  # fmt: skip
+        with querier, contextlib.suppress(queue.Empty):
+            while not querier.matching_status.matching:
+                if time.monotonic() > deadline:
+                    return None
+                time.sleep(LOOK_S)
+            taking = zenoh.handlers.Callback(replies.put, lambda: replies.put(None))
+            querier.get(taking, payload=content, attachment=attached)
+            while (reply := replies.get(timeout=max(0.0, deadline - time.monotonic()))) is not None:
+                if reply.ok is not None:
+                    return bytes(reply.ok.payload.to_bytes())
+        return None
 
     def topics(self) -> dict[str, str]:
         """Topics that can be seen now, with their types."""

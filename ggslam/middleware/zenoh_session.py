@@ -18,7 +18,7 @@ QUEUE_BATCHES: Final = 16
 """Batches of 64 KiB that wait for a link: a picture of 1 MB fits, so only a link that stands still loses messages."""
 WAIT_US: Final = 1000
 """Longest wait of a sender for room in the queue of a link, microseconds."""
-FRAGMENTS_WAIT_US: Final = 20_000
+FRAGMENTS_WAIT_US: Final = 50_000
 """The same, of a message of many batches."""
 
 

@@ -61,7 +61,7 @@ class ZenohPublisher:
     @property
     def subscribers(self) -> int:
         """How many listen: subscriptions of ROS 2 by their tokens; others count as one together."""
-        shown = self._graph.count("MS", self.topic, self.kind)
+        shown = len(self._graph.hashes("MS", self.topic, self.kind))
         if shown or not hasattr(self._publisher, "matching_status"):
             return shown
         return int(self._publisher.matching_status.matching)

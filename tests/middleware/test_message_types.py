@@ -6,7 +6,8 @@ from __future__ import annotations
 import pytest
 
 from ggslam.errors import MiddlewareError
-from ggslam.middleware.types import MessageTypes, message_types
+from ggslam.middleware.definitions import MESSAGES, SERVICES
+from ggslam.middleware.types import DISTRIBUTIONS, MessageTypes, message_types
 
 pytest.importorskip("rosbags")
 
@@ -48,6 +49,15 @@ def test_services_have_requests_and_responses() -> None:
     content = types.encode("std_srvs/srv/Trigger_Response", response)
     assert types.decode("std_srvs/srv/Trigger_Response", content) == response
     assert [name for name, _ in types.fields("nav_msgs/srv/GetPlan_Request")] == ["start", "goal", "tolerance"]
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_all_distributions_have_what_is_used(distribution: str) -> None:
+    types = message_types(distribution)
+    for kind in (*MESSAGES, *SERVICES):
+        assert types.hash(kind)
+    for kind in ("rmw_dds_common/msg/ParticipantEntitiesInfo", "tf2_msgs/msg/TFMessage"):
+        assert types.fields(kind)
 
 
 def test_own_definitions() -> None:

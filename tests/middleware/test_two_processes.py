@@ -3,30 +3,15 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from pathlib import Path
 
-import numpy as np
 import pytest
+from networks import Network, end, image, wait_until
+from peer import IMAGE, PAIRS, TEXT, TRIGGER, register
 
-sys.path.insert(0, str(Path(__file__).parent))
-from conftest import Network, end, wait_until  # noqa: E402
-from peer import IMAGE, PAIRS, TEXT, TRIGGER, register  # noqa: E402
-
-from ggslam.errors import MiddlewareError  # noqa: E402
-from ggslam.middleware.node import LATCHED, Qos, Received  # noqa: E402
-from ggslam.middleware.types import message_types  # noqa: E402
-
-
-def image(number: int, height: int = 480, width: int = 640) -> bytes:
-    types = message_types("jazzy")
-    stamp = types.make("builtin_interfaces/msg/Time", sec=number, nanosec=0)
-    header = types.make("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
-    data = np.random.default_rng(number).integers(0, 255, height * width * 3, np.uint8)
-    return types.encode(IMAGE, types.make(
-        IMAGE, header=header, height=height, width=width, encoding="rgb8", is_bigendian=0, step=3 * width, data=data
-    ))  # fmt: skip
+from ggslam.errors import MiddlewareError
+from ggslam.middleware.node import LATCHED, Qos, Received
+from ggslam.middleware.types import message_types
 
 
 def test_images_go_and_come_back(network: Network) -> None:
@@ -85,20 +70,32 @@ def test_services(network: Network) -> None:
     node.close()
 
 
-def test_a_peer_that_was_killed_is_found_again(network: Network) -> None:
-    node, got = network.node(), []
+@pytest.mark.parametrize("listens", [True, False])
+def test_a_peer_that_was_killed_is_found_again(network: Network, listens: bool) -> None:
+    """Of Zenoh, whichever of the two connects to the other."""
+    node, got = network.node(listens=listens), []
     node.subscribe("/latched", TEXT, LATCHED, got.append)
 
     def heard(process: int) -> bool:  # who listens already may get both messages of the peer
         decode = message_types("jazzy").decode
         return any(decode(TEXT, received.content).data == f"from {process}" for received in got)
 
-    peer = network.peer()
+    peer = network.peer(not listens)
     assert wait_until(lambda: heard(peer.pid))
     peer.kill()
     peer.wait(5)
-    second = network.peer()
+    second = network.peer(not listens)
     assert wait_until(lambda: heard(second.pid))
     assert node.call("/trigger", TRIGGER, message_types("jazzy").make(TRIGGER + "_Request"), 8.0).success
     end(second)
+    node.close()
+
+
+def test_a_request_is_answered_once(network: Network) -> None:
+    """A client that gets no answer does not ask again: the request may have done something."""
+    node, types, calls = network.node(), message_types("jazzy"), []
+    node.offer("/broken", TRIGGER, lambda request: calls.append(request))  # None is no response
+    with pytest.raises(MiddlewareError, match="/broken"):
+        node.call("/broken", TRIGGER, types.make(TRIGGER + "_Request"), 1.0)
+    assert len(calls) == 1
     node.close()

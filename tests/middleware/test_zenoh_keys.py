@@ -40,8 +40,8 @@ def test_tokens() -> None:
 
 
 def test_tokens_are_read() -> None:
-    assert keys.read_token(LISTENER) == keys.Shown("MS", "/chatter", "std_msgs/msg/String")
-    assert keys.read_token(SERVER) == keys.Shown("SS", "/add_two_ints", "example_interfaces/srv/AddTwoInts")
+    assert keys.read_token(LISTENER) == keys.Shown("MS", "/chatter", "std_msgs/msg/String", STRING_HASH)
+    assert keys.read_token(SERVER) == keys.Shown("SS", "/add_two_ints", "example_interfaces/srv/AddTwoInts", SUM_HASH)
     for other in ("", "@ros2_lv/0/1/0/0/NN/%/%/c", LISTENER.replace("MS", "XX"), "a/" * 13, LISTENER[:60]):
         assert keys.read_token(other) is None
 
