@@ -127,10 +127,12 @@ class Thing:
 
 @dataclass(frozen=True)
 class Things:
-    """All things of a kind that there are now: what is not among them is gone."""
+    """All things of a kind that there are now: what is not among them is gone. `up`: the unit vector upwards in the
+    frame, where names stand above the boxes; None: they stand in the boxes."""
 
     frame: str
     things: tuple[Thing, ...]
+    up: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,6 @@ class FoxgloveChannel:
         self._fixed: dict[str, Edge] = {}
         self._shown: set[str] = set()
         self._grid: Grid | None = None
-        self._parts: dict[str, bytes] = {}
         self._last: tuple[bytes, int] | None = None
 
     def send(self, content: Content, stamp: float) -> int:
@@ -82,20 +81,20 @@ class FoxgloveChannel:
         with self._lock:
             message = self._message(content, stamp)
             at = whole_nanoseconds(stamp)
-            if self.channel.latched:
-                whole = scene_message(self._parts.values()) if self.channel.kind is Mesh else message
-                self._last = (whole, at)
+            if self.channel.latched and not (isinstance(content, Mesh) and content.part):
+                self._last = (message, at)
             self._sink.log(message, log_time=at)
         return len(message)
 
     def resend(self) -> None:
-        """Sends the last content again, if it is latched. To everybody: the package does not tell how to reach one."""
+        """Sends the last content again, if it is latched and not a part of a mesh, of which there are many. To
+        everybody: the package does not tell how to reach one."""
         with self._lock:
             if self._last is not None:
                 self._sink.log(self._last[0], log_time=self._last[1])
 
     def _message(self, content: Content, stamp: float) -> bytes:
-        write: Callable[[Any, float], bytes] = {
+        writers: dict[type, Callable[..., bytes]] = {
             Transforms: self._transforms,
             Pose: pose_message,
             Path: path_message,
@@ -107,8 +106,8 @@ class FoxgloveChannel:
             Grid: self._grid_message,
             Things: self._things,
             Verdicts: verdicts_message,
-        }[type(content)]
-        return write(content, stamp)
+        }
+        return writers[type(content)](content, stamp)
 
     def _transforms(self, content: Transforms, stamp: float) -> bytes:
         edges: list[Edge] = [(*edge, stamp) for edge in content.edges]
@@ -120,25 +119,22 @@ class FoxgloveChannel:
     def _things(self, content: Things, stamp: float) -> bytes:
         shown = {str(thing.id) for thing in content.things}
         gone, self._shown = sorted(self._shown - shown), shown
-        entities = [thing_entity(content.frame, thing, stamp) for thing in content.things]
+        entities = [thing_entity(content.frame, thing, stamp, content.up) for thing in content.things]
         return scene_message(entities, gone, stamp + AFTER_S)
 
     def _mesh(self, content: Mesh, stamp: float) -> bytes:
         name = mesh_id(content)
         if not len(content.triangles):
-            self._parts.pop(name, None)
             return scene_message([], [name], stamp + AFTER_S)
-        entity = mesh_entity(content, stamp)
-        if self.channel.latched:
-            self._parts[name] = entity
-        return scene_message([entity])
+        return scene_message([mesh_entity(content, stamp)])
 
     def _grid_message(self, content: Grid, stamp: float) -> bytes:
         """A part is put into the whole, which is sent: Foxglove has no message for parts."""
         if content.at is not None and self._grid is not None:
             (row, column), (height, width) = content.at, content.cells.shape
             whole = self._grid.cells.copy()
-            whole[row : row + height, column : column + width] = content.cells
+            place = whole[row : row + height, column : column + width]  # what lies outside has no place
+            place[:] = content.cells[: place.shape[0], : place.shape[1]]
             content = replace(self._grid, cells=whole)
         if content.at is None:
             self._grid = content

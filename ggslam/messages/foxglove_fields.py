@@ -10,7 +10,7 @@ import numpy as np
 
 from ggslam.messages.contents import Grid, Points, Splats, Verdicts
 from ggslam.messages.foxglove_package import foxglove_messages, pose, timestamp
-from ggslam.messages.point_rows import point_rows, splat_rows
+from ggslam.messages.point_rows import columns_of, point_rows, splat_rows
 from ggslam.messages.ros2_lists import LEVELS
 from ggslam.messages.sound_content import plain_text
 from ggslam.messages.stamps import seconds_and_nanoseconds
@@ -46,8 +46,7 @@ VERDICTS_SCHEMA: Final[dict[str, Any]] = {
 def cloud_message(content: Points | Splats, stamp: float) -> bytes:
     """foxglove.PointCloud."""
     rows = point_rows(content, "columns") if isinstance(content, Points) else splat_rows(content, "columns")
-    names = rows.dtype.names or ()
-    fields = [_packed(name, *rows.dtype.fields[name][:2]) for name in names]  # type: ignore[index]
+    fields = [_field(*column) for column in columns_of(rows)]
     made = foxglove_messages().PointCloud(
         timestamp=timestamp(stamp), frame_id=plain_text(content.frame), pose=pose(np.eye(4)),
         point_stride=rows.dtype.itemsize, fields=fields, data=rows.tobytes(),
@@ -61,15 +60,15 @@ def grid_message(content: Grid, stamp: float) -> bytes:
     made = kinds.Grid(
         timestamp=timestamp(stamp), frame_id=plain_text(content.frame), pose=pose(content.T_frame_origin),
         column_count=content.cells.shape[1], cell_size=kinds.Vector2(x=content.cell_m, y=content.cell_m),
-        row_stride=content.cells.shape[1], cell_stride=1, fields=[_packed("occupancy", np.dtype(np.int8), 0)],
+        row_stride=content.cells.shape[1], cell_stride=1, fields=[_field("occupancy", "|i1", 0)],
         data=np.ascontiguousarray(content.cells, np.int8).tobytes(),
     )  # fmt: skip
     return bytes(made.encode())
 
 
-def _packed(name: str, kind: np.dtype, offset: int) -> Any:
+def _field(name: str, kind: str, offset: int) -> Any:
     kinds = foxglove_messages()
-    number = getattr(kinds.PackedElementFieldNumericType, NUMBERS[kind.str])
+    number = getattr(kinds.PackedElementFieldNumericType, NUMBERS[kind])
     return kinds.PackedElementField(name=name, offset=offset, type=number)
 
 

@@ -60,14 +60,14 @@ def lens_message(content: Lens, stamp: float) -> bytes:
 def picture_message(content: Picture, stamp: float) -> bytes:
     """foxglove.CompressedImage, as a topic has one schema: JPEG of colour, or PNG if it shall not be compressed with
     loss; PNG of millimetres of depth."""
-    image = content.image
-    if image.ndim == 2:
-        form, stored, options = "png", depth_mm(image), [cv2.IMWRITE_PNG_COMPRESSION, PictureTuning.png_level]
-    elif content.compressed:
-        form, stored, options = "jpeg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, PictureTuning.jpeg_quality]
+    png = [cv2.IMWRITE_PNG_COMPRESSION, PictureTuning.png_level]
+    if content.image.ndim == 2:
+        form, stored, options = "png", depth_mm(content.image), png
     else:
-        form, stored, options = "png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, PictureTuning.png_level]
-    data = cv2.imencode(f".{form}", np.ascontiguousarray(stored), options)[1].tobytes()
+        jpeg = [cv2.IMWRITE_JPEG_QUALITY, PictureTuning.jpeg_quality]
+        form, options = ("jpeg", jpeg) if content.compressed else ("png", png)
+        stored = cv2.cvtColor(content.image, cv2.COLOR_RGB2BGR)
+    data = cv2.imencode(f".{form}", stored, options)[1].tobytes()
     made = foxglove_messages().CompressedImage(
         timestamp=timestamp(stamp), frame_id=plain_text(content.frame), data=data, format=form
     )

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -62,6 +63,7 @@ class FoxgloveOutlet(_Outlet):
         super().__init__()
         self._told: list[Callable[[Channel], None]] = []
         self._clients: dict[str, set[int]] = {}
+        logging.getLogger("foxglove.websocket").setLevel(logging.CRITICAL)  # a client that hung up is no error
         try:
             self._server = foxglove_package().start_server(
                 name="ggslam", host=host, port=port, server_listener=_Listener(self), context=self._context,

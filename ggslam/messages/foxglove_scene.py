@@ -24,11 +24,13 @@ def scene_message(entities: Iterable[bytes], gone: Iterable[str] = (), after: fl
     return bytes(kinds.SceneUpdate(deletions=deletions).encode()) + b"".join(field(2, entity) for entity in entities)
 
 
-def thing_entity(frame: str, thing: Thing, stamp: float) -> bytes:
-    """foxglove.SceneEntity: a box, its name above it, and an arrow if it moves."""
+def thing_entity(
+    frame: str, thing: Thing, stamp: float, up: tuple[float, float, float] | None = None
+) -> bytes:
+    """foxglove.SceneEntity: a box, its name, and an arrow if it moves."""
     kinds = foxglove_messages()
     place = np.eye(4)
-    place[:3, 3] = label_place(thing)
+    place[:3, 3] = label_place(thing, up)
     text = kinds.TextPrimitive(
         pose=pose(place), billboard=True, font_size=ThingTuning.text_m, color=color((255, 255, 255)), text=label(thing)
     )

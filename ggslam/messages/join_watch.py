@@ -15,6 +15,8 @@ class JoinTuning(Tuning):
 
     every_s = 0.25
     """Seconds between two looks."""
+    longest_s = 2.0
+    """Seconds that the end waits for a look, which may wait for who ends it."""
 
 
 class JoinWatch:
@@ -59,4 +61,4 @@ class JoinWatch:
         """Ends the thread."""
         self._ended.set()
         if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join()
+            self._thread.join(JoinTuning.longest_s)

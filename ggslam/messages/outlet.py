@@ -24,7 +24,8 @@ class Outlet(Protocol):
         """`told` is called, from any thread, when somebody began to listen to a channel."""
 
     def send(self, channel: Channel, content: Content, stamp: float) -> int:
-        """Sends; returns the bytes of the message. Latched contents are also kept for who joins late."""
+        """Sends; returns the bytes of the message. Latched contents are also kept for who joins late, but for parts of
+        meshes: those are to be sent again when `on_join` tells."""
 
     def left_out(self) -> int:
         """Messages that could not be taken without waiting."""

@@ -9,7 +9,7 @@ by spherical harmonics, all of red first), and `id`. A colour in front lets view
 from __future__ import annotations
 
 import math
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -83,3 +83,9 @@ def _table(
             rows[name] = rgb[:, k]
         rows["alpha"] = 255 if alpha is None else alpha
     return rows
+
+
+def columns_of(rows: np.ndarray) -> list[tuple[str, str, int]]:
+    """Name, numpy's word for the type, and offset in bytes of each column of rows."""
+    fields: Any = rows.dtype.fields or {}
+    return [(name, fields[name][0].str, fields[name][1]) for name in rows.dtype.names or ()]

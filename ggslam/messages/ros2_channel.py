@@ -66,8 +66,8 @@ class Ros2QueueTuning(Tuning):
     """Of images: newer ones are wanted."""
     updates = 100
     """Of parts of grids: none may be left out."""
-    mesh_parts = 200
-    """Of parts of meshes; who joins late gets as many."""
+    mesh_parts = 50
+    """Of parts of meshes; of a latched channel who joins late gets as many."""
     others = 10
     """Of everything else."""
 
@@ -128,14 +128,14 @@ class Ros2Channel:
 
     def messages(self, content: Content, stamp: float) -> Messages:
         """The messages that tell a content, by topic."""
-        write: Callable[[Content, float], Messages] = {
+        writers: dict[type, Callable[..., Messages]] = {
             Transforms: self._transforms,
             Picture: self._picture,
             Grid: self._grid,
             Things: self._things,
             Mesh: self._mesh,
-        }.get(type(content), self._single)  # type: ignore[assignment]
-        return write(content, stamp)
+        }
+        return writers.get(type(content), self._single)(content, stamp)
 
     def _single(self, content: Content, stamp: float) -> Messages:
         """Contents of one topic."""
@@ -182,7 +182,7 @@ class Ros2Channel:
         for thing in content.things:
             number = self._ids.of(thing.id)
             shown.add(number)
-            markers += thing_markers(frame, thing, number)
+            markers += thing_markers(frame, thing, number, content.up)
         for number in sorted(self._shown - shown):
             markers += thing_deletions(frame, number)
         self._shown = shown

@@ -72,10 +72,12 @@ def _write(writer: CdrWriter, marker: Marker, stamp: float) -> None:
     writer.numbers("B", 0)  # mesh_use_embedded_materials
 
 
-def thing_markers(frame: str, thing: Thing, number: int) -> list[Marker]:
-    """A box, its name above it, and an arrow if it moves; those that it may have had and has no more are deleted."""
+def thing_markers(
+    frame: str, thing: Thing, number: int, up: tuple[float, float, float] | None = None
+) -> list[Marker]:
+    """A box, its name, and an arrow if it moves; those that it may have had and has no more are deleted."""
     red, green, blue = (value / 255 for value in thing.rgb)
-    place = (*label_place(thing), 0.0, 0.0, 0.0, 1.0)
+    place = (*label_place(thing, up), 0.0, 0.0, 0.0, 1.0)
     width, depth, height = (max(float(side), ThingTuning.least_m) for side in thing.size)
     text = Marker(
         frame, "names", number, TEXT, pose=place, scale=(0.0, 0.0, ThingTuning.text_m), rgba=(1.0, 1.0, 1.0, 1.0),

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from ggslam.messages.contents import Points, Splats
-from ggslam.messages.point_rows import point_rows, splat_rows
+from ggslam.messages.point_rows import columns_of, point_rows, splat_rows
 from ggslam.messages.ros2_images import header
 from ggslam.messages.sound_content import plain_text
 from ggslam.middleware.types import MessageTypes
@@ -24,9 +24,12 @@ def cloud_message(types: MessageTypes, content: Points | Splats, stamp: float) -
     """sensor_msgs/PointCloud2 of one row."""
     rows = point_rows(content, "packed") if isinstance(content, Points) else splat_rows(content, "packed")
     fields = [
-        types.make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=_number(name, kind), count=1)
-        for name, (kind, offset) in ((name, rows.dtype.fields[name][:2]) for name in rows.dtype.names)
-    ]
+        types.make(
+            "sensor_msgs/msg/PointField", name=name, offset=offset, datatype=RGB if name == "rgb" else NUMBERS[kind],
+            count=1,
+        )
+        for name, kind, offset in columns_of(rows)
+    ]  # fmt: skip
     finite = isinstance(content, Splats) or bool(np.isfinite(content.xyz).all())
     made = types.make(
         CLOUD, header=header(types, plain_text(content.frame), stamp), height=1, width=len(rows), fields=fields,
@@ -34,7 +37,3 @@ def cloud_message(types: MessageTypes, content: Points | Splats, stamp: float) -
         is_dense=finite,
     )  # fmt: skip
     return types.encode(CLOUD, made)
-
-
-def _number(name: str, kind: np.dtype) -> int:
-    return RGB if name == "rgb" else NUMBERS[kind.str]

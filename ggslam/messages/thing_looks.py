@@ -34,11 +34,14 @@ def label(thing: Thing) -> str:
     return plain_text(f"{thing.name}: {thing.note}" if thing.note else thing.name)
 
 
-def label_place(thing: Thing) -> np.ndarray:
-    """Where the text stands: above the highest corner of the box, float64 [3]."""
+def label_place(thing: Thing, up: tuple[float, float, float] | None) -> np.ndarray:
+    """Where the text stands, float64 [3]: above the box, or at its middle if nobody knows where up is."""
     T = np.asarray(thing.T, np.float64)
-    highest = np.abs(T[2, :3]) @ np.asarray(thing.size, np.float64) / 2
-    return T[:3, 3] + [0.0, 0.0, highest + ThingTuning.text_m]
+    if up is None:
+        return T[:3, 3]
+    direction = np.asarray(up, np.float64)
+    highest = np.abs(direction @ T[:3, :3]) @ np.asarray(thing.size, np.float64) / 2
+    return T[:3, 3] + direction * (highest + ThingTuning.text_m)
 
 
 def speed(thing: Thing) -> float:
