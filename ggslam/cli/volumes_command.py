@@ -41,7 +41,8 @@ SourcePath = Annotated[
     Path,
     typer.Argument(
         metavar="SOURCE",
-        help="Folder that `ggslam run` wrote, of a recording or of laser scans, or a grid store made of runs.",
+        help="Folder that `ggslam run` wrote, of a recording or of laser scans, or a grid store made of runs; with "
+        "--live also a camera, named as for `ggslam run`.",
     ),
 ]
 
@@ -159,9 +160,10 @@ def volumes(
 ) -> None:  # fmt: skip
     """Make maps that planners read, each with a picture: TSDF with mesh, distance field, occupancy."""
     from ggslam.jobs.volumes.fuse import VolumesRequest
-    from ggslam.runs.recordings import SequenceRequest
+    from ggslam.runs.recordings import LiveRequest, SequenceRequest
+    from ggslam.sequences.live import is_live
 
-    reading = SequenceRequest(
+    reading = (LiveRequest if live and is_live(source) else SequenceRequest)(
         source, format=format_name, start=start, stop=stop, stride=stride, scale=scale,
         depth_scale=depth_scale, on_bad_frame="skip" if skip_bad_frames else "error", pose_convention=pose_convention,
         camera=camera, intrinsics=intrinsics, depth_camera=depth_camera, depth_kind=depth_kind,

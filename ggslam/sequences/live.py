@@ -148,7 +148,7 @@ class LiveSequence:
     Attributes:
         say: is told what happens to the camera meanwhile; `warnings` keep it.
         goes_on: whether frames are still waited for while none comes.
-        since: what `taken` tells: "stamp", where stamps are of the wall clock, else "arrival".
+        since: what `moment_of` tells: "stamp", where stamps are of the wall clock, else "arrival".
     """
 
     format = "live"
@@ -214,7 +214,7 @@ class LiveSequence:
             self.since = "stamp" if -LiveTuning.early_s < delay < LiveTuning.late_s else "arrival"
         self._taken.append(frame.timestamp if self.since == "stamp" else arrived)
 
-    def taken(self, frame: Frame) -> float:
+    def moment_of(self, frame: Frame) -> float:
         """When a frame was taken, or came, seconds since 1970; see `since`."""
         return self._taken[frame.index]
 

@@ -12,7 +12,7 @@ import pytest
 
 from ggslam.errors import RunFolderError, SequenceError
 from ggslam.jobs.run.pipeline import RunRequest, execute
-from ggslam.runs.recordings import LiveRequest, open_recording_of
+from ggslam.runs.recordings import LiveRequest, SequenceRequest, open_recording_of
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
 
@@ -53,6 +53,24 @@ def test_frames_that_are_not_kept(place: Path, tmp_path: Path) -> None:
     assert outcome.error is None and outcome.metrics is None and len(outcome.result.frames) == 3
     with pytest.raises(RunFolderError, match=r"python:room_camera:RoomCamera.*`record`"):
         open_recording_of(outcome.folder)
+
+
+def test_latency(place: Path, room: Path, tmp_path: Path) -> None:
+    """Of a camera since its frames came, for their stamps are of another clock; in real time since they were due."""
+    live = execute(RunRequest(LiveRequest(place, stop=4), tmp_path / "live", overrides=FAST))
+    latency = live.folder.timing().latency
+    assert latency == live.latency and latency is not None and latency.since == "arrival" and latency.arrivals is None
+    assert latency.pose is not None and latency.pose.count == 4 and 0 < latency.pose.median_s <= latency.pose.p95_s
+    assert latency.map is not None and latency.map.count == len(live.result.keyframes)
+    pace = [*FAST, "realtime_fps=8", "refine_iterations=1"]
+    paced = execute(RunRequest(SequenceRequest(room, stop=6), tmp_path / "paced", overrides=pace, evaluate=False))
+    latency = paced.folder.timing().latency
+    assert latency is not None and latency.since == "due" and latency.pose is not None
+    assert latency.pose.count == 5 - len(paced.result.dropped_frames)  # not the first one, which starts the clock
+    assert 0 < latency.pose.median_s < 2 and "latency since the frame was due: pose" in latency.text()
+    assert "Latency since the frame was due" in (paced.folder.path / "report.html").read_text()
+    plain = execute(RunRequest(SequenceRequest(room, stop=2), tmp_path / "plain", overrides=FAST, evaluate=False))
+    assert plain.latency is None and plain.folder.timing().latency is None
 
 
 def test_options_for_recordings_only(place: Path) -> None:

@@ -18,7 +18,7 @@ from ggslam.sequences.formats.ros2_discovery import wait_until
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, TF = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-ADDRESS, PATIENT = (f"ros2://camera/color,camera/depth?wait={seconds}" for seconds in (0.4, 5))
+ADDRESS, PATIENT = (f"ros2://camera/color,camera/depth?wait={seconds}" for seconds in (0.8, 5))
 
 
 def color_of(i: int, camera: Camera = CAMERA) -> np.ndarray:

@@ -115,7 +115,7 @@ class SlamLoop:
         else:
             frames = sequence.stream(masks="lazy")
             sequence.say, sequence.goes_on = observer.note, lambda: self.stop.number is None
-            self.latency = LatencyMeter(sequence.taken)
+            self.latency = LatencyMeter(sequence.moment_of)
         self._between_steps = self.config.realtime_fps == 0
         if self.config.realtime_fps > 0:
             self._side_by_side(slam, frames)

@@ -60,6 +60,7 @@ class PairInbox:
         self.damaged: Counter[str] = Counter()
         self._topics: dict[Kind, str] = {"color": topics[0], "depth": topics[1]}
         self._matcher: PairMatcher[Received] = PairMatcher(tolerance_s)
+        self._zeros: Counter[Kind] = Counter()
         self._slot: ImagePair | None = None
         self._last_at = 0.0
         self._events: deque[str] = deque(maxlen=20)
@@ -82,8 +83,9 @@ class PairInbox:
             if stamp is None:
                 return self._note_damage(self._topics[kind], f"{len(received.content)} bytes are no message")
             jumps = self._matcher.jumps
-            # Drivers that leave the time out write 0; then it is that of coming.
-            for pair in self._matcher.add(kind, stamp or received.at, received):
+            # Drivers that leave the time out write 0 each time; then it is that of coming.
+            self._zeros[kind] = self._zeros[kind] + 1 if stamp == 0 else 0
+            for pair in self._matcher.add(kind, received.at if self._zeros[kind] > 1 else stamp, received):
                 self._put(*pair)
             if self._matcher.jumps > jumps:
                 self._tell_jump(self._topics[kind])

@@ -96,7 +96,7 @@ class Ros2Camera:
                 wait_until(lambda: self._infos.tells_camera(topics["depth_info"]), LiveTopicsTuning.depth_info_s)
             try:
                 maker = FrameMaker(
-                    self._types, self._node.topics(), self._told(), pair, scale, self._infos.wait_for_fixed
+                    self._types, self._node.topics(), self._topic_infos(), pair, scale, self._infos.wait_for_fixed
                 )  # fmt: skip
             except GgslamError as error:
                 self._inbox.note_damage(f"{topics['color']} or {topics['depth']}", str(error))
@@ -106,7 +106,7 @@ class Ros2Camera:
             return maker
         raise SequenceError(problem)
 
-    def _told(self) -> TopicInfos:
+    def _topic_infos(self) -> TopicInfos:
         depth_info = self._topics.get("depth_info")
         return TopicInfos(
             self._topics["color"], self._topics["depth"], self._topics["color_info"],
