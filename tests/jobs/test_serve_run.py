@@ -16,11 +16,12 @@ from ggslam.jobs.serve import channels as c
 from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.run_contents import RunContents, ServedRun
-from ggslam.jobs.serve.run_volumes import VOLUMES, RunVolumes
+from ggslam.jobs.serve.run_volumes import VOLUMES, RunVolumes, RunVolumesTuning
 from ggslam.jobs.serve.tiles import TileTuning, tile_of
 from ggslam.jobs.volumes.fuse_volumes import fuse_volumes
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.poses import inverse, transform_points
+from ggslam.system.tuning import overridden
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.tsdf_file import load_tsdf
 
@@ -97,6 +98,12 @@ def test_volumes_are_those_of_the_files(room_run: RunFolder, tmp_path: FilePath)
     parts = volumes.mesh_parts()
     assert len({part.part for part in parts}) == len(parts) and sum(len(part.triangles) for part in parts) > 100
     assert np.abs(field.query(np.concatenate([part.vertices for part in parts])).distance).max() < 0.04
+    fine = sum(len(part.triangles) for part in parts)
+    with overridden(RunVolumesTuning, most_triangles=fine // 3, part_triangles=50):
+        coarse = volumes.mesh_parts()
+    assert fine // 30 < sum(len(part.triangles) for part in coarse) <= fine // 3
+    assert max(len(part.triangles) for part in coarse) <= 50
+    assert np.abs(field.query(np.concatenate([part.vertices for part in coarse])).distance).max() < 0.15
     np.testing.assert_array_equal(
         volumes.T_floor_map(run.gaussians, contents.poses), volumes.floor(), err_msg="floor.yaml is what counts"
     )

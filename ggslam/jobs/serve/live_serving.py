@@ -53,7 +53,7 @@ LIVE: tuple[Channel, ...] = (
     MOVERS, VERDICTS,
 )  # fmt: skip
 """Channels of a run that goes on."""
-AFTER: tuple[Channel, ...] = (MESH, DISTANCE, CHANGES)
+AFTER: tuple[Channel, ...] = (CHANGES, DISTANCE, MESH)
 """Channels that have something when it has ended, besides grids."""
 
 
@@ -137,7 +137,7 @@ def serve_live(request: ServeRequest, beside: Path) -> Iterator[LiveServing]:
     """
     with ExitStack() as opened:
         outlets = opened.enter_context(open_outlets(request.publish))
-        channels = (*LIVE, *AFTER, *(grid_channel(name) for name in robot_names(request)))
+        channels = (*LIVE, *(grid_channel(name) for name in robot_names(request)), *AFTER)
         publisher = MapPublisher(outlets.outlets, channels)
         opened.callback(publisher.close)
         pause = Pause()

@@ -101,9 +101,9 @@ class RunContents:
     def channels(self) -> list[Channel]:
         """All that there may be something of. Poses are latched: a finished run says them once."""
         pose = Channel(POSE.name, Pose, latched=True)
-        known = [TF_STATIC, pose, PATH, LENS, POINTS, POINT_TILES, SPLATS, SPLAT_TILES, MESH, DISTANCE, OBJECTS]
+        known = [TF_STATIC, pose, PATH, LENS, POINTS, POINT_TILES, SPLATS, SPLAT_TILES, OBJECTS, MOVERS]
         grids = [grid_channel(name) for name in self.grids.values()]
-        return [*known, MOVERS, CHANGES, VERDICTS, *grids]
+        return [*known, CHANGES, VERDICTS, *grids, DISTANCE, MESH]  # the largest last
 
     def make(self, publisher: MapPublisher, channel: Channel) -> None:
         """Hands over what there is of a channel; what cannot be made is noted in `problems`."""

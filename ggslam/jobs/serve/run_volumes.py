@@ -30,6 +30,7 @@ from ggslam.volumes.cell_grid import CellGrid
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import floor_from_map
 from ggslam.volumes.map_upright import upright_of
+from ggslam.volumes.mesh import Mesh as SurfaceMesh
 from ggslam.volumes.mesh import extract_mesh
 from ggslam.volumes.slices import plane_at_height, slice_field
 from ggslam.volumes.tsdf_file import load_tsdf
@@ -42,8 +43,10 @@ class RunVolumesTuning(Tuning):
 
     min_piece_triangles = 50
     """Pieces of the mesh with fewer triangles are left out."""
-    most_parts = 100
-    """Most parts of the mesh, which are as large as that takes."""
+    most_triangles = 150_000
+    """Most triangles of the mesh, whose vertices are united in larger cells until it has no more."""
+    part_triangles = 5000
+    """Most triangles of one message."""
     slice_points = 30_000
     """Most points of a slice through the distance field."""
     most_cells = 4_000_000
@@ -149,20 +152,17 @@ class RunVolumes:
             GgslamError: as of `place`, or the file is damaged.
         """
         with self._lock:
-            mesh = extract_mesh(self.field().tsdf, min_triangles=RunVolumesTuning.min_piece_triangles)
-        if not len(mesh.triangles):
-            return []
-        middles, edge = mesh.vertices[mesh.triangles].mean(axis=1), TileTuning.edge_m
-        parts = rows_by_key(np.floor(middles / edge).astype(np.int64))
-        while len(parts) > RunVolumesTuning.most_parts:
-            edge *= 2
-            parts = rows_by_key(np.floor(middles / edge).astype(np.int64))
+            field = self.field()
+            mesh = extract_mesh(field.tsdf, min_triangles=RunVolumesTuning.min_piece_triangles)
+        cell = field.voxel
+        while len(mesh.triangles) > RunVolumesTuning.most_triangles:
+            cell *= 2
+            mesh = _coarser(mesh, cell)
+        middles = mesh.vertices[mesh.triangles].mean(axis=1)
         made = []
-        for tile, rows in sorted(parts.items()):
-            used, triangles = np.unique(mesh.triangles[rows], return_inverse=True)
-            shape = triangles.reshape(-1, 3).astype(np.int32)
-            vertices = mesh.vertices[used].astype(np.float32)
-            made.append(Mesh(MAP, vertices, shape, mesh.colors[used], ",".join(map(str, tile))))
+        for tile, rows in sorted(rows_by_key(np.floor(middles / TileTuning.edge_m).astype(np.int64)).items()):
+            name, count = ",".join(map(str, tile)), -(-len(rows) // RunVolumesTuning.part_triangles)
+            made += [_part(mesh, piece, f"{name}/{k}") for k, piece in enumerate(np.array_split(rows, count))]
         return made
 
     def distance_slice(self, poses: np.ndarray) -> Points:
@@ -195,6 +195,28 @@ class RunVolumes:
                 self._made = None
         finally:
             self._lock.release()
+
+
+def _coarser(mesh: SurfaceMesh, cell: float) -> SurfaceMesh:
+    """The vertices of each cell as one, in their middle, and the triangles that are left."""
+    _, first, owner, count = np.unique(
+        np.floor(mesh.vertices / cell).astype(np.int64), axis=0, return_index=True, return_inverse=True,
+        return_counts=True,
+    )  # fmt: skip
+    owner = owner.reshape(-1)
+    sums = [np.bincount(owner, mesh.vertices[:, axis], len(first)) for axis in range(3)]
+    vertices = (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
+    triangles = owner[mesh.triangles].astype(np.int32)
+    a, b, c = triangles.T
+    kept = np.unique(triangles[(a != b) & (b != c) & (a != c)], axis=0)
+    return SurfaceMesh(vertices, mesh.normals[first], mesh.colors[first], mesh.labels[first], kept)
+
+
+def _part(mesh: SurfaceMesh, rows: np.ndarray, name: str) -> Mesh:
+    """Some triangles [N] and their vertices."""
+    used, triangles = np.unique(mesh.triangles[rows], return_inverse=True)
+    shape = triangles.reshape(-1, 3).astype(np.int32)
+    return Mesh(MAP, mesh.vertices[used].astype(np.float32), shape, mesh.colors[used], name)
 
 
 def _grid_of_file(found: RosMap) -> Grid:
