@@ -198,7 +198,7 @@ def test_status_verdicts_and_saving(faces: Faces, run: RunFolder) -> None:
     assert response.success and Path(response.message) == run.path.resolve().parent / "copy"
     assert len(RunFolder.open(run.path.parent / "copy").gaussians()) == len(run.gaussians())
     again = faces.post("save_map", name="copy")
-    assert again == {"ok": False, "error": f"`name`: {run.path.resolve().parent / 'copy'} is there already"}
+    assert again == {"ok": False, "error": f"name: {run.path.resolve().parent / 'copy'} is there already"}
     response = faces.ros("pause", SET_BOOL, data=True)
     assert not response.success and "cannot do that" in response.message
 

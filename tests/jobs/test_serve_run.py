@@ -54,6 +54,7 @@ def test_a_run_is_published(room_run: RunFolder) -> None:
     found = chain(tree, c.MAP, c.ODOM, c.CAMERA, c.OPTICAL)
     np.testing.assert_allclose(found, trajectory.T_world_camera[-1], rtol=0, atol=2e-9)
     solid = gaussians.opacities.numpy() >= TileTuning.min_opacity
+    assert len(outlet.of(c.POINTS.name)) == len(outlet.of(c.SPLATS.name)) == 1
     assert outlet.of(c.POINTS.name)[0].values["count"].sum() == solid.sum()
     tiles = outlet.of(c.POINT_TILES.name)
     assert sum(tile.values["count"].sum() for tile in tiles) == solid.sum()

@@ -135,7 +135,7 @@ class LiveFunctions:
 def _copy_of(slam: Slam) -> tuple[GaussianMap, np.ndarray, np.ndarray]:
     """The map on the CPU; times [N] and poses [N, 4, 4] of the frames."""
     if slam.pager is not None:
-        raise ConfigError("`memory_limit_mb`: parts of the map are on disk; it can be saved at the end only")
+        raise ConfigError("memory_limit_mb: parts of the map are on disk; it can be saved at the end only")
     with slam.mapper.in_turn(), torch.no_grad():
         gaussians = slam.map.copy("cpu")
     keyframes = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,7 +72,10 @@ class MapContents:
             self._publisher.is_wanted(channel) for channel in (POINT_TILES, SPLAT_TILES)
         )
 
-    def show(self, shown: MapCopy, stamp: float, final: bool = False, harmonics: int = 1) -> None:
+    def show(
+        self, shown: MapCopy, stamp: float, final: bool = False, harmonics: int = 1,
+        only: Collection[Channel] = (POINTS, POINT_TILES, SPLATS, SPLAT_TILES),
+    ) -> None:  # fmt: skip
         """Publishes what changed.
 
         Args:
@@ -79,19 +83,23 @@ class MapContents:
             stamp: when it was so, seconds.
             final: whether it stays so: the least change counts, and all is sent at once.
             harmonics: most coefficients of a splat's colour.
+            only: channels that are looked at.
         """
         g = shown.gaussians
         surface = opacities_of(g) >= TileTuning.min_opacity
         means, rgb = g.means.numpy(), colors_to_uint8(0.5 + SH_C0 * g.sh.numpy()[:, 0])
         solid = means[surface], rgb[surface], shown.ids[surface]
-        if self._publisher.is_wanted(POINT_TILES) or self._publisher.is_wanted(SPLAT_TILES):
-            thin = thin_points(*solid)
+        tiled = [channel for channel in (POINT_TILES, SPLAT_TILES) if channel in only]
+        tiled = [channel for channel in tiled if self._publisher.is_wanted(channel)]
+        thin = thin_points(*solid) if tiled else None
+        if thin is not None and POINT_TILES in tiled:
             self._point_tiles(shown, thin, stamp, final)
+        if thin is not None and SPLAT_TILES in tiled:
             self._splat_tiles(shown, thin, stamp, final, harmonics)
-        if self._is_due(POINTS, final):
+        if POINTS in only and self._is_due(POINTS, final):
             self._whole_at[POINTS.name] = time.monotonic()
             self._publisher.put(POINTS, points_of(at_most(*solid, TileTuning.max_points)), stamp)
-        if self._is_due(SPLATS, final):
+        if SPLATS in only and self._is_due(SPLATS, final):
             self._whole_at[SPLATS.name] = time.monotonic()
             rows = most_visible(g, MapContentsTuning.max_splats)
             self._publisher.put(SPLATS, splats_of(shown, rows, harmonics), stamp)
@@ -101,8 +109,6 @@ class MapContents:
         return self._publisher.is_wanted(channel) and (final or rested)
 
     def _point_tiles(self, shown: MapCopy, thin: ThinPoints, stamp: float, final: bool) -> None:
-        if not self._publisher.is_wanted(POINT_TILES):
-            return
         for tile, rows in self._tiles[POINT_TILES.name].find_changes(thin, final, shown.whole).items():
             if len(rows):
                 self._publisher.put(POINT_TILES, points_of(thin, rows), stamp, part_name(tile))
@@ -111,8 +117,6 @@ class MapContents:
 
     def _splat_tiles(self, shown: MapCopy, thin: ThinPoints, stamp: float, final: bool, harmonics: int) -> None:
         """Splats of the tiles whose points changed."""
-        if not self._publisher.is_wanted(SPLAT_TILES):
-            return
         changed = self._tiles[SPLAT_TILES.name].find_changes(thin, final, shown.whole)
         if not changed:
             return

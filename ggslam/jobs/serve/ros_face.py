@@ -118,7 +118,7 @@ class RosFace:
         def values() -> dict[str, Any]:
             frames = {end.header.frame_id or MAP for end in (request.start, request.goal)}
             if len(frames) != 1:
-                raise ConfigError("`plan`: start and goal are in different frames")
+                raise ConfigError("plan: start and goal are in different frames")
             start, goal = (end.pose.position for end in (request.start, request.goal))
             return {"start": [start.x, start.y, start.z], "goal": [goal.x, goal.y, goal.z], "frame": frames.pop()}
 
@@ -136,7 +136,7 @@ class RosFace:
 
     def _localize(self, request: Any) -> Any:
         def locate() -> dict[str, Any]:
-            color, depth = color_image("`color`", request.color), depth_in_unit("`depth`", request.depth, True)
+            color, depth = color_image("color", request.color), depth_in_unit("depth", request.depth, True)
             return self._services.locate(color, depth, _camera(request.camera))
 
         found, error = self._try("localize", locate)
@@ -169,4 +169,4 @@ def _camera(info: Any) -> Camera | None:
     try:
         return Camera(int(info.width), int(info.height), fx, fy, cx, cy)
     except Exception:
-        raise ConfigError("`camera`: expected width, height, fx, fy, cx, cy of a camera") from None
+        raise ConfigError("camera: expected width, height, fx, fy, cx, cy of a camera") from None

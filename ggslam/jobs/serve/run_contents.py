@@ -109,7 +109,7 @@ class RunContents:
         """Hands over what there is of a channel; what cannot be made is noted in `problems`."""
         try:
             if channel.name in self._of_map:
-                self._points_and_splats(publisher)
+                self._points_and_splats(publisher, channel)
             elif channel.name in self.grids:
                 grid = self.volumes.grid(self.grids[channel.name])
                 publisher.put(channel, grid, self.stamp)
@@ -135,11 +135,12 @@ class RunContents:
     def _lens(self, publisher: MapPublisher, channel: Channel) -> None:
         publisher.put(channel, Lens(OPTICAL, self.camera), self.stamp)
 
-    def _points_and_splats(self, publisher: MapPublisher) -> None:
+    def _points_and_splats(self, publisher: MapPublisher, channel: Channel) -> None:
         self._map_contents = self._map_contents or MapContents(publisher)
         shown = self._gaussians()
         ids = shown.object_id.numpy().astype(np.uint16)
-        self._map_contents.show(MapCopy(shown, ids), self.stamp, final=True, harmonics=RunContentsTuning.harmonics)
+        most = RunContentsTuning.harmonics
+        self._map_contents.show(MapCopy(shown, ids), self.stamp, final=True, harmonics=most, only=(channel,))
 
     def _gaussians(self) -> GaussianMap:
         if self._map is None:

@@ -47,9 +47,9 @@ def save_target(beside: Path, values: Mapping[str, Any]) -> Path:
     """
     name = text_in(values, "name")
     if not is_plain_name(name) or not name.isprintable() or name[0] in ".-":  # hidden, or an option
-        raise ConfigError(f"`name`: expected a name to save as, of something new in {beside}")
+        raise ConfigError(f"name: expected a name to save as, of something new in {beside}")
     if (beside / name).exists():
-        raise ConfigError(f"`name`: {beside / name} is there already")
+        raise ConfigError(f"name: {beside / name} is there already")
     return beside / name
 
 
@@ -139,9 +139,9 @@ class RunFunctions:
         depth = _image(values, "depth", cv2.IMREAD_UNCHANGED)
         scale = values.get("depth_scale", LocalizeTuning.depth_scale)
         if isinstance(scale, bool) or not isinstance(scale, (int, float)) or not 1e-3 <= scale <= 1e6:
-            raise ConfigError(f"`depth_scale`: expected units per metre, found {str(scale)[:40]}")
+            raise ConfigError(f"depth_scale: expected units per metre, found {str(scale)[:40]}")
         if depth.dtype != np.uint16 or depth.ndim != 2:
-            raise ConfigError("`depth`: expected a PNG of one channel with 16 bits")
+            raise ConfigError("depth: expected a PNG of one channel with 16 bits")
         metres = depth.astype(np.float32) * np.float32(1 / scale)
         return self.locate(np.ascontiguousarray(color), metres, _camera(values.get("camera")))
 
@@ -157,7 +157,7 @@ class RunFunctions:
             GgslamError: images and camera do not fit, or the map cannot be read.
         """
         if depth.shape != color.shape[:2]:
-            raise ConfigError(f"`depth`: expected the size of `color`, {color.shape[1]}x{color.shape[0]}")
+            raise ConfigError(f"depth: expected the size of color, {color.shape[1]}x{color.shape[0]}")
         if camera is None:
             camera = self._contents.camera
             color, depth = _to_size(color, depth, camera)
@@ -167,7 +167,7 @@ class RunFunctions:
         try:
             found = self._localizer.locate(Frame(0, 0, 0.0, color, depth, camera))
         except SequenceError as error:
-            raise ConfigError(f"`color`, `depth`: {error}") from None
+            raise ConfigError(f"color, depth: {error}") from None
         if not found.status.is_located:
             return {"located": False, "reason": found.reason or "it was not found in the map"}
         T = found.T_world_sensor
@@ -187,23 +187,23 @@ class RunFunctions:
 def _image(values: Mapping[str, Any], name: str, flags: int) -> np.ndarray:
     given = values.get(name)
     if not isinstance(given, str):
-        raise ConfigError(f"`{name}`: expected an image in base64, found {type(given).__name__}")
+        raise ConfigError(f"{name}: expected an image in base64, found {type(given).__name__}")
     try:
         content = base64.b64decode(given, validate=True)
     except (binascii.Error, ValueError):
-        raise ConfigError(f"`{name}`: is no base64") from None
-    return decode_image(f"`{name}`", content, flags, LocalizeTuning.max_pixels, ConfigError)
+        raise ConfigError(f"{name}: is no base64") from None
+    return decode_image(name, content, flags, LocalizeTuning.max_pixels, ConfigError)
 
 
 def _camera(given: object) -> Camera | None:
     if given is None:
         return None
     if not isinstance(given, dict):
-        raise ConfigError(f"`camera`: expected width, height, fx, fy, cx, cy, found {type(given).__name__}")
+        raise ConfigError(f"camera: expected width, height, fx, fy, cx, cy, found {type(given).__name__}")
     try:
         return Camera(**given)
     except Exception:
-        raise ConfigError("`camera`: expected numbers width, height, fx, fy, cx, cy of a camera") from None
+        raise ConfigError("camera: expected numbers width, height, fx, fy, cx, cy of a camera") from None
 
 
 def _to_size(color: np.ndarray, depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -212,8 +212,8 @@ def _to_size(color: np.ndarray, depth: np.ndarray, camera: Camera) -> tuple[np.n
     if (width, height) == (camera.width, camera.height):
         return color, depth
     if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
-        expected = f"expected {camera.width}x{camera.height} or a multiple of it, or `camera`"
-        raise ConfigError(f"`color`: {expected}, found {width}x{height}")
+        expected = f"expected {camera.width}x{camera.height} or a multiple of it, or camera"
+        raise ConfigError(f"color: {expected}, found {width}x{height}")
     size = (camera.width, camera.height)
     return (
         cv2.resize(color, size, interpolation=cv2.INTER_AREA),

@@ -109,7 +109,7 @@ def points_in(values: Mapping[str, Any], name: str) -> np.ndarray:
     """
     given = values.get(name)
     if not isinstance(given, list) or not 0 < len(given) <= ServiceTuning.most_points:
-        raise ConfigError(f"`{name}`: expected 1 to {ServiceTuning.most_points} points [x, y, z], found {_kind(given)}")
+        raise ConfigError(f"{name}: expected 1 to {ServiceTuning.most_points} points [x, y, z], found {_kind(given)}")
     return np.array([_point(name, one) for one in given])
 
 
@@ -120,7 +120,7 @@ def point_in(values: Mapping[str, Any], name: str) -> np.ndarray:
 
 def _point(name: str, given: object) -> list[float]:
     if not isinstance(given, list) or len(given) != 3 or not all(_is_coordinate(value) for value in given):
-        raise ConfigError(f"`{name}`: expected points of three finite numbers of metres, found {_short(given)}")
+        raise ConfigError(f"{name}: expected points of three finite numbers of metres, found {_short(given)}")
     return [float(value) for value in given]
 
 
@@ -133,7 +133,7 @@ def text_in(values: Mapping[str, Any], name: str, default: str | None = None) ->
     """A text; raises ConfigError if it is none, or too long."""
     given = values.get(name, default)
     if not isinstance(given, str) or len(given) > ServiceTuning.most_letters:
-        raise ConfigError(f"`{name}`: expected a text, found {_kind(given)}")
+        raise ConfigError(f"{name}: expected a text, found {_kind(given)}")
     return given
 
 
@@ -141,7 +141,7 @@ def flag_in(values: Mapping[str, Any], name: str, default: bool) -> bool:
     """true or false; raises ConfigError if it is neither."""
     given = values.get(name, default)
     if not isinstance(given, bool):
-        raise ConfigError(f"`{name}`: expected true or false, found {_kind(given)}")
+        raise ConfigError(f"{name}: expected true or false, found {_kind(given)}")
     return given
 
 
@@ -149,7 +149,7 @@ def choice_in(values: Mapping[str, Any], name: str, choices: Sequence[str]) -> s
     """One of some texts, the first if none is given; raises ConfigError for others."""
     given = text_in(values, name, choices[0])
     if given not in choices:
-        raise ConfigError(f"`{name}`: expected {' or '.join(choices)}, found {_short(given)!r}")
+        raise ConfigError(f"{name}: expected {' or '.join(choices)}, found {_short(given)!r}")
     return given
 
 
