@@ -60,9 +60,9 @@ _log = logging.getLogger(__name__)
 class LiveContentsTuning(Tuning):
     """What publishing a growing map costs and shows."""
 
-    processor_share = 0.035
+    processor_share = 0.025
     """Share of the program's processor time that publishing may take."""
-    ahead_s = 0.2
+    ahead_s = 0.1
     """Processor seconds that may be used before."""
     look_s = 0.2
     """Seconds between two looks whether there is time for the next copy."""
