@@ -23,6 +23,7 @@ from ggslam.errors import ConfigError, TrackingLostError
 if TYPE_CHECKING:  # torch is slow to import and `--help` does not need it
     from ggslam.jobs.run.encoding import EncodeRequest
     from ggslam.jobs.run.pipeline import RunOutcome, RunRequest
+    from ggslam.jobs.serve.serving import ServeRequest
     from ggslam.middleware.opening import NodeRequest
     from ggslam.runs.recordings import SequenceRequest
 
@@ -63,8 +64,8 @@ _SHORTCUTS = {
 """Settings that have options of their own, with their parameters."""
 _MODEL = "masks.model"
 """Setting that whoever goes on with a run has to know, if it has one."""
-_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "host", "port", "evaluate", "strict", "energy",
-                "encode", "encode_with"}  # fmt: skip
+_WITH_RESUME = {"sequence", "resume", "checkpoint_every", "log", "view", "publish", "host", "port", "middleware",
+                "domain", "namespace", "address", "evaluate", "strict", "energy", "encode", "encode_with"}  # fmt: skip
 """Options that change nothing of what a run computes."""
 
 
@@ -128,6 +129,11 @@ Log = Annotated[
     str | None, typer.Option(metavar="rerun|FILE.rrd", help="Stream poses, images and map to rerun, or to a file.")
 ]
 ShowPage = Annotated[bool, typer.Option("--view", help="Show the map in a browser during and after the run.")]
+Publish = Annotated[
+    str | None,
+    typer.Option(metavar="LIST", help="Publish poses and the map as it grows, and what came out until Ctrl-C: "
+                 "foxglove[:PORT], ros2, http[:PORT] (functions, see ggslam serve), FILE.mcap, with commas between."),
+]  # fmt: skip
 Evaluate = Annotated[bool, typer.Option("--eval/--no-eval", help="Score the run at the end.")]
 Check = Annotated[
     bool, typer.Option("--check/--no-check", help="Check depth first, and refuse it if it is certainly wrong.")
@@ -194,11 +200,9 @@ def run(
     loops: Loops = None,
     threads: Threads = None, seed: Seed = None,
     skip_bad_frames: options.SkipBadFrames = False, check: Check = True,
-    log: Log = None,
-    view: ShowPage = False,
+    log: Log = None, view: ShowPage = False, publish: Publish = None,
     host: options.Host = "127.0.0.1", port: options.Port = 8080,
-    evaluate: Evaluate = True,
-    overwrite: Overwrite = False,
+    evaluate: Evaluate = True, overwrite: Overwrite = False,
     strict: Strict = False, energy: Energy = False,
     resume: Resume = None, checkpoint_every: CheckpointEvery = None,
     encode: EncodeTo = None, encode_with: EncodeWith = None,
@@ -208,7 +212,9 @@ def run(
     from ggslam.jobs.run.pipeline import execute
     from ggslam.runs.recordings import SequenceRequest
 
-    watched = _Watched(log, (host, port) if view else None, strict, energy)
+    node = network.node_request(middleware, domain, namespace, address)
+    page, served = (host, port) if view else None, _serve_request(publish, host, node, overwrite)
+    watched = _Watched(log, page, strict, energy, served, out)
     coded_as = _encode_request(context, encode, encode_with)
     if resume is not None:
         return _go_on(context, resume, sequence, checkpoint_every, evaluate, settings, loss, coded_as, watched)
@@ -218,13 +224,24 @@ def run(
         camera, intrinsics, depth_kind, depth_delay, upright, void_id,
     )  # fmt: skip
     given = overrides_of(context.params)
-    node = network.node_request(middleware, domain, namespace, address)
     request = replace(
         _request(reading, record, node), out=out, config=config, overrides=given, evaluate=evaluate,
         overwrite=overwrite, map=earlier, localize_only=localize_only, checkpoint_every=checkpoint_every, check=check,
         loss=loss, energy=energy, encode=coded_as,
     )  # fmt: skip
     _run_and_show(partial(execute, request), reading.path.resolve().name, watched)
+
+
+def _serve_request(publish: str | None, host: str, node: NodeRequest, overwrite: bool) -> ServeRequest | None:
+    """How the run is published; None: it is not. Raises ConfigError for places that are none."""
+    if publish is None:
+        return None
+    from ggslam.jobs.serve.outlets import FOXGLOVE_PORT, PublishRequest, parse_places
+    from ggslam.jobs.serve.serving import ServeRequest
+
+    places = parse_places(publish)
+    port = FOXGLOVE_PORT if places.foxglove_port is None else places.foxglove_port
+    return ServeRequest(PublishRequest(places.names, host, port, node, overwrite), host, places.http_port)
 
 
 def _encode_request(context: typer.Context, out: Path | None, words: list[str] | None) -> EncodeRequest | None:
@@ -307,12 +324,15 @@ def _request(reading: SequenceRequest, record: Path | None, node: NodeRequest) -
 @dataclass(frozen=True)
 class _Watched:
     """Where a run is logged, and the host and port of the page that shows it; None: not. Whether verdicts are
-    failures, and whether energy is counted."""
+    failures, and whether energy is counted. How it is published, and the folder of its results, as far as it was told.
+    """
 
     log: str | None
     address: tuple[str, int] | None
     strict: bool
     energy: bool = False
+    served: ServeRequest | None = None
+    out: Path | None = None
 
 
 def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) -> None:
@@ -320,17 +340,22 @@ def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) 
     from ggslam.jobs.view.serve import wait_for_interrupt
     from ggslam.jobs.watch.watchers import watch_run
 
-    with watch_run(watched.log, watched.address, name) as watchers:
-        page = watchers.page
+    beside = Path("runs") if watched.out is None else watched.out.resolve().parent
+    with watch_run(watched.log, watched.address, name, watched.served, beside) as watchers:
+        page, served = watchers.page, watchers.served
+        for line in [] if served is None else served.lines:
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
         if page is not None:
             console.print(f"the map as it grows: {page.address}", highlight=False, markup=False)
         with progress_bar() as bar:
             outcome = run(observer=ProgressObserver(bar), follower=watchers.follower)
         _print(outcome)
         watchers.finish(outcome)
-        if page is not None and outcome.error is None:
-            text = f"{page.address} shows the run (Ctrl-C ends)"
+        if outcome.error is None and (page is not None or (served is not None and served.stays)):
+            text = f"{page.address} shows the run (Ctrl-C ends)" if page is not None else "published (Ctrl-C ends)"
             wait_for_interrupt(lambda: console.print(text, highlight=False, markup=False))
+        if served is not None:
+            console.print(served.publisher.line(), highlight=False, markup=False, soft_wrap=True)
     if outcome.error is not None:
         raise outcome.error
     if outcome.encode_failure is not None:

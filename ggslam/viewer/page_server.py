@@ -36,12 +36,14 @@ class HttpServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, family: int, place: Any, gate: Gate, title: str) -> None:
+    def __init__(
+        self, family: int, place: Any, gate: Gate, title: str, requests: type[PageRequests] = PageRequests
+    ) -> None:
         self.address_family = socket.AddressFamily(family)
         self.gate, self.title, self.events = gate, title, Events()
         self.source: PageSource = NothingYet(title, "waiting for the first frame")
         self._free = threading.BoundedSemaphore(ServerTuning.connections)
-        super().__init__(place, PageRequests)
+        super().__init__(place, requests)
 
     def server_bind(self) -> None:
         """Binds; Python's own would ask for this machine's name on the network, which may take long."""
@@ -75,12 +77,17 @@ class PageServer:
         host: address to listen at; with the default nobody but this machine can connect.
         port: to listen at; 0: any free one.
         title: of the page.
+        requests: what answers them.
+        source: that is shown; None: one that waits for its map.
 
     Raises:
         ConfigError: the address cannot be listened at.
     """
 
-    def __init__(self, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, title: str = "ggslam") -> None:
+    def __init__(
+        self, host: str = DEFAULT_HOST, port: int = DEFAULT_PORT, title: str = "ggslam",
+        requests: type[PageRequests] = PageRequests, source: PageSource | None = None,
+    ) -> None:  # fmt: skip
         if not 0 <= port <= 65535:
             raise ConfigError(f"`port`: expected 0 to 65535, found {port}")
         self.host = host
@@ -88,12 +95,14 @@ class PageServer:
             if not host:
                 raise OSError(errno.EADDRNOTAVAIL, "no address")
             kind = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-            self._http = HttpServer(kind[0], kind[4], Gate(host), title)
+            self._http = HttpServer(kind[0], kind[4], Gate(host), title, requests)
         except (OSError, UnicodeError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             argument = "port" if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES) else "host"
             text = f"{host}:{port}: cannot be listened at: {reason}; choose another with `{argument}`"
             raise ConfigError(text) from None
+        if source is not None:
+            self._http.source = source
         self._thread = threading.Thread(target=self._http.serve_forever, name="viewer", daemon=True, args=(0.1,))
         self._thread.start()
 

@@ -39,7 +39,7 @@ _SHARED = 3
 _GROUPS = {
     "Make a map": ("run", "inspect", "synth", "doctor"),
     "Look and score": ("view", "render", "report", "eval", "compare"),
-    "Use a map": ("edit", "export", "volumes", "plan", "encode", "decode", "localize", "submaps", "refine"),
+    "Use a map": ("edit", "export", "volumes", "plan", "encode", "decode", "localize", "serve", "submaps", "refine"),
 }
 
 

@@ -134,7 +134,7 @@ def test_every_option_of_a_run_is_passed_on_or_refused_on_purpose() -> None:
     refused = {
         "out", "seed", "resume", "overwrite", "view", "host", "port", "eval", "no-eval", "localize-only", "log",
         "record", "help-setting", "help-settings", "loss", "encode", "encode-with", "middleware", "domain", "namespace",
-        "address",
+        "address", "publish",
     }  # fmt: skip
     assert names - set(ALLOWED) == refused and set(ALLOWED) <= names
     flags = {n.lstrip("-") for option in options if option.is_flag for n in (*option.opts, *option.secondary_opts)}

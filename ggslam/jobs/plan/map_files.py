@@ -111,7 +111,7 @@ def _of_tsdf(path: Path, request: MapRequest) -> PlanMap:
     tsdf = load_tsdf(path)
     field = DistanceField(tsdf, FieldSettings(max_distance=max(2 * tsdf.settings.voxel, request.reach + 0.1)))
     field.update()
-    T_floor_map, floor_seen = _floor_beside(path)
+    T_floor_map, floor_seen = floor_beside(path)
     if T_floor_map is None:
         T_floor_map = floor_of_field(field)
     if request.fly:
@@ -125,7 +125,7 @@ def _of_tsdf(path: Path, request: MapRequest) -> PlanMap:
     return PlanMap(_name(path), 2, cell, T_grid_map, WholeArray((0, 0, 0), clearance), T_floor_map)
 
 
-def _floor_beside(path: Path, of_files: bool = False) -> tuple[np.ndarray | None, bool]:
+def floor_beside(path: Path, of_files: bool = False) -> tuple[np.ndarray | None, bool]:
     """T_floor_map [4, 4] as floor.yaml beside a file says, None: there is none; and whether it is no guess. `of_files`:
     from the frame that meshes and occupancy beside it are in."""
     file = path.parent / FLOOR_FILE
@@ -144,7 +144,7 @@ def _floor_beside(path: Path, of_files: bool = False) -> tuple[np.ndarray | None
 
 def _of_octomap(path: Path, request: MapRequest) -> PlanMap:
     occupancy = read_octomap(path)
-    T_floor_map, _ = _floor_beside(path, of_files=True)
+    T_floor_map, _ = floor_beside(path, of_files=True)
     if T_floor_map is None:  # z is up there
         T_floor_map = translation(-np.array([0.0, 0.0, request.start[2]]))
     reach, unknown = request.reach, request.settings.unknown

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watchers of a running run: a page in the browser, a log for rerun."""
+"""Watchers of a running run: a page in the browser, a log for rerun, robots and their tools."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from ggslam.jobs.run.pipeline import Follower, RunOutcome
+from ggslam.jobs.serve.live_serving import LiveServing, serve_live
+from ggslam.jobs.serve.serving import ServeRequest
 from ggslam.jobs.view.serve import LivePage, live_page
 from ggslam.jobs.watch.rerun_follower import LiveLog
 from ggslam.reporting.rerun_log import RerunLog
@@ -22,9 +25,11 @@ class Watching:
 
     Attributes:
         page: shows the map as it grows; None: no one asked.
+        served: to robots and their tools; None: no one asked.
     """
 
     page: LivePage | None = None
+    served: LiveServing | None = None
     _followers: list[Follower] = field(default_factory=list)
     _finish: list[Callable[[RunOutcome], None]] = field(default_factory=list)
 
@@ -44,13 +49,18 @@ class Watching:
 
 
 @contextmanager
-def watch_run(log: str | None, page: tuple[str, int] | None, name: str) -> Iterator[Watching]:
+def watch_run(
+    log: str | None, page: tuple[str, int] | None, name: str, serve: ServeRequest | None = None,
+    beside: Path = Path("runs"),
+) -> Iterator[Watching]:  # fmt: skip
     """Opens what was asked for, and closes it at the end.
 
     Args:
         log: "rerun", or a file .rrd; None: none.
         page: host and port; None: no page.
         name: of the recording.
+        serve: how the run is published; None: it is not.
+        beside: folder that maps are saved in while it goes on.
 
     Raises:
         GgslamError: a package is missing, the file cannot be written, or the port is taken.
@@ -68,4 +78,8 @@ def watch_run(log: str | None, page: tuple[str, int] | None, name: str) -> Itera
             watchers._finish.append(
                 lambda outcome: shown.show_result(outcome.folder) if outcome.error is None else None
             )
+        if serve is not None:
+            watchers.served = served = opened.enter_context(serve_live(serve, beside))
+            watchers._followers.append(served.follow)
+            watchers._finish.append(served.finish)
         yield watchers

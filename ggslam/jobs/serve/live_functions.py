@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run answers while it goes on."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam.errors import ConfigError, GgslamError
+from ggslam.formats.gaussian_ply import write_gaussian_ply
+from ggslam.formats.trajectory import write_tum
+from ggslam.jobs.serve.channels import VERDICTS
+from ggslam.jobs.serve.pausing import Pause
+from ggslam.jobs.serve.publishing import MapPublisher
+from ggslam.jobs.serve.run_functions import save_target, verdict_values
+from ggslam.jobs.serve.services import Function, flag_in
+from ggslam.messages.contents import Verdicts
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.slam.result import tracked_poses
+from ggslam.slam.slam import Slam
+from ggslam.system.atomic import make_folder
+from ggslam.system.tuning import Tuning
+
+
+class LiveFunctionTuning(Tuning):
+    """How long is waited for the run."""
+
+    copy_s = 20.0
+    """Seconds in which the run has to give a copy of its map: it does so between two frames."""
+
+
+class LiveFunctions:
+    """Functions of a run that goes on.
+
+    Args:
+        publisher: of its contents.
+        pause: holds it.
+        beside: folder that maps are saved in.
+    """
+
+    def __init__(self, publisher: MapPublisher, pause: Pause, beside: Path) -> None:
+        self._publisher, self._pause, self._beside = publisher, pause, beside
+        self._asked: queue.SimpleQueue[Callable[[Slam], None]] = queue.SimpleQueue()
+        self._frames, self._status, self._dropped, self._ended = 0, "", 0, False
+        self.wants_reset = False
+        """Whether somebody asked the run to end."""
+
+    def functions(self) -> dict[str, Function]:
+        """By name."""
+        return {
+            "status": self.status, "verdicts": self.verdicts, "save_map": self.save_map, "pause": self.pause,
+            "reset": self.reset,
+        }  # fmt: skip
+
+    # --- the thread of the run ---------------------------------------------------------------------------------------
+
+    def between_frames(self, slam: Slam) -> None:
+        """Does what was asked for."""
+        self._frames, self._dropped = len(slam.frames), len(slam.dropped_frames)
+        self._status = slam.frames[-1].status if slam.frames else ""
+        while not self._asked.empty():
+            self._asked.get()(slam)
+
+    def end(self) -> None:
+        """There are no more frames."""
+        self._ended = True
+
+    # --- in any thread -----------------------------------------------------------------------------------------------
+
+    def status(self, values: dict[str, Any]) -> dict[str, Any]:
+        """How the run is doing."""
+        return {
+            "live": True, "frames": self._frames, "tracking": self._status, "dropped": self._dropped,
+            "paused": self._pause.is_on, "paused_s": self._pause.seconds, "pauses": self._pause.times,
+            "published": self._publisher.record(),
+        }  # fmt: skip
+
+    def verdicts(self, values: dict[str, Any]) -> dict[str, Any]:
+        """The last ones that were published."""
+        newest = self._publisher.newest(VERDICTS)
+        content = newest[-1].content if newest else None
+        return {"verdicts": verdict_values(content) if isinstance(content, Verdicts) else []}
+
+    def pause(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Holds the run after the frame in work, or lets it go on."""
+        on = flag_in(values, "on", True)
+        self._pause.switch(on)
+        return {"paused": on}
+
+    def reset(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Ends the run as Ctrl-C does. A fresh map is another run."""
+        self.wants_reset = True
+        self._pause.switch(False)
+        os.kill(os.getpid(), signal.SIGINT)
+        return {"ends": True}
+
+    def save_map(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Writes the map as it is now as NAME.ply, and NAME.txt with the poses."""
+        path = save_target(self._beside, {"name": f"{values.get('name', '')}.ply"} if "name" in values else values)
+        copies: list[tuple[GaussianMap, np.ndarray, np.ndarray]] = []
+        self._ask(lambda slam: copies.append(_copy_of(slam)))
+        gaussians, stamps, poses = copies[0]
+        make_folder(self._beside)
+        write_gaussian_ply(path, gaussians)
+        write_tum(path.with_suffix(".txt"), stamps, poses)
+        return {"path": str(path), "gaussians": len(gaussians), "frames": len(stamps)}
+
+    def _ask(self, what: Callable[[Slam], None]) -> None:
+        """Has something done between two frames, and waits for it."""
+        done, failures = threading.Event(), list[GgslamError]()
+
+        def act(slam: Slam) -> None:
+            try:
+                what(slam)
+            except GgslamError as error:
+                failures.append(error)
+            finally:
+                done.set()
+
+        self._asked.put(act)
+        if self._ended or not done.wait(LiveFunctionTuning.copy_s):
+            raise ConfigError(f"no frame came in {LiveFunctionTuning.copy_s:g} s, so there is no copy of the map")
+        if failures:
+            raise failures[0]
+
+
+def _copy_of(slam: Slam) -> tuple[GaussianMap, np.ndarray, np.ndarray]:
+    """The map on the CPU; times [N] and poses [N, 4, 4] of the frames."""
+    if slam.pager is not None:
+        raise ConfigError("memory_limit_mb: parts of the map are on disk; it can be saved at the end only")
+    with slam.mapper.in_turn(), torch.no_grad():
+        gaussians = slam.map.copy("cpu")
+    keyframes = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
+    stamps = np.array([frame.timestamp for frame in slam.frames])
+    return gaussians, stamps, tracked_poses(slam.frames, keyframes)
