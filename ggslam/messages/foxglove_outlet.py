@@ -70,7 +70,7 @@ class FoxgloveOutlet(_Outlet):
                 message_backlog_size=FoxgloveTuning.backlog,
             )  # fmt: skip
         except Exception as error:  # the package raises RuntimeError, and others for what is no address
-            raise MiddlewareError(f"`foxglove`: cannot listen at {host}:{port}: {error}") from None
+            raise MiddlewareError(f"foxglove: cannot listen at {host}:{port}: {error}") from None
         self.port: int = self._server.port
 
     def url(self) -> str:

@@ -27,7 +27,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, matrix_to_quaternion, transform_points
 from ggslam.system.images import decode_image
 from ggslam.system.tuning import Tuning
-from ggslam.system.untrusted_files import is_plain_name
+from ggslam.system.untrusted_files import copy_untrusted_folder, is_plain_name
 
 
 class LocalizeTuning(Tuning):
@@ -97,10 +97,12 @@ class RunFunctions:
             raise ConfigError(f"{source}: is a file; copy it")
         staged = target.with_name(f".{target.name}-{secrets.token_hex(4)}")
         try:
-            shutil.copytree(source, staged, symlinks=True)
+            copy_untrusted_folder(source, staged, error=ConfigError)
             staged.rename(target)
-        except OSError as error:
+        except (OSError, ConfigError) as error:
             shutil.rmtree(staged, ignore_errors=True)
+            if isinstance(error, ConfigError):
+                raise
             raise ConfigError(f"{target}: cannot be written: {error.strerror or error}") from None
         return {"path": str(target)}
 
