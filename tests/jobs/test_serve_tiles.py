@@ -10,6 +10,7 @@ from serve_tools import KeptOutlet
 from ggslam.jobs.serve import channels as c
 from ggslam.jobs.serve.map_contents import MapContents, MapCopy
 from ggslam.jobs.serve.publishing import MapPublisher
+from ggslam.jobs.serve.things import growing_objects
 from ggslam.jobs.serve.tiles import SentTiles, ThinPoints, TileTuning, at_most, thin_points, tile_of
 from ggslam.rendering.types import GaussianTensors
 
@@ -95,3 +96,8 @@ def test_contents_of_tiles() -> None:
     assert len(publisher.newest(c.POINT_TILES)) == len(tiles) - 1
     assert len(outlet.of(c.POINTS.name)) == 1  # the whole map rests longer
     publisher.close()
+
+
+def test_a_map_without_surfaces_has_no_objects() -> None:
+    nothing = growing_objects(np.zeros((0, 3), np.float32), np.zeros(0, np.uint16), {})
+    assert nothing.things == () and growing_objects(MEANS, IDS, {}).things == ()

@@ -56,6 +56,8 @@ def growing_objects(means: np.ndarray, ids: np.ndarray, names: Mapping[int, str]
         ids: [N], object of each, 0: none.
         names: of ids, where known.
     """
+    if not len(ids):
+        return Things(MAP, ())
     order = np.argsort(ids, kind="stable")
     found, starts = np.unique(ids[order], return_index=True)
     things = []
