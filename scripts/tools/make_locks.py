@@ -99,7 +99,7 @@ def locked(name: str) -> set[str]:
 def missing() -> list[str]:
     """What pyproject.toml names for the demo and the tests, and the locks lack."""
     project = re.sub(r"#.*", "", (ROOT / "pyproject.toml").read_text())
-    lists = dict(re.findall(r"^([a-z]+) = \[(.*?)\]\s*$", project, re.M | re.S))
+    lists = dict(re.findall(r"^([a-z0-9]+) = \[(.*?)\]\s*$", project, re.M | re.S))
     out = []
     for lock, extras in EXTRAS.items():
         wanted, waiting = set[str](), ["dependencies", *extras]
