@@ -24,6 +24,7 @@ import find_benchmarks  # noqa: F401  # isort: skip
 from rows import Paper, options
 
 from bench_submaps import case  # isort: skip
+from submap_runs import located, looked_up, parse_radius, started  # isort: skip
 from ggslam.reporting.plot_files import write_sheet
 from ggslam.reporting.plots import Plot, Series
 from ggslam.system.atomic import make_folder
@@ -32,6 +33,10 @@ RADIUS = 10.0
 """R', metres."""
 OFF, TURN = 3.0, 20.0
 """Metres and degrees that starts are off."""
+SEES_M = 6.0
+"""How far the scanner of the last table sees, metres."""
+VOXEL = 0.15
+"""Of the target, metres; as `submap_runs.py locate` has it."""
 FIXED = (5, 10, 20)
 """R' beside the adaptive one, metres."""
 ADAPTIVE: dict[str, tuple[Any, ...]] = {
@@ -73,8 +78,9 @@ def make(made: Path, seeds: int, size: float, scans: int, words: tuple[Any, ...]
 
 def locate(folder: Path, radius: float | str) -> Found:
     """Located with R' metres, "auto" or in the whole map, "full"."""
-    words = ["--full"] if radius == "full" else ["--radius", radius]
-    return case("locate", folder / "map.grid", folder, *words)
+    full = radius == "full"
+    reach = RADIUS if full else parse_radius(radius)
+    return located(folder / "map.grid", folder, full, False, VOXEL, reach, 0, None, 1.0)
 
 
 def add_table(paper: Paper, made: Path, size: float, scans: int, seeds: int) -> None:
@@ -154,9 +160,9 @@ def add_starts(paper: Paper, made: Path, size: float, count: int, seeds: int) ->
     outcomes: dict[float | str, list[dict[str, int]]] = {radius: [] for radius in radii}
     for folder in make(made, seeds, size, count, ("--kind", "equal", "--every", 20)):
         for radius, found in outcomes.items():
-            words = ["--full"] if radius == "full" else ["--radius", radius]
-            where = ("starts", folder / "map.grid", folder, *words, "--off", OFF, TURN, "--count", count)
-            found.append(case(*where)["outcomes"])
+            full = radius == "full"
+            reach = RADIUS if full else parse_radius(radius)
+            found.append(started(folder / "map.grid", folder, full, reach, OFF, TURN, count)["outcomes"])
     for radius, found in outcomes.items():
         shares = {key: spread([100 * one.get(key, 0) / (4 * count) for one in found], 0)
                   for key in ("right", "wrong", "doubtful", "lost")}  # fmt: skip
@@ -170,13 +176,13 @@ def add_starts(paper: Paper, made: Path, size: float, count: int, seeds: int) ->
 
 def add_near(paper: Paper, made: Path, size: float, count: int, seeds: int) -> None:
     """Which of equal rooms a scanner that sees 6 m is in: with no position, a rough one, and a wrong one."""
-    ways: dict[str, tuple[Any, ...]] = {
-        "no position": (), "position within 1 m": ("--sigma", 1), "position 3 m wrong": ("--sigma", 0.5, "--off", 3)
+    ways: dict[str, tuple[float | None, float]] = {
+        "no position": (None, 0.0), "position within 1 m": (1.0, 0.0), "position 3 m wrong": (0.5, 3.0)
     }
     runs: dict[str, list[Found]] = {name: [] for name in ways}
     for folder in make(made, seeds, size, count, ("--kind", "equal", "--every", 20)):
-        for name, words in ways.items():
-            runs[name].append(case("near", folder / "map.grid", folder, "--count", count, *words))
+        for name, where in ways.items():
+            runs[name].append(looked_up(folder / "map.grid", folder, *where, SEES_M, count))
     for name, found in runs.items():
         shares = {key: spread([100 * run["outcomes"].get(key, 0) / count for run in found], 0)
                   for key in ("right", "wrong", "lost")}  # fmt: skip
