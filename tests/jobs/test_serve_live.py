@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from serve_tools import KeptOutlet, SlowOutlet, chain, until
 
 from ggslam.errors import ConfigError
@@ -29,6 +30,7 @@ from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.sending import SendTuning
 from ggslam.jobs.serve.services import MapServices
 from ggslam.jobs.serve.serving import ServeRequest
+from ggslam.runs.opened_points import surface_points
 from ggslam.runs.recordings import SequenceRequest
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp, separation
@@ -90,16 +92,17 @@ def test_everything_is_told_and_the_end_is_the_map_as_saved(room: Path, tmp_path
     with overridden(LiveContentsTuning, min_rest_s=0.0, processor_share=10.0, picture_every_s=0.0):
         contents = LiveContents(publisher)
         outcome = run_of(room, tmp_path / "run", contents.follow)
-        contents.finish(outcome.result)
+        contents.finish(outcome.result, outcome.folder)
     assert publisher.wait_idle(10.0)
     publisher.close()
     told = {kept.channel.name for kept in outlet.sent}
     assert told == {channel.name for channel in LIVE} - {c.MOVERS.name}
     assert len(outlet.of(c.RECORDED.name)) == 24 == len(outlet.of(c.POSE.name)) - 1
     assert contents.copies >= 2
-    saved = outcome.folder.gaussians()
-    solid = (saved.opacities.numpy() >= 0.5).sum()
-    assert abs(outlet.of(c.POINTS.name)[-1].values["count"].sum() - solid) <= 1e-3 * solid
+    surface = cKDTree(surface_points(outcome.folder).points)  # a point each centimetre
+    growing, last = (surface.query(outlet.of(c.POINTS.name)[i].xyz)[0] for i in (0, -1))
+    assert len(growing) > 2000 and np.median(growing) < 0.012 and np.percentile(growing, 90) < 0.03  # as a Kinect sees
+    assert len(last) > 4000 and np.median(last) < 0.005 and np.percentile(last, 99) < 0.01
     level = [verdict.level for verdict in outlet.of(c.VERDICTS.name)[0].verdicts]
     assert level == ["ok", "ok"]
     assert {child for _, child, _ in outlet.of(c.TF_STATIC.name)[-1].edges} == {c.OPTICAL, c.FLOOR}

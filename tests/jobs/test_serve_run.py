@@ -10,6 +10,7 @@ from pathlib import Path as FilePath
 from shutil import copytree
 
 import numpy as np
+from scipy.spatial import cKDTree
 from serve_tools import KeptOutlet, chain, until
 
 from ggslam.jobs.serve import channels as c
@@ -17,9 +18,10 @@ from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.run_contents import RunContents, ServedRun
 from ggslam.jobs.serve.run_volumes import VOLUMES, RunVolumes, RunVolumesTuning
-from ggslam.jobs.serve.tiles import TileTuning, tile_of
+from ggslam.jobs.serve.tiles import tile_of
 from ggslam.jobs.volumes.fuse_volumes import fuse_volumes
 from ggslam.runs.folder import RunFolder
+from ggslam.runs.opened_points import surface_points
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.system.tuning import overridden
 from ggslam.volumes.esdf import DistanceField
@@ -45,7 +47,7 @@ def test_a_run_is_published(room_run: RunFolder) -> None:
     with served(room_run, outlet) as (_, publisher):
         until(lambda: {kept.channel.name for kept in outlet.sent} == {channel.name for channel in asked})
         assert publisher.wait_idle(5.0)
-    trajectory, gaussians = room_run.trajectory(), room_run.gaussians()
+    trajectory = room_run.trajectory()
     path = outlet.of(c.PATH.name)[0]
     np.testing.assert_allclose(path.poses @ inverse(T_OPTICAL_CAMERA), trajectory.T_world_camera, rtol=0, atol=2e-9)
     np.testing.assert_allclose(path.stamps, trajectory.timestamps, rtol=0, atol=1e-9)
@@ -53,11 +55,11 @@ def test_a_run_is_published(room_run: RunFolder) -> None:
     assert tree.fixed
     found = chain(tree, c.MAP, c.ODOM, c.CAMERA, c.OPTICAL)
     np.testing.assert_allclose(found, trajectory.T_world_camera[-1], rtol=0, atol=2e-9)
-    solid = gaussians.opacities.numpy() >= TileTuning.min_opacity
+    surface = surface_points(room_run, None)
     assert len(outlet.of(c.POINTS.name)) == len(outlet.of(c.SPLATS.name)) == 1
-    assert outlet.of(c.POINTS.name)[0].values["count"].sum() == solid.sum()
-    tiles = outlet.of(c.POINT_TILES.name)
-    assert sum(tile.values["count"].sum() for tile in tiles) == solid.sum()
+    points, tiles = outlet.of(c.POINTS.name)[0], outlet.of(c.POINT_TILES.name)
+    assert points.values["count"].sum() == len(surface) == sum(tile.values["count"].sum() for tile in tiles)
+    assert cKDTree(surface.points).query(points.xyz)[0].max() < 1e-6  # each is a point of the surface, no mean of some
     assert all(len(np.unique(tile_of(tile.xyz), axis=0)) == 1 for tile in tiles)
     assert {t.id for t in outlet.of(c.OBJECTS.name)[0].things} == set(room_run.object_table().ids())
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,8 @@ from ggslam.jobs.serve.channels import (
     OBJECTS,
     OPTICAL,
     PATH,
+    POINT_TILES,
+    POINTS,
     POSE,
     RECORDED,
     RENDERED,
@@ -35,13 +37,16 @@ from ggslam.jobs.serve.channels import (
 from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA, FramesTree, fixed_frames
 from ggslam.jobs.serve.map_contents import MapContents, MapCopy
 from ggslam.jobs.serve.publishing import MapPublisher
+from ggslam.jobs.serve.seen_points import PointCloud, SeenImages, SeenPoints, saved_points
 from ggslam.jobs.serve.things import MoversNow, growing_objects
 from ggslam.jobs.serve.tiles import TileTuning
+from ggslam.mapping.keyframe import Keyframe
 from ggslam.messages.contents import Lens, Path, Picture, Pose, Verdict, Verdicts
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.rendering.types import GaussianTensors
 from ggslam.reporting.pictures import color_to_uint8
+from ggslam.runs.folder import RunFolder
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
@@ -92,6 +97,9 @@ class _Snapshot:
     T_map_optical: np.ndarray | None
     stamp: float
     whole: bool
+    seen: list[SeenImages]
+    keyframes: dict[int, np.ndarray]
+    labels: np.ndarray | None
 
 
 class LiveContents:
@@ -107,7 +115,8 @@ class LiveContents:
         self.tree = FramesTree()
         self._moves, self._unbroken = 0, False
         self._movers, self._has_movers = MoversNow(), False
-        self._map = MapContents(publisher)
+        self._map, self._seen, self._taken = MapContents(publisher), SeenPoints(), 0
+        self._labels: np.ndarray | None = None
         self._rasterizer: CpuRasterizer | None = None
         self._T_floor_map: np.ndarray | None = None
         self._floor_due = True
@@ -233,7 +242,19 @@ class LiveContents:
                 labels = slam.mapper.vote_labels()[:count]
                 ids[: len(labels)] = labels
         poses, stamps = _path_of(slam)
-        return _Snapshot(copies, ids, poses, stamps, slam.camera, T, stamp, slam.pager is None)
+        keyframes, seen = list(slam.mapper.keyframes), []
+        if self._wants_points:
+            seen, self._taken = [SeenImages.of_keyframe(k) for k in keyframes[self._taken :]], len(keyframes)
+        if slam.mapper.identity is not None:
+            self._labels = slam.mapper.identity.current(np.arange(1 << 16, dtype=np.uint16))
+        return _Snapshot(
+            copies, ids, poses, stamps, slam.camera, T, stamp, slam.pager is None, seen, _poses_of(keyframes),
+            self._labels,
+        )  # fmt: skip
+
+    @property
+    def _wants_points(self) -> bool:
+        return any(self._publisher.is_wanted(channel) for channel in (POINTS, POINT_TILES))
 
     # --- the thread that makes contents ------------------------------------------------------------------------------
 
@@ -269,7 +290,11 @@ class LiveContents:
             self._send_floor(s.gaussians, s.poses, s.stamp)
         if wanted(PATH) and len(s.poses):
             put(PATH, Path(MAP, s.poses @ T_OPTICAL_CAMERA, s.stamps), s.stamp)
-        self._map.show(MapCopy(s.gaussians, s.ids, s.whole), s.stamp)
+        for images in s.seen:
+            self._seen.add(images)
+        if self._map.is_wanted:
+            surface = self._seen.cloud(s.keyframes, s.labels)
+            self._map.show(MapCopy(s.gaussians, s.ids, surface, s.whole), s.stamp)
         if wanted(OBJECTS) and s.ids.any():
             solid = opacities_of(s.gaussians) >= TileTuning.min_opacity
             put(OBJECTS, growing_objects(s.gaussians.means.numpy()[solid], s.ids[solid], self._names), s.stamp)
@@ -297,8 +322,8 @@ class LiveContents:
             self._given.notify()
         self._thread.join(timeout=10.0)
 
-    def finish(self, result: SlamResult) -> None:
-        """The run ended: publishes poses and map as they came out."""
+    def finish(self, result: SlamResult, folder: RunFolder | None = None) -> None:
+        """The run ended: publishes poses and map as they came out. `folder`: where it was saved, if it was."""
         self.stop()
         poses, stamps = result.trajectory()[:: self._cameras], result.timestamps()[:: self._cameras]
         known = np.isfinite(poses).all(axis=(1, 2))
@@ -316,7 +341,20 @@ class LiveContents:
             copies = GaussianTensors(*(view.detach().to("cpu") for view in views))
             self._send_floor(copies, poses[known], stamp)
             ids = g.object_id.cpu().numpy().astype(np.uint16)
-            self._map.show(MapCopy(copies, ids), stamp, final=True)
+            surface = self._last_points(result, folder) if self._wants_points else None
+            self._map.show(MapCopy(copies, ids, surface), stamp, final=True)
+
+    def _last_points(self, result: SlamResult, folder: RunFolder | None) -> PointCloud:
+        if folder is not None:
+            return saved_points(folder)
+        for keyframe in result.keyframes[self._taken :]:
+            self._seen.add(SeenImages.of_keyframe(keyframe))
+        return self._seen.cloud(_poses_of(result.keyframes), self._labels)
+
+
+def _poses_of(keyframes: Iterable[Keyframe]) -> dict[int, np.ndarray]:
+    """T_world_camera [4, 4] of keyframes by number."""
+    return {keyframe.index: keyframe.T_world_camera for keyframe in keyframes}
 
 
 def _path_of(slam: Slam) -> tuple[np.ndarray, np.ndarray]:

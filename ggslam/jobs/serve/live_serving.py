@@ -102,7 +102,7 @@ class LiveServing:
         """Publishes what came out, and notes in timing.json what was sent."""
         self._functions.end()
         made = {channel.name for channel in LIVE if self.publisher.is_wanted(channel)} - {OBJECTS.name, VERDICTS.name}
-        self.contents.finish(outcome.result)
+        self.contents.finish(outcome.result, None if outcome.failure is not None else outcome.folder)
         if not self.stays:
             self.publisher.wait_idle(LiveServingTuning.end_s)
         if outcome.failure is not None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ggslam.jobs.serve.channels import MAP, POINT_TILES, POINTS, SPLAT_TILES, SPLATS
 from ggslam.jobs.serve.publishing import MapPublisher
+from ggslam.jobs.serve.seen_points import PointCloud
 from ggslam.jobs.serve.tiles import (
     SentTiles,
     ThinPoints,
@@ -45,11 +46,13 @@ class MapCopy:
     Attributes:
         gaussians: on the CPU.
         ids: uint16 [N], object of each, 0: none.
+        surface: points of its surface; None: the middles of its Gaussians, which lie about it.
         whole: whether there is nothing else: of a run whose memory is limited parts are on disk.
     """
 
     gaussians: Gaussians
     ids: np.ndarray
+    surface: PointCloud | None = None
     whole: bool = True
 
 
@@ -89,16 +92,15 @@ class MapContents:
         surface = opacities_of(g) >= TileTuning.min_opacity
         means, rgb = g.means.numpy(), colors_to_uint8(0.5 + SH_C0 * g.sh.numpy()[:, 0])
         solid = means[surface], rgb[surface], shown.ids[surface]
-        tiled = [channel for channel in (POINT_TILES, SPLAT_TILES) if channel in only]
-        tiled = [channel for channel in tiled if self._publisher.is_wanted(channel)]
-        thin = thin_points(*solid) if tiled else None
-        if thin is not None and POINT_TILES in tiled:
-            self._point_tiles(shown, thin, stamp, final)
-        if thin is not None and SPLAT_TILES in tiled:
-            self._splat_tiles(shown, thin, stamp, final, harmonics)
+        seen = solid if shown.surface is None else (shown.surface.xyz, shown.surface.rgb, shown.surface.ids)
+        wanted = [c for c in (POINT_TILES, SPLAT_TILES) if c in only and self._publisher.is_wanted(c)]
+        if POINT_TILES in wanted:
+            self._point_tiles(shown, thin_points(*seen), stamp, final)
+        if SPLAT_TILES in wanted:
+            self._splat_tiles(shown, thin_points(*solid), stamp, final, harmonics)
         if POINTS in only and self._is_due(POINTS, final):
             self._whole_at[POINTS.name] = time.monotonic()
-            self._publisher.put(POINTS, points_of(at_most(*solid, TileTuning.max_points)), stamp)
+            self._publisher.put(POINTS, points_of(at_most(*seen, TileTuning.max_points)), stamp)
         if SPLATS in only and self._is_due(SPLATS, final):
             self._whole_at[SPLATS.name] = time.monotonic()
             rows = most_visible(g, MapContentsTuning.max_splats)
@@ -140,7 +142,7 @@ def part_name(tile: Tile) -> str:
 
 
 def points_of(thin: ThinPoints, rows: np.ndarray | None = None) -> Points:
-    """Some points, or all; `count` tells how many Gaussians one stands for, `id` its object."""
+    """Some points, or all; `count` tells how many one stands for, `id` its object."""
     chosen = slice(None) if rows is None else rows
     values = {"count": thin.count[chosen], "id": thin.ids[chosen]}
     return Points(MAP, thin.xyz[chosen], thin.rgb[chosen], values)

@@ -37,8 +37,9 @@ from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA, fixed_frames
 from ggslam.jobs.serve.map_contents import MapContents, MapCopy
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.run_volumes import RunVolumes
+from ggslam.jobs.serve.seen_points import PointCloud, saved_points
 from ggslam.jobs.serve.things import known_changes, known_movers, known_objects
-from ggslam.messages.contents import Channel, Lens, Level, Path, Pose, Things, Transforms, Verdict, Verdicts
+from ggslam.messages.contents import Channel, Lens, Level, Path, Points, Pose, Things, Transforms, Verdict, Verdicts
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.records.verdict import AspectRecord
 from ggslam.scene.gaussian_map import GaussianMap
@@ -82,6 +83,7 @@ class RunContents:
         """...and their times [N], seconds; of a map without times the frames' numbers."""
         self._times = dict(zip(frames, self.stamps.tolist(), strict=True))
         self._map: GaussianMap | None = None
+        self._surface: PointCloud | None = None
         self.problems: dict[str, str] = {}
         """Why a channel has no content, by its name."""
         self._makers: dict[str, Callable[[MapPublisher, Channel], None]] = {
@@ -139,8 +141,14 @@ class RunContents:
         self._map_contents = self._map_contents or MapContents(publisher)
         shown = self._gaussians()
         ids = shown.object_id.numpy().astype(np.uint16)
-        most = RunContentsTuning.harmonics
-        self._map_contents.show(MapCopy(shown, ids), self.stamp, final=True, harmonics=most, only=(channel,))
+        surface = self._seen_points() if channel.kind is Points else None
+        shown_map, most = MapCopy(shown, ids, surface), RunContentsTuning.harmonics
+        self._map_contents.show(shown_map, self.stamp, final=True, harmonics=most, only=(channel,))
+
+    def _seen_points(self) -> PointCloud:
+        if self._surface is None:
+            self._surface = saved_points(self.folder)
+        return self._surface
 
     def _gaussians(self) -> GaussianMap:
         if self._map is None:

@@ -44,9 +44,10 @@ class ThinPoints:
 
     Attributes:
         codes: int64 [N], of the cells.
-        xyz: float32 [N, 3], mean of what is in it, metres.
+        xyz: float32 [N, 3], that of what is in it which lies nearest to the mean, metres: means of a corner lie beside
+            both of its walls.
         rgb: uint8 [N, 3].
-        count: uint16 [N], how many Gaussians that is.
+        count: uint16 [N], how many points that is.
         ids: uint16 [N], object of one of them, 0: none.
         cell_m: edge of a cell.
     """
@@ -86,8 +87,23 @@ def thin_points(
                           np.zeros(0, np.uint16), cell_m)  # fmt: skip
     sums = np.add.reduceat(np.concatenate([means, rgb], axis=1, dtype=np.float64)[order], first, axis=0)
     mean = sums / count[:, None]
-    return ThinPoints(codes[first], mean[:, :3].astype(np.float32), (mean[:, 3:] + 0.5).astype(np.uint8),
-                      np.minimum(count, 65535).astype(np.uint16), ids[order][first], cell_m)  # fmt: skip
+    chosen = order[_nearest(means[order], mean[:, :3], count)]
+    return ThinPoints(codes[first], means[chosen], (mean[:, 3:] + 0.5).astype(np.uint8),
+                      np.minimum(count, 65535).astype(np.uint16), ids[chosen], cell_m)  # fmt: skip
+
+
+def _nearest(points: np.ndarray, middles: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Row of each group's point that lies nearest to its middle, int64 [M].
+
+    Args:
+        points: [N, 3], group by group.
+        middles: [M, 3].
+        count: [M], of the points of each group.
+    """
+    group = np.repeat(np.arange(len(count)), count)
+    far = np.square(points - middles[group]).sum(axis=1)
+    by_group = np.lexsort((far, group))
+    return by_group[np.cumsum(count) - count]
 
 
 def at_most(means: np.ndarray, rgb: np.ndarray, ids: np.ndarray, most: int) -> ThinPoints:

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The surface of a map as points: Gaussians' middles lie centimetres beside it.
+
+Of a growing map it is what its keyframes measured. Each keyframe's points are thinned once, in the frame of its camera,
+and stand where its pose stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ggslam.jobs.serve.tiles import TileTuning, thin_points
+from ggslam.mapping.keyframe import Keyframe
+from ggslam.runs.folder import RunFolder
+from ggslam.runs.opened_points import surface_points
+from ggslam.scene.camera import Camera
+from ggslam.scene.poses import transform_points
+from ggslam.system.tuning import Tuning
+
+
+class SeenPointsTuning(Tuning):
+    """Which of a keyframe's pixels are taken."""
+
+    columns = 128
+    """Most pixels along an image's side that are looked at."""
+    near_edge = 0.05
+    """Share of its depth by which a pixel's neighbours may differ: beside edges of depth sensors see neither."""
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points [N, 3] (metres), colours uint8 [N, 3], objects uint16 [N] (0: none)."""
+
+    xyz: np.ndarray
+    rgb: np.ndarray
+    ids: np.ndarray
+
+
+@dataclass(frozen=True)
+class SeenImages:
+    """What a keyframe holds, as references: nothing of it is changed any more."""
+
+    number: int
+    camera: Camera
+    color: np.ndarray
+    depth: np.ndarray
+    depth_unit: float
+    mask: np.ndarray | None
+    moving: np.ndarray | None
+
+    @staticmethod
+    def of_keyframe(keyframe: Keyframe) -> SeenImages:
+        """Of a keyframe, read from where it was put away."""
+        k = keyframe
+        return SeenImages(k.index, k.camera, k.color, k.depth, k.depth_unit, k.mask, k.moving)
+
+
+class SeenPoints:
+    """Gathers keyframes. Not for several threads at a time."""
+
+    def __init__(self) -> None:
+        self._parts: dict[int, PointCloud] = {}
+
+    def add(self, images: SeenImages) -> None:
+        """Thins a keyframe's points."""
+        self._parts[images.number] = points_in_camera(images)
+
+    def cloud(self, poses: Mapping[int, np.ndarray], ids: np.ndarray | None) -> PointCloud:
+        """All points where their keyframes are.
+
+        Args:
+            poses: T_world_camera float64 [4, 4] by number; keyframes that are not among them are left out.
+            ids: uint16 [65536], object of each id of the masks; None: there are no objects.
+        """
+        parts = [(part, poses[number]) for number, part in self._parts.items() if number in poses]
+        xyz = [transform_points(part.xyz, T).astype(np.float32) for part, T in parts]
+        labels = np.concatenate([np.zeros(0, np.uint16), *(part.ids for part, _ in parts)])
+        labels = np.zeros_like(labels) if ids is None else ids[labels]
+        rgb = [np.zeros((0, 3), np.uint8), *(part.rgb for part, _ in parts)]
+        return PointCloud(np.concatenate([np.zeros((0, 3), np.float32), *xyz]), np.concatenate(rgb), labels)
+
+
+def saved_points(folder: RunFolder) -> PointCloud:
+    """The surface of a saved run, see `surface_points`; errors as there."""
+    found = surface_points(folder, None)
+    ids = np.zeros(len(found), np.uint16) if found.object_id is None else found.object_id.astype(np.uint16)
+    return PointCloud(found.points.astype(np.float32), found.colors, ids)
+
+
+def points_in_camera(images: SeenImages) -> PointCloud:
+    """A keyframe's points in its camera's frame, one for each cell of `TileTuning.point_m` that it sees."""
+    step = max(1, -(-max(images.depth.shape) // SeenPointsTuning.columns))
+    depth = images.depth.astype(np.float32) * np.float32(images.depth_unit)
+    good = (depth > 0) & _is_smooth(depth)
+    if images.moving is not None:
+        good &= ~images.moving
+    good[np.arange(good.shape[0]) % step != 0] = False
+    good[:, np.arange(good.shape[1]) % step != 0] = False
+    rows, columns = np.nonzero(good)
+    z = depth[rows, columns]
+    c = images.camera
+    xyz = np.stack([(columns - c.cx) / c.fx * z, (rows - c.cy) / c.fy * z, z], axis=1).astype(np.float32)
+    ids = np.zeros(len(z), np.uint16) if images.mask is None else images.mask[rows, columns]
+    thin = thin_points(xyz, images.color[rows, columns], ids, TileTuning.point_m)
+    return PointCloud(thin.xyz, thin.rgb, thin.ids)
+
+
+def _is_smooth(depth: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: the pixels left, right, above and below are about as far."""
+    most = SeenPointsTuning.near_edge * depth
+    smooth = np.ones(depth.shape, bool)
+    across, down = np.abs(np.diff(depth, axis=1)), np.abs(np.diff(depth, axis=0))
+    smooth[:, 1:] &= across <= most[:, 1:]
+    smooth[:, :-1] &= across <= most[:, :-1]
+    smooth[1:] &= down <= most[1:]
+    smooth[:-1] &= down <= most[:-1]
+    return smooth
