@@ -107,7 +107,7 @@ def _check_file(command: str, place: Path, domain: int) -> None:
     from mcap.reader import make_reader
 
     words, env = shlex.split(command), {**os.environ, "ROS_DOMAIN_ID": str(domain)}
-    program = [sys.executable, "-m", "ggslam", *words, "--no-http"]
+    program = [sys.executable, "-m", "ggslam", *words]
     subprocess.run(program, cwd=place, check=True, env=env, timeout=WAIT_S)
     with (place / words[-1]).open("rb") as file:
         summary = make_reader(file).get_summary()

@@ -44,7 +44,7 @@ camera_optical: z forward, its pose in map is trajectory.txt's.
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `ggslam run` wrote.")]
 Publish = Annotated[
     str | None,
-    typer.Option(metavar="LIST", help="Where to publish: foxglove[:PORT], ros2, FILE.mcap, with commas between them. "
+    typer.Option(metavar="LIST", help="Where to publish: foxglove[:PORT], ros2, http[:PORT], FILE.mcap, with commas. "
                  "Default: foxglove, if it is installed."),
 ]  # fmt: skip
 FoxglovePort = Annotated[
@@ -67,7 +67,10 @@ Changes = Annotated[
 def serve(
     run: RunPath,
     publish: Publish = None,
-    http: Annotated[bool, typer.Option("--http/--no-http", help="Answer questions over HTTP.")] = True,
+    http: Annotated[
+        bool | None,
+        typer.Option("--http/--no-http", help="Answer questions over HTTP; default: unless all goes into files."),
+    ] = None,
     host: options.Host = "127.0.0.1",
     port: HttpPort = 8090,
     foxglove_port: FoxglovePort = 8765,
@@ -89,7 +92,8 @@ def serve(
     node = network.node_request(middleware, domain, namespace, address)
     foxglove = foxglove_port if places.foxglove_port is None else places.foxglove_port
     through = PublishRequest(places.names, host, foxglove, node, overwrite, optional=publish is None)
-    asked = places.http_port if places.http_port is not None else port if http else None
+    answers = not places.only_files if http is None else http
+    asked = places.http_port if places.http_port is not None else port if answers else None
     request = ServeRequest(through, host, asked, tuple(robot or ()), changes)
     with serve_map(RunFolder.open(run), request) as serving:
         for line in serving.lines:

@@ -14,6 +14,7 @@ Anything with a camera and an iterator of frames is a source:
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
@@ -191,6 +192,7 @@ class LiveSequence:
                 self._note_time(frame)
                 if self.record is not None:
                     _record(self.record, frame)
+                    _record_time(self.record, frame)  # one by one: a run that is killed keeps what it recorded
                 yield frame
                 if self._ended.is_set() or (self._stop is not None and len(self._times) >= self._stop):
                     break
@@ -198,9 +200,6 @@ class LiveSequence:
             if in_main:
                 signal.signal(signal.SIGINT, before)
             self.source.close()
-            if self.record is not None:
-                write_text(self.record / "timestamps.txt", "".join(f"{at:.6f}\n" for at in self._times))
-
 
     def _note(self, text: str) -> None:
         if len(self.warnings) < LiveTuning.warnings:
@@ -209,13 +208,13 @@ class LiveSequence:
 
     def _note_time(self, frame: Frame) -> None:
         arrived = self.source.arrived if isinstance(self.source, WaitingSource) else time.time()
-        if not self.since:
-            delay = arrived - frame.timestamp
-            self.since = "stamp" if -LiveTuning.early_s < delay < LiveTuning.late_s else "arrival"
-        self._taken.append(frame.timestamp if self.since == "stamp" else arrived)
+        good = -LiveTuning.early_s < arrived - frame.timestamp < LiveTuning.late_s
+        self.since = self.since or ("stamp" if good else "arrival")
+        by_stamp = frame.timestamp if good else math.nan  # its clock was set, or jumped
+        self._taken.append(by_stamp if self.since == "stamp" else arrived)
 
     def moment_of(self, frame: Frame) -> float:
-        """When a frame was taken, or came, seconds since 1970; see `since`."""
+        """When a frame was taken, or came, seconds since 1970; see `since`. NaN: its stamp cannot be true."""
         return self._taken[frame.index]
 
     def counts(self) -> dict[str, int] | None:
@@ -234,6 +233,11 @@ def _begin_recording(folder: Path, camera: Camera) -> None:
     make_folder(folder / "depth")
     entries = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     write_text(folder / "camera.yaml", yaml.safe_dump({**entries, "depth_scale": DEPTH_SCALE}, sort_keys=False))
+
+
+def _record_time(folder: Path, frame: Frame) -> None:
+    with (folder / "timestamps.txt").open("a") as times:
+        times.write(f"{frame.timestamp:.6f}\n")
 
 
 def _record(folder: Path, frame: Frame) -> None:

@@ -178,6 +178,12 @@ def test_a_run_is_held_and_its_map_saved_meanwhile(room: Path, tmp_path: Path) -
         told["saved"] = services.call("save_map", {"name": "now"})
         with pytest.raises(ConfigError, match="is there already"):
             services.call("save_map", {"name": "now"})
+        (tmp_path / "mine.txt").write_text("MINE")
+        with pytest.raises(ConfigError, match="mine.txt is there already"):
+            services.call("save_map", {"name": "mine"})
+        for name in (5, None, ["a"]):
+            with pytest.raises(ConfigError, match="name"):
+                services.call("save_map", {"name": name})
         time.sleep(0.2)
         told["same"] = services.call("status")["frames"] == frames
         services.call("pause", {"on": False})
@@ -190,6 +196,7 @@ def test_a_run_is_held_and_its_map_saved_meanwhile(room: Path, tmp_path: Path) -
         live.finish(outcome)
         assert services.call("status")["live"] is False  # the saved run answers now
         assert outcome.folder.timing().model_dump()["publishing"]["outlets"]["kept"]["failure"] == ""
+    assert (tmp_path / "mine.txt").read_text() == "MINE" and not (tmp_path / "mine.ply").exists()
     saved = read_gaussian_ply(tmp_path / "now.ply")
     assert len(saved) == told["saved"]["gaussians"] > 0  # type: ignore[index]
     assert len((tmp_path / "now.txt").read_text().splitlines()) == 1 + told["saved"]["frames"]  # type: ignore[index]

@@ -58,7 +58,10 @@ def test_live_camera(tmp_path: Path) -> None:
         open_live("realsense:999")
     stopped = fake_realsense.Pipeline.stopped
     sequence = LiveSequence(open_live("realsense:123"), stop=3, record=tmp_path / "walk")
-    frames = list(sequence.stream())
+    frames = []
+    for frame in sequence.stream():  # what came so far is a whole recording: a run may be killed
+        frames.append(frame)
+        assert len((tmp_path / "walk" / "timestamps.txt").read_text().splitlines()) == len(frames)
     assert [f.index for f in frames] == [0, 1, 2] and fake_realsense.Pipeline.stopped == stopped + 1
     again = open_sequence(tmp_path / "walk")
     assert len(again) == 3 and again.camera == sequence.camera

@@ -21,7 +21,7 @@ from ggslam.jobs.serve.channels import VERDICTS
 from ggslam.jobs.serve.pausing import Pause
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.run_functions import save_target, verdict_values
-from ggslam.jobs.serve.services import Function, flag_in
+from ggslam.jobs.serve.services import Function, flag_in, text_in
 from ggslam.messages.contents import Verdicts
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.result import tracked_poses
@@ -104,13 +104,14 @@ class LiveFunctions:
 
     def save_map(self, values: dict[str, Any]) -> dict[str, Any]:
         """Writes the map as it is now as NAME.ply, and NAME.txt with the poses."""
-        path = save_target(self._beside, {"name": f"{values.get('name', '')}.ply"} if "name" in values else values)
+        name = text_in(values, "name")
+        path, poses_path = (save_target(self._beside, {"name": f"{name}{end}"}) for end in (".ply", ".txt"))
         copies: list[tuple[GaussianMap, np.ndarray, np.ndarray]] = []
         self._ask(lambda slam: copies.append(_copy_of(slam)))
         gaussians, stamps, poses = copies[0]
         make_folder(self._beside)
         write_gaussian_ply(path, gaussians)
-        write_tum(path.with_suffix(".txt"), stamps, poses)
+        write_tum(poses_path, stamps, poses)
         return {"path": str(path), "gaussians": len(gaussians), "frames": len(stamps)}
 
     def _ask(self, what: Callable[[Slam], None]) -> None:

@@ -7,7 +7,7 @@ import struct
 import threading
 import time
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -26,6 +26,8 @@ class InboxTuning(Tuning):
     """Damaged messages, and jumps of a clock, that are told one by one; the others are only counted."""
     settle_s = 0.2
     """Seconds without an image after which no better partner is waited for."""
+    alive_s = 1.0
+    """Seconds since its last image that a publisher counts as one that still sends."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,12 @@ def stamp_of(content: bytes) -> float | None:
     return float(seconds + 1e-9 * nanoseconds)
 
 
+def _with_time(pair: ImagePair) -> ImagePair:
+    """A pair whose stamps are those of its coming, where it has none."""
+    color, depth = (replace(i, stamp=i.content.at) if i.stamp == 0 else i for i in (pair.color, pair.depth))
+    return replace(pair, color=color, depth=depth)
+
+
 class PairInbox:
     """Takes image messages in the middleware's threads and holds the newest pair for whoever asks: one that was not
     taken in time makes room and is counted.
@@ -61,6 +69,8 @@ class PairInbox:
         self._topics: dict[Kind, str] = {"color": topics[0], "depth": topics[1]}
         self._matcher: PairMatcher[Received] = PairMatcher(tolerance_s)
         self._zeros: Counter[Kind] = Counter()
+        self._writers: dict[Kind, dict[str, float]] = {"color": {}, "depth": {}}
+        self._told_writers: dict[Kind, bool] = {"color": False, "depth": False}
         self._slot: ImagePair | None = None
         self._last_at = 0.0
         self._events: deque[str] = deque(maxlen=20)
@@ -79,12 +89,15 @@ class PairInbox:
         with self._changed:
             self.received[kind] += 1
             self._last_at = time.monotonic()
+            self._note_writer(kind, received.writer)
             stamp = stamp_of(received.content)
             if stamp is None:
                 return self._note_damage(self._topics[kind], f"{len(received.content)} bytes are no message")
             jumps = self._matcher.jumps
             # Drivers that leave the time out write 0 each time; then it is that of coming.
             self._zeros[kind] = self._zeros[kind] + 1 if stamp == 0 else 0
+            if self._slot is not None and self._zeros[kind] > 1:
+                self._slot = _with_time(self._slot)
             for pair in self._matcher.add(kind, received.at if self._zeros[kind] > 1 else stamp, received):
                 self._put(*pair)
             if self._matcher.jumps > jumps:
@@ -119,9 +132,18 @@ class PairInbox:
         with self._changed:
             self.taken -= 1
             if self._slot is None:
-                self._slot = pair
+                self._slot = _with_time(pair) if max(self._zeros.values(), default=0) > 1 else pair
             else:
                 self.overwritten += 1
+
+    def _note_writer(self, kind: Kind, writer: str) -> None:
+        """Two cameras on one topic take turns in every picture of the run."""
+        now = time.monotonic()
+        others = [other for other, at in self._writers[kind].items() if now - at < InboxTuning.alive_s]
+        if writer not in others and others and not self._told_writers[kind]:
+            self._told_writers[kind] = True
+            self._events.append(f"two publishers send to {self._topics[kind]} at once: their images are mixed")
+        self._writers[kind][writer] = now
 
     def note_damage(self, topic: str, why: str) -> None:
         """A message that could not be decoded."""
