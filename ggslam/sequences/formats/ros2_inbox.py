@@ -137,13 +137,15 @@ class PairInbox:
                 self.overwritten += 1
 
     def _note_writer(self, kind: Kind, writer: str) -> None:
-        """Two cameras on one topic take turns in every picture of the run."""
-        now = time.monotonic()
-        others = [other for other, at in self._writers[kind].items() if now - at < InboxTuning.alive_s]
-        if writer not in others and others and not self._told_writers[kind]:
+        """Two cameras on one topic take turns; one that was started anew does not come back as it was."""
+        now, seen = time.monotonic(), self._writers[kind]
+        alive = [other for other, at in seen.items() if now - at < InboxTuning.alive_s]
+        takes_turns = writer in alive and next(reversed(seen)) != writer
+        if takes_turns and not self._told_writers[kind]:
             self._told_writers[kind] = True
             self._events.append(f"two publishers send to {self._topics[kind]} at once: their images are mixed")
-        self._writers[kind][writer] = now
+        seen.pop(writer, None)
+        seen[writer] = now  # the newest last
 
     def note_damage(self, topic: str, why: str) -> None:
         """A message that could not be decoded."""
