@@ -79,7 +79,7 @@ class LiveContentsTuning(Tuning):
     floor_keyframes = 5
     """Keyframes from which the floor is looked for."""
     end_after_s = 1e-6
-    """Seconds after the last frame that the frames as they came out are stamped: of two of one time, tf2 may keep the first."""
+    """Seconds after the last frame at which the tree as it came out is stamped: tf2 may keep the first of one time."""
 
 
 @dataclass
