@@ -81,7 +81,9 @@ def test_the_keys_others_rely_on_hold_sensible_numbers(finished: Path) -> None:
 
 def test_the_commands_that_a_run_suggests_can_be_copied(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = SimpleNamespace(path=tmp_path / ("it's a long name " * 8))
-    nothing = {"metrics": None, "error": None, "verdicts": (), "verdict": None, "energy": None, "latency": None, "encoded": ""}
+    nothing = {
+        "metrics": None, "error": None, "verdicts": (), "verdict": None, "energy": None, "latency": None, "encoded": "",
+    }  # fmt: skip
     outcome = SimpleNamespace(folder=folder, headline=lambda: "24 frames", **nothing)
     _print(cast(RunOutcome, outcome))
     shown = capsys.readouterr().out.splitlines()[-2:]
