@@ -102,7 +102,7 @@ def played(room: Path) -> Played:
     played = play(Slam(frames[0].camera, config, has_masks=False), frames, LiveContents(publisher))
     assert publisher.wait_idle(10.0)
     publisher.close()
-    played.trees = outlet.of(c.TF.name)
+    played.trees = [content for content in outlet.of(c.TF.name) if isinstance(content, Transforms)]
     assert played.result is not None and len(played.trees) == len(ORDER) + 1
     events = [event.kind for event in played.result.loop_events]
     assert events.count("closed") == len(played.corrections) > 0, events
