@@ -195,7 +195,7 @@ def show_live(parts: list[str], frames: int, quick: bool, stall: list[str]) -> N
         synth = ["synth", str(recording), "--frames", "24" if quick else "120", "--width", size[0], "--height", size[1]]
         subprocess.run([sys.executable, "-m", "ggslam", *synth], check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
         some = list(CARRIERS[:1] if quick else CARRIERS)
-        more = ["--iterations", "2", "--refine", "10"] if quick else []
+        more = ["--iterations", "2", "--refine", "10"] if quick else ["--refine", "100"]  # the end is not the subject
         if "runs" in parts:
             print(f"\na generated recording, {'x'.join(size)}, at 30 Hz into a run in real time", flush=True)
             show_runs({name: play_into_run(name, recording, frames, folder / name, more) for name in some})

@@ -87,7 +87,7 @@ def kill_by_turns(middleware: str, recording: Path, seconds: float, folder: Path
     out, told = folder / "run", folder / "second.mcap"
     with LivePlace(middleware) as place:
         first = place.listen(folder / "first.mcap")
-        run = place.run(out, *REALTIME, "--publish", "ros2", idle_s=12.0)
+        run = place.run(out, *REALTIME, "--refine", "10", "--publish", "ros2", idle_s=12.0)
         player = place.play(recording, "--fps", str(RATE), "--loop")
         first.wait_for("topic /tf", 60)
         time.sleep(seconds)
@@ -101,7 +101,7 @@ def kill_by_turns(middleware: str, recording: Path, seconds: float, folder: Path
         second.wait_for("topic /tf", 60)
         time.sleep(seconds)
         player.interrupt(20)
-        run.wait_for(SERVED, 120)
+        run.wait_for(SERVED, 300)
         status = run.interrupt(60)
         second.finish(60)
     topics = [topic for topic, *_ in read_recorded(told)]

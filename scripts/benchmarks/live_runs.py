@@ -83,7 +83,7 @@ def play_into_run(middleware: str, recording: Path, frames: int, folder: Path, w
         recorder.wait_for("topic /tf", 60)
         time.sleep(frames / RATE)
         player.interrupt(20)
-        run.wait_for(SERVED, 120)
+        run.wait_for(SERVED, 300)
         recorder.wait_for("topic /ggslam/changes", 30)
         run.interrupt(60)
         recorder.finish(60)
