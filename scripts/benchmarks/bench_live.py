@@ -213,7 +213,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
     parser.add_argument("--quick", action="store_true", help="everything small, in a minute")
     parser.add_argument("--stall", nargs="+", metavar="WORD", help="recording of `stalls`, and more words for its run; "
-                        "default: redkitchen of GGSLAM_DATA --scale .5 --stop 30")  # fmt: skip
+                        "default: redkitchen of GGSLAM_DATA --scale .5 --stop 45")  # fmt: skip
     parser.add_argument("--sender", nargs=3, metavar=("CARRIER", "PLACE", "PROFILE"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     frames = arguments.frames or (30 if arguments.quick else 1000)
@@ -225,7 +225,7 @@ def main() -> None:
         show_transport(frames, arguments.rate)
     if arguments.parts != ["transport"]:
         data = Path(os.environ.get("GGSLAM_DATA", ROOT.parent / "shared" / "data"))
-        stall = arguments.stall or [str(data / "redkitchen"), "--scale", ".5", "--stop", "30"]
+        stall = arguments.stall or [str(data / "redkitchen"), "--scale", ".5", "--stop", "45"]
         show_live(arguments.parts, frames, arguments.quick, stall)
 
 
