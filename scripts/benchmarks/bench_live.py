@@ -1,29 +1,39 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""How frames go from one process to another over Zenoh and over DDS, on 127.0.0.1.
+"""How frames go from one process to another over Zenoh and over DDS, on 127.0.0.1, and what a live run makes of them.
 
     python scripts/benchmarks/bench_live.py
-    python scripts/benchmarks/bench_live.py --frames 100 --rate 60
+    python scripts/benchmarks/bench_live.py --quick
+    python scripts/benchmarks/bench_live.py --parts transport --frames 100 --rate 60
 
-A process sends 640x480 rgb8 and 16UC1 images at a rate; this one takes them. Each carrier is measured with ROS 2's
-profile for sensors and with a reliable one of ten messages. `late` is the time from before a message is sent until its
-CDR is in the hands of the taker; `send` the time that sending one takes whoever sends; the processor time of a message
-is that of the whole process, all threads, of either side. A ratio of two carriers depends less on the machine than
-their figures.
+Four parts. `transport`: a process sends 640x480 rgb8 and 16UC1 images at a rate; this one takes them. Each carrier is
+measured with ROS 2's profile for sensors and with a reliable one of ten messages. `late` is the time from before a
+message is sent until its CDR is in the hands of the taker; `send` the time that sending one takes whoever sends; the
+processor time of a message is that of the whole process, all threads, of either side. A ratio of two carriers depends
+less on the machine than their figures.
+
+`runs`: a generated recording is played at 30 Hz into `ggslam run --realtime 30 --publish ros2,FILE.mcap`, and a third
+process keeps all that is published: frames sent, taken, overwritten and lost, delays, bytes a second, messages that
+other decoders read otherwise, and the frames' tree against trajectory.txt. `stalls`: what a run of a recording takes
+while somebody who listens stands still, as a ratio to the run that is not published. `kills`: player and subscriber are
+killed and started anew while a run goes on.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
 import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from statistics import median, quantiles
 from typing import Any
 
@@ -39,6 +49,7 @@ TOPICS = {"/camera/color": ("rgb8", 3), "/camera/depth": ("16UC1", 2)}
 WIDTH, HEIGHT = 640, 480
 PROFILES = {"sensor": SENSOR_DATA, "reliable": Qos(depth=10)}
 CARRIERS = ("zenoh", "dds")
+PARTS = ["transport", "runs", "stalls", "kills"]
 STAMP = struct.Struct("<II")
 STAMP_AT = 4
 """Of seconds and nanoseconds in the CDR of a message that begins with a header."""
@@ -173,17 +184,49 @@ def show_transport(frames: int, rate: float) -> None:
         print(f"{'dds : zenoh':16}{'':27}" + "".join(f"{ratio:9.2f}" for ratio in ratios), flush=True)
 
 
+def show_live(parts: list[str], frames: int, quick: bool, stall: list[str]) -> None:
+    """Prints the tables of whole runs."""
+    from live_faults import show_kills, show_stalls
+    from live_runs import play_into_run, show_runs
+
+    with tempfile.TemporaryDirectory(prefix="bench-live-") as made:
+        folder = Path(made)
+        recording, size = folder / "room", ("160", "120") if quick else ("320", "240")
+        synth = ["synth", str(recording), "--frames", "24" if quick else "120", "--width", size[0], "--height", size[1]]
+        subprocess.run([sys.executable, "-m", "ggslam", *synth], check=True, cwd=ROOT, stdout=subprocess.DEVNULL)
+        some = list(CARRIERS[:1] if quick else CARRIERS)
+        more = ["--iterations", "2", "--refine", "10"] if quick else ["--refine", "100"]  # the end is not the subject
+        if "runs" in parts:
+            print(f"\na generated recording, {'x'.join(size)}, at 30 Hz into a run in real time", flush=True)
+            show_runs({name: play_into_run(name, recording, frames, folder / name, more) for name in some})
+        if "stalls" in parts:
+            place, words = (recording, more) if quick else (Path(stall[0]), stall[1:])
+            show_stalls(place, words, some, 1 if quick else 3, folder / "stalls")
+        if "kills" in parts:
+            show_kills(some, recording, 1.0 if quick else 5.0, folder / "kills")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=1000)
-    parser.add_argument("--rate", type=float, default=30.0, help="frames a second")
+    parser.add_argument("--frames", type=int, help="of a recording that is sent; default 1000")
+    parser.add_argument("--rate", type=float, default=30.0, help="frames a second of `transport`")
+    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS)
+    parser.add_argument("--quick", action="store_true", help="everything small, in a minute")
+    parser.add_argument("--stall", nargs="+", metavar="WORD", help="recording of `stalls`, and more words for its run; "
+                        "default: redkitchen of GGSLAM_DATA --scale .5 --stop 45")  # fmt: skip
     parser.add_argument("--sender", nargs=3, metavar=("CARRIER", "PLACE", "PROFILE"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    frames = arguments.frames or (30 if arguments.quick else 1000)
     if arguments.sender:
         carrier, place, profile = arguments.sender
-        send_frames(carrier, int(place), profile, arguments.frames, arguments.rate)
-    else:
-        show_transport(arguments.frames, arguments.rate)
+        send_frames(carrier, int(place), profile, frames, arguments.rate)
+        return
+    if "transport" in arguments.parts:
+        show_transport(frames, arguments.rate)
+    if arguments.parts != ["transport"]:
+        data = Path(os.environ.get("GGSLAM_DATA", ROOT.parent / "shared" / "data"))
+        stall = arguments.stall or [str(data / "redkitchen"), "--scale", ".5", "--stop", "45"]
+        show_live(arguments.parts, frames, arguments.quick, stall)
 
 
 if __name__ == "__main__":

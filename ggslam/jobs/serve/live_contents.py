@@ -83,6 +83,8 @@ class LiveContentsTuning(Tuning):
     """Seconds between two verdicts."""
     floor_keyframes = 5
     """Keyframes from which the floor is looked for."""
+    end_after_s = 1e-6
+    """Seconds after the last frame at which the tree as it came out is stamped: tf2 may keep the first of one time."""
 
 
 @dataclass
@@ -332,7 +334,7 @@ class LiveContents:
         stamp = float(stamps[known][-1])
         self.tree.correct(poses[known][-1])
         put = self._publisher.put
-        put(TF, self.tree.transforms, stamp)
+        put(TF, self.tree.transforms, stamp + LiveContentsTuning.end_after_s)
         put(POSE, Pose(MAP, poses[known][-1] @ T_OPTICAL_CAMERA), stamp)
         put(PATH, Path(MAP, poses[known] @ T_OPTICAL_CAMERA, stamps[known]), stamp)
         if len(result.gaussians):
