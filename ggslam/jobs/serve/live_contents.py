@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.driving.robot import Robot
 from ggslam.jobs.serve.channels import (
     DEPTH,
     LENS,
@@ -33,6 +34,8 @@ from ggslam.jobs.serve.channels import (
     VERDICTS,
 )
 from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA, FramesTree, fixed_frames
+from ggslam.jobs.serve.keyframe_volumes import Floor, KeyframeVolumes, PlacedKeyframe, placed
+from ggslam.jobs.serve.live_volumes import GrowingVolumes
 from ggslam.jobs.serve.map_contents import MapContents, MapCopy
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.things import MoversNow, growing_objects
@@ -92,6 +95,8 @@ class _Snapshot:
     T_map_optical: np.ndarray | None
     stamp: float
     whole: bool
+    keyframes: list[PlacedKeyframe]
+    scale: float
 
 
 class LiveContents:
@@ -100,17 +105,22 @@ class LiveContents:
     Args:
         publisher: that takes the contents.
         names: of object ids, where known.
+        robots: by name, that grids are made for.
     """
 
-    def __init__(self, publisher: MapPublisher, names: Mapping[int, str] | None = None) -> None:
+    def __init__(
+        self, publisher: MapPublisher, names: Mapping[int, str] | None = None,
+        robots: Mapping[str, Robot] | None = None,
+    ) -> None:  # fmt: skip
         self._publisher, self._names = publisher, names or {}
+        self.volumes = GrowingVolumes(publisher, robots or {})
         self.tree = FramesTree()
         self._moves, self._unbroken = 0, False
         self._movers, self._has_movers = MoversNow(), False
         self._map = MapContents(publisher)
         self._rasterizer: CpuRasterizer | None = None
-        self._T_floor_map: np.ndarray | None = None
-        self._floor_due = True
+        self._floor: Floor | None = None
+        self._floor_due, self._corrections, self._scale = True, 0, 1.0
         self._picture_at = self._verdict_at = -1e9
         self._ready = threading.Event()
         self._ready.set()
@@ -212,6 +222,9 @@ class LiveContents:
     def _copy(self, slam: Slam, report: StepReport, T: np.ndarray | None, stamp: float) -> None:
         """Copies the map if the other thread is ready and anybody wants what is made of it."""
         heavy = self._map.is_wanted or any(self._publisher.is_wanted(c) for c in (OBJECTS, PATH, RENDERED))
+        if len(slam.corrections) > self._corrections:
+            self._corrections, self._floor_due = len(slam.corrections), True
+        heavy = heavy or self.volumes.is_wanted
         if not self._ready.is_set() or not slam.mapper.keyframes or not (heavy or self._floor_due):
             return
         self._ready.clear()
@@ -233,7 +246,9 @@ class LiveContents:
                 labels = slam.mapper.vote_labels()[:count]
                 ids[: len(labels)] = labels
         poses, stamps = _path_of(slam)
-        return _Snapshot(copies, ids, poses, stamps, slam.camera, T, stamp, slam.pager is None)
+        keyframes = placed(slam.mapper.keyframes) if self.volumes.is_wanted else []
+        self._scale = slam.scale
+        return _Snapshot(copies, ids, poses, stamps, slam.camera, T, stamp, slam.pager is None, keyframes, slam.scale)
 
     # --- the thread that makes contents ------------------------------------------------------------------------------
 
@@ -275,10 +290,12 @@ class LiveContents:
             put(OBJECTS, growing_objects(s.gaussians.means.numpy()[solid], s.ids[solid], self._names), s.stamp)
         if wanted(RENDERED) and s.T_map_optical is not None:
             put(RENDERED, Picture(OPTICAL, self._render(s, s.T_map_optical)), s.stamp, keep=False)
+        self.volumes.show(s.keyframes, s.scale, self._floor, s.poses, s.stamp)
 
     def _send_floor(self, gaussians: GaussianTensors, poses: np.ndarray, stamp: float) -> None:
-        self._T_floor_map = floor_from_map(upright_of(gaussians, poses), poses)
-        self._publisher.put(TF_STATIC, fixed_frames(self._T_floor_map), stamp)
+        upright = upright_of(gaussians, poses)
+        self._floor = Floor(floor_from_map(upright, poses), upright.floor is not None)
+        self._publisher.put(TF_STATIC, fixed_frames(self._floor.T_floor_map), stamp)
 
     def _render(self, s: _Snapshot, T_map_optical: np.ndarray) -> np.ndarray:
         if self._rasterizer is None:  # kernels of one context take turns; the run must not wait for these
@@ -317,6 +334,11 @@ class LiveContents:
             self._send_floor(copies, poses[known], stamp)
             ids = g.object_id.cpu().numpy().astype(np.uint16)
             self._map.show(MapCopy(copies, ids), stamp, final=True)
+        self.volumes.show(placed(result.keyframes), self._scale, self._floor, poses[known], stamp, final=True)
+
+    def keyframe_volumes(self, result: SlamResult) -> KeyframeVolumes | None:
+        """Volumes of the finished run's keyframes; None: no floor is known, for there is no map."""
+        return None if self._floor is None else KeyframeVolumes(result.keyframes, self._scale, self._floor)
 
 
 def _path_of(slam: Slam) -> tuple[np.ndarray, np.ndarray]:
