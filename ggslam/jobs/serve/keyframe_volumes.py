@@ -74,8 +74,8 @@ class FusedKeyframes:
         """Number of keyframes."""
         return len(self._poses)
 
-    def still_fits(self, views: Sequence[PlacedKeyframe]) -> bool:
-        """Whether what was fused is among some keyframes, about where it was."""
+    def still_fits(self, views: Sequence[PlacedKeyframe], moved_m: float) -> bool:
+        """Whether what was fused is among some keyframes, and what they see no farther than `moved_m` from there."""
         now = {view.keyframe.index: view.T_camera_world for view in views}
         if not self._poses.keys() <= now.keys():
             return False
@@ -84,7 +84,7 @@ class FusedKeyframes:
         moves = np.stack([now[k] for k in self._poses]) @ inverse(np.stack(list(self._poses.values())))
         turned = np.linalg.norm(moves[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2)
         far = np.linalg.norm(moves[:, :3, 3], axis=1) + KeyframeVolumesTuning.reach_m * turned
-        return bool(far.max() <= KeyframeVolumesTuning.moved_m)
+        return bool(far.max() <= moved_m)
 
     def add(self, views: Sequence[PlacedKeyframe], go_on: Callable[[], bool] = lambda: True) -> bool:
         """Fuses what was not yet, at least one and as long as `go_on` says; returns whether all of them are."""

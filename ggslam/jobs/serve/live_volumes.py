@@ -15,7 +15,7 @@ import numpy as np
 from ggslam.driving.robot import Robot
 from ggslam.errors import ConfigError
 from ggslam.jobs.serve.channels import CHANGED, DISTANCE, MESH, grid_channel
-from ggslam.jobs.serve.keyframe_volumes import Floor, FusedKeyframes, PlacedKeyframe
+from ggslam.jobs.serve.keyframe_volumes import Floor, FusedKeyframes, KeyframeVolumesTuning, PlacedKeyframe
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.tiles import SentTiles, Tile, thin_points
 from ggslam.jobs.serve.volume_contents import (
@@ -128,7 +128,7 @@ class GrowingVolumes:
         if self._context is None:  # kernels of one context take turns; the run must not wait for these
             self._context = NativeContext(1)
         growing = self._next or self._shown
-        if growing is None or not growing.still_fits(views):
+        if growing is None or not growing.still_fits(views, 1e-6 if final else KeyframeVolumesTuning.moved_m):
             growing = FusedKeyframes(scale, self._context)
             self._next = growing
         before, end = len(growing), time.monotonic() + LiveVolumesTuning.pass_s
