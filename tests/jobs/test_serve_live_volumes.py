@@ -20,8 +20,10 @@ from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.serve import channels as c
 from ggslam.jobs.serve.keyframe_volumes import Floor, FusedKeyframes, PlacedKeyframe
 from ggslam.jobs.serve.live_contents import LiveContents, LiveContentsTuning
+from ggslam.jobs.serve.live_functions import LiveFunctions
 from ggslam.jobs.serve.live_serving import AFTER, LIVE
 from ggslam.jobs.serve.live_volumes import GrowingVolumes, LiveVolumesTuning
+from ggslam.jobs.serve.pausing import Pause
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.run_volumes import RunVolumes
 from ggslam.jobs.serve.volume_contents import grid_of, layers_of
@@ -146,6 +148,10 @@ def test_nothing_is_fused_while_nobody_asks(exact: ExactRoom) -> None:
         assert volumes.fused == 3 and not publisher.newest(c.MESH)
         found = volumes.query(exact.surface.data[2000:2100])  # of the first view
         assert found.known.all() and np.abs(found.distance).max() < 0.06
+        functions = LiveFunctions(publisher, Pause(), Path())
+        functions.distances = volumes
+        told = functions.query_distance({"points": [*exact.surface.data[2000:2002].tolist(), [50, 0, 0]]})
+        assert told["distance"] == [*found.distance[:2].tolist(), None] and told["most_m"] > 0.5
 
 
 def test_who_joins_gets_a_whole_grid_and_what_changed_since(exact: ExactRoom) -> None:

@@ -42,7 +42,7 @@ class PlacedKeyframe:
     T_camera_world: np.ndarray
 
 
-def placed(keyframes: Sequence[Keyframe]) -> list[PlacedKeyframe]:
+def keyframes_now(keyframes: Sequence[Keyframe]) -> list[PlacedKeyframe]:
     """Keyframes where they are now."""
     return [PlacedKeyframe(keyframe, keyframe.T_camera_world.copy()) for keyframe in list(keyframes)]
 
@@ -125,7 +125,7 @@ class KeyframeVolumes:
             RunFolderError: they cannot be written.
         """
         fused = FusedKeyframes(self._scale)
-        fused.add(placed(self._keyframes))
+        fused.add(keyframes_now(self._keyframes))
         make_folder(folder)
         save_tsdf(folder / TSDF, fused.tsdf)
         write_floor_file(folder / FLOOR_FILE, self._floor.T_floor_map, OutputFrame.map, self._floor.seen)

@@ -34,7 +34,7 @@ from ggslam.jobs.serve.channels import (
     VERDICTS,
 )
 from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA, FramesTree, fixed_frames
-from ggslam.jobs.serve.keyframe_volumes import Floor, KeyframeVolumes, PlacedKeyframe, placed
+from ggslam.jobs.serve.keyframe_volumes import Floor, KeyframeVolumes, PlacedKeyframe, keyframes_now
 from ggslam.jobs.serve.live_volumes import GrowingVolumes
 from ggslam.jobs.serve.map_contents import MapContents, MapCopy
 from ggslam.jobs.serve.publishing import MapPublisher
@@ -246,7 +246,7 @@ class LiveContents:
                 labels = slam.mapper.vote_labels()[:count]
                 ids[: len(labels)] = labels
         poses, stamps = _path_of(slam)
-        keyframes = placed(slam.mapper.keyframes) if self.volumes.is_wanted else []
+        keyframes = keyframes_now(slam.mapper.keyframes) if self.volumes.is_wanted else []
         self._scale = slam.scale
         return _Snapshot(copies, ids, poses, stamps, slam.camera, T, stamp, slam.pager is None, keyframes, slam.scale)
 
@@ -334,7 +334,7 @@ class LiveContents:
             self._send_floor(copies, poses[known], stamp)
             ids = g.object_id.cpu().numpy().astype(np.uint16)
             self._map.show(MapCopy(copies, ids), stamp, final=True)
-        self.volumes.show(placed(result.keyframes), self._scale, self._floor, poses[known], stamp, final=True)
+        self.volumes.show(keyframes_now(result.keyframes), self._scale, self._floor, poses[known], stamp, final=True)
 
     def keyframe_volumes(self, result: SlamResult) -> KeyframeVolumes | None:
         """Volumes of the finished run's keyframes; None: no floor is known, for there is no map."""
