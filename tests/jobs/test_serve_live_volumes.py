@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from shutil import copytree, rmtree
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from serve_tools import KeptOutlet, until
 import ggslam
 from ggslam.driving.bands import HeightLayers, floor_plane
 from ggslam.driving.robot import Robot
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, GgslamError
 from ggslam.jobs.run.pipeline import RunRequest, execute
 from ggslam.jobs.serve import channels as c
 from ggslam.jobs.serve.keyframe_volumes import Floor, FusedKeyframes, PlacedKeyframe
@@ -178,7 +179,8 @@ def test_a_run_shows_volumes_and_has_them_without_a_recording(room: Path, tmp_pa
     outlet = KeptOutlet()
     publisher = MapPublisher([(outlet, True)], CHANNELS)
     few = ["mapping.iterations_per_frame=2", "refine_iterations=10"]
-    request = RunRequest(SequenceRequest(room), out=tmp_path / "run", overrides=few, evaluate=False, check=False)
+    recording = Path(copytree(room, tmp_path / "recording"))
+    request = RunRequest(SequenceRequest(recording), out=tmp_path / "run", overrides=few, evaluate=False, check=False)
     with overridden(LiveContentsTuning, min_rest_s=0.0, processor_share=10.0):
         contents = LiveContents(publisher, robots={"": Robot()})
         outcome = execute(request, follower=contents.follow)
@@ -189,7 +191,7 @@ def test_a_run_shows_volumes_and_has_them_without_a_recording(room: Path, tmp_pa
     assert live > 0 and contents.volumes.fused >= len(outcome.result.keyframes)
     made = fuse_volumes(outcome.folder.path, tmp_path / "volumes", esdf=True, objects=False, voxel=0.05)
     assert made.error is None
-    outcome.folder.has_recording = False
+    rmtree(recording)  # as that of a live camera, which is none
     alone = RunVolumes(outcome.folder, keyframes=contents.keyframe_volumes(outcome.result))
     kept = alone.grid("")
     np.testing.assert_array_equal(kept.cells, grid_from(outlet).cells)
@@ -207,5 +209,5 @@ def test_a_run_shows_volumes_and_has_them_without_a_recording(room: Path, tmp_pa
     (outcome.folder.path / "volumes").rename(tmp_path / "away")
     assert alone.mesh_parts() and len(alone.distance_slice(outcome.result.trajectory()).xyz) > 100
     alone.close()
-    with pytest.raises(ConfigError, match="no recording"):
+    with pytest.raises(GgslamError, match="recording"):
         RunVolumes(outcome.folder).place()

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ggslam.driving.robot import Robot
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, GgslamError
 from ggslam.jobs.plan.map_files import TSDF, floor_beside
 from ggslam.jobs.plan.ros_maps import RosMap, read_ros_map
 from ggslam.jobs.serve.channels import FLOOR
@@ -73,15 +73,21 @@ class RunVolumes:
             return there
         with self._lock:
             if self._made is None:
-                if not self._folder.has_recording and self._keyframes is None:
-                    raise ConfigError(f"{self._folder.path}: has no recording that volumes could be made of")
                 made = tempfile.TemporaryDirectory(prefix="ggslam-")
-                if self._folder.has_recording or self._keyframes is None:
-                    fuse_volumes(self._folder.path, Path(made.name) / VOLUMES, esdf=True, objects=False)
-                else:
-                    self._keyframes.write(Path(made.name) / VOLUMES)
+                self._make(Path(made.name) / VOLUMES)
                 self._made = made
             return Path(self._made.name) / VOLUMES
+
+    def _make(self, place: Path) -> None:
+        """Of the recording; where there is none, of the keyframes."""
+        try:
+            if not self._folder.has_recording:
+                raise ConfigError(f"{self._folder.path}: has no recording that volumes could be made of")
+            fuse_volumes(self._folder.path, place, esdf=True, objects=False)
+        except GgslamError:
+            if self._keyframes is None:
+                raise
+            self._keyframes.write(place)
 
     def field(self) -> DistanceField:
         """The distance field, up to date.
