@@ -17,8 +17,9 @@ from ggslam.jobs.serve import channels as c
 from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.run_contents import RunContents, ServedRun
-from ggslam.jobs.serve.run_volumes import VOLUMES, RunVolumes, RunVolumesTuning
+from ggslam.jobs.serve.run_volumes import VOLUMES, RunVolumes
 from ggslam.jobs.serve.tiles import tile_of
+from ggslam.jobs.serve.volume_contents import RunVolumesTuning
 from ggslam.jobs.volumes.fuse_volumes import fuse_volumes
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.opened_points import surface_points

@@ -53,6 +53,8 @@ OBJECTS = Channel("ggslam/objects", Things, latched=True)
 MOVERS = Channel("ggslam/movers", Things, latched=True)
 CHANGES = Channel("ggslam/changes", Things, latched=True)
 VERDICTS = Channel("/diagnostics", Verdicts)
+CHANGED: Final = "changed"
+"""Name of the part of a grid that is not as it was in the last whole one."""
 
 
 def grid_channel(robot: str) -> Channel:

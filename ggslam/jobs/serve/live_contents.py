@@ -12,11 +12,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.driving.robot import Robot
 from ggslam.jobs.serve.channels import (
     DEPTH,
     LENS,
@@ -35,12 +36,13 @@ from ggslam.jobs.serve.channels import (
     VERDICTS,
 )
 from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA, FramesTree, fixed_frames
+from ggslam.jobs.serve.keyframe_volumes import Floor, KeyframeVolumes, PlacedKeyframe, keyframes_now
+from ggslam.jobs.serve.live_volumes import GrowingVolumes
 from ggslam.jobs.serve.map_contents import MapContents, MapCopy
 from ggslam.jobs.serve.publishing import MapPublisher
-from ggslam.jobs.serve.seen_points import PointCloud, SeenImages, SeenPoints, saved_points
+from ggslam.jobs.serve.seen_points import PointCloud, SeenPoints, saved_points
 from ggslam.jobs.serve.things import MoversNow, growing_objects
 from ggslam.jobs.serve.tiles import TileTuning
-from ggslam.mapping.keyframe import Keyframe
 from ggslam.messages.contents import Lens, Path, Picture, Pose, Verdict, Verdicts
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cpu import CpuRasterizer
@@ -99,8 +101,8 @@ class _Snapshot:
     T_map_optical: np.ndarray | None
     stamp: float
     whole: bool
-    seen: list[SeenImages]
-    keyframes: dict[int, np.ndarray]
+    keyframes: list[PlacedKeyframe]
+    scale: float
     labels: np.ndarray | None
 
 
@@ -110,18 +112,23 @@ class LiveContents:
     Args:
         publisher: that takes the contents.
         names: of object ids, where known.
+        robots: by name, that grids are made for.
     """
 
-    def __init__(self, publisher: MapPublisher, names: Mapping[int, str] | None = None) -> None:
+    def __init__(
+        self, publisher: MapPublisher, names: Mapping[int, str] | None = None,
+        robots: Mapping[str, Robot] | None = None,
+    ) -> None:  # fmt: skip
         self._publisher, self._names = publisher, names or {}
+        self.volumes = GrowingVolumes(publisher, robots or {})
         self.tree = FramesTree()
         self._moves, self._unbroken = 0, False
         self._movers, self._has_movers = MoversNow(), False
-        self._map, self._seen, self._taken = MapContents(publisher), SeenPoints(), 0
+        self._map, self._seen = MapContents(publisher), SeenPoints()
         self._labels: np.ndarray | None = None
         self._rasterizer: CpuRasterizer | None = None
-        self._T_floor_map: np.ndarray | None = None
-        self._floor_due = True
+        self._floor: Floor | None = None
+        self._floor_due, self._corrections, self._scale = True, 0, 1.0
         self._picture_at = self._verdict_at = -1e9
         self._ready = threading.Event()
         self._ready.set()
@@ -223,6 +230,9 @@ class LiveContents:
     def _copy(self, slam: Slam, report: StepReport, T: np.ndarray | None, stamp: float) -> None:
         """Copies the map if the other thread is ready and anybody wants what is made of it."""
         heavy = self._map.is_wanted or any(self._publisher.is_wanted(c) for c in (OBJECTS, PATH, RENDERED))
+        if len(slam.corrections) > self._corrections:
+            self._corrections, self._floor_due = len(slam.corrections), True
+        heavy = heavy or self.volumes.is_wanted
         if not self._ready.is_set() or not slam.mapper.keyframes or not (heavy or self._floor_due):
             return
         self._ready.clear()
@@ -244,14 +254,12 @@ class LiveContents:
                 labels = slam.mapper.vote_labels()[:count]
                 ids[: len(labels)] = labels
         poses, stamps = _path_of(slam)
-        keyframes, seen = list(slam.mapper.keyframes), []
-        if self._wants_points:
-            seen, self._taken = [SeenImages.of_keyframe(k) for k in keyframes[self._taken :]], len(keyframes)
+        keyframes = keyframes_now(slam.mapper.keyframes) if self.volumes.is_wanted or self._wants_points else []
+        self._scale = slam.scale
         if slam.mapper.identity is not None:
             self._labels = slam.mapper.identity.current(np.arange(1 << 16, dtype=np.uint16))
         return _Snapshot(
-            copies, ids, poses, stamps, slam.camera, T, stamp, slam.pager is None, seen, _poses_of(keyframes),
-            self._labels,
+            copies, ids, poses, stamps, slam.camera, T, stamp, slam.pager is None, keyframes, slam.scale, self._labels
         )  # fmt: skip
 
     @property
@@ -292,20 +300,20 @@ class LiveContents:
             self._send_floor(s.gaussians, s.poses, s.stamp)
         if wanted(PATH) and len(s.poses):
             put(PATH, Path(MAP, s.poses @ T_OPTICAL_CAMERA, s.stamps), s.stamp)
-        for images in s.seen:
-            self._seen.add(images)
         if self._map.is_wanted:
-            surface = self._seen.cloud(s.keyframes, s.labels)
+            surface = self._seen.cloud(s.keyframes, s.labels) if s.keyframes else None
             self._map.show(MapCopy(s.gaussians, s.ids, surface, s.whole), s.stamp)
         if wanted(OBJECTS) and s.ids.any():
             solid = opacities_of(s.gaussians) >= TileTuning.min_opacity
             put(OBJECTS, growing_objects(s.gaussians.means.numpy()[solid], s.ids[solid], self._names), s.stamp)
         if wanted(RENDERED) and s.T_map_optical is not None:
             put(RENDERED, Picture(OPTICAL, self._render(s, s.T_map_optical)), s.stamp, keep=False)
+        self.volumes.show(s.keyframes, s.scale, self._floor, s.poses, s.stamp)
 
     def _send_floor(self, gaussians: GaussianTensors, poses: np.ndarray, stamp: float) -> None:
-        self._T_floor_map = floor_from_map(upright_of(gaussians, poses), poses)
-        self._publisher.put(TF_STATIC, fixed_frames(self._T_floor_map), stamp)
+        upright = upright_of(gaussians, poses)
+        self._floor = Floor(floor_from_map(upright, poses), upright.floor is not None)
+        self._publisher.put(TF_STATIC, fixed_frames(self._floor.T_floor_map), stamp)
 
     def _render(self, s: _Snapshot, T_map_optical: np.ndarray) -> np.ndarray:
         if self._rasterizer is None:  # kernels of one context take turns; the run must not wait for these
@@ -345,18 +353,16 @@ class LiveContents:
             ids = g.object_id.cpu().numpy().astype(np.uint16)
             surface = self._last_points(result, folder) if self._wants_points else None
             self._map.show(MapCopy(copies, ids, surface), stamp, final=True)
+        self.volumes.show(keyframes_now(result.keyframes), self._scale, self._floor, poses[known], stamp, final=True)
 
     def _last_points(self, result: SlamResult, folder: RunFolder | None) -> PointCloud:
         if folder is not None:
             return saved_points(folder)
-        for keyframe in result.keyframes[self._taken :]:
-            self._seen.add(SeenImages.of_keyframe(keyframe))
-        return self._seen.cloud(_poses_of(result.keyframes), self._labels)
+        return self._seen.cloud(keyframes_now(result.keyframes), self._labels)
 
-
-def _poses_of(keyframes: Iterable[Keyframe]) -> dict[int, np.ndarray]:
-    """T_world_camera [4, 4] of keyframes by number."""
-    return {keyframe.index: keyframe.T_world_camera for keyframe in keyframes}
+    def keyframe_volumes(self, result: SlamResult) -> KeyframeVolumes | None:
+        """Volumes of the finished run's keyframes; None: no floor is known, for there is no map."""
+        return None if self._floor is None else KeyframeVolumes(result.keyframes, self._scale, self._floor)
 
 
 def _path_of(slam: Slam) -> tuple[np.ndarray, np.ndarray]:

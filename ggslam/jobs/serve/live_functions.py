@@ -17,11 +17,12 @@ import torch
 from ggslam.errors import ConfigError, GgslamError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.trajectory import write_tum
-from ggslam.jobs.serve.channels import VERDICTS
+from ggslam.jobs.serve.channels import MAP, VERDICTS
+from ggslam.jobs.serve.live_volumes import GrowingVolumes
 from ggslam.jobs.serve.pausing import Pause
 from ggslam.jobs.serve.publishing import MapPublisher
-from ggslam.jobs.serve.run_functions import save_target, verdict_values
-from ggslam.jobs.serve.services import Function, flag_in, text_in
+from ggslam.jobs.serve.run_functions import distance_values, save_target, verdict_values
+from ggslam.jobs.serve.services import Function, choice_in, flag_in, points_in, text_in
 from ggslam.messages.contents import Verdicts
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.slam.result import tracked_poses
@@ -52,12 +53,14 @@ class LiveFunctions:
         self._frames, self._status, self._dropped, self._ended = 0, "", 0, False
         self.wants_reset = False
         """Whether somebody asked the run to end."""
+        self.distances: GrowingVolumes | None = None
+        """That `query_distance` asks."""
 
     def functions(self) -> dict[str, Function]:
         """By name."""
         return {
             "status": self.status, "verdicts": self.verdicts, "save_map": self.save_map, "pause": self.pause,
-            "reset": self.reset,
+            "reset": self.reset, "query_distance": self.query_distance,
         }  # fmt: skip
 
     # --- the thread of the run ---------------------------------------------------------------------------------------
@@ -113,6 +116,14 @@ class LiveFunctions:
         write_gaussian_ply(path, gaussians)
         write_tum(poses_path, stamps, poses)
         return {"path": str(path), "gaussians": len(gaussians), "frames": len(stamps)}
+
+    def query_distance(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Distances at points of the map's frame, as far as the map has grown; null where nothing is known."""
+        points = points_in(values, "points")
+        choice_in(values, "frame", (MAP,))
+        if self.distances is None:
+            raise ConfigError("there are no distances")
+        return distance_values(self.distances.query(points), np.eye(3), self.distances.most_m)
 
     def _ask(self, what: Callable[[Slam], None]) -> None:
         """Has something done between two frames, and waits for it."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from ggslam.driving.robot import Robot
 from ggslam.errors import GgslamError
 from ggslam.jobs.run.pipeline import RunOutcome
 from ggslam.jobs.serve.channels import (
@@ -54,7 +55,7 @@ LIVE: tuple[Channel, ...] = (
 )  # fmt: skip
 """Channels of a run that goes on."""
 AFTER: tuple[Channel, ...] = (CHANGES, DISTANCE, MESH)
-"""Channels that have something when it has ended, besides grids."""
+"""Channels that are made anew of what came out when it has ended, besides grids."""
 
 
 class LiveServingTuning(Tuning):
@@ -80,7 +81,9 @@ class LiveServing:
         self, publisher: MapPublisher, services: MapServices, functions: LiveFunctions, pause: Pause,
         request: ServeRequest, opened: ExitStack,
     ) -> None:  # fmt: skip
-        self.publisher, self.contents = publisher, LiveContents(publisher)
+        robots = {robot.name: robot for robot in parse_robots(request.robots)} or {"": Robot()}
+        self.publisher, self.contents = publisher, LiveContents(publisher, robots=robots)
+        functions.distances = self.contents.volumes
         opened.callback(self.contents.stop)
         self._services, self._functions, self._pause = services, functions, pause
         self._request, self._opened = request, opened
@@ -112,7 +115,7 @@ class LiveServing:
             record = folder.timing().model_copy(update={"publishing": self.publisher.record()})
             record.write(folder.path)
         if outcome.error is None and self.stays:
-            volumes = RunVolumes(folder, self._request.robots)
+            volumes = RunVolumes(folder, self._request.robots, self.contents.keyframe_volumes(outcome.result))
             self._opened.callback(volumes.close)
             try:
                 contents = RunContents(folder, volumes, self._request.changes)

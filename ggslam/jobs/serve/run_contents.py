@@ -14,6 +14,7 @@ from ggslam.errors import ConfigError, GgslamError
 from ggslam.jobs.changes.saved_changes import changes_of, read_changes, sentence_of
 from ggslam.jobs.serve.channels import (
     CAMERA,
+    CHANGED,
     CHANGES,
     DISTANCE,
     LENS,
@@ -34,6 +35,7 @@ from ggslam.jobs.serve.channels import (
     grid_channel,
 )
 from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA, fixed_frames
+from ggslam.jobs.serve.live_volumes import put_gone
 from ggslam.jobs.serve.map_contents import MapContents, MapCopy
 from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.run_volumes import RunVolumes
@@ -114,6 +116,7 @@ class RunContents:
                 self._points_and_splats(publisher, channel)
             elif channel.name in self.grids:
                 grid = self.volumes.grid(self.grids[channel.name])
+                publisher.forget(channel, CHANGED)  # of the run while it went on
                 publisher.put(channel, grid, self.stamp)
             elif maker := self._makers.get(channel.name):
                 maker(publisher, channel)
@@ -171,8 +174,12 @@ class RunContents:
         publisher.put(channel, self.verdicts(), self.stamp)
 
     def _mesh(self, publisher: MapPublisher, channel: Channel) -> None:
-        for part in self.volumes.mesh_parts():
+        before = {given.part for given in publisher.newest(channel)}  # of the run while it went on
+        parts = self.volumes.mesh_parts()
+        for part in parts:
             publisher.put(channel, part, self.stamp, part.part)
+        for name in before - {part.part for part in parts}:
+            put_gone(publisher, name, self.stamp)
 
     def _distance(self, publisher: MapPublisher, channel: Channel) -> None:
         publisher.put(channel, self.volumes.distance_slice(self.poses), self.stamp)

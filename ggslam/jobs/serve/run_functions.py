@@ -28,6 +28,7 @@ from ggslam.scene.poses import inverse, matrix_to_quaternion, transform_points
 from ggslam.system.images import decode_image
 from ggslam.system.tuning import Tuning
 from ggslam.system.untrusted_files import copy_untrusted_folder, is_plain_name
+from ggslam.volumes.esdf import FieldValues
 
 
 class LocalizeTuning(Tuning):
@@ -56,6 +57,15 @@ def save_target(beside: Path, values: Mapping[str, Any]) -> Path:
 def verdict_values(verdicts: Verdicts) -> list[dict[str, Any]]:
     """For JSON."""
     return [{"name": v.name, "level": v.level, "text": v.text, "values": v.values} for v in verdicts.verdicts]
+
+
+def distance_values(found: FieldValues, R_map_frame: np.ndarray, most_m: float) -> dict[str, Any]:
+    """For JSON: distances with gradients in a frame whose axes in the map's are R_map_frame [3, 3]."""
+    return {
+        "distance": [float(d) if known else None for d, known in zip(found.distance, found.known, strict=True)],
+        "gradient": (found.gradient @ R_map_frame).astype(float).tolist(), "known": found.known.tolist(),
+        "most_m": most_m,
+    }  # fmt: skip
 
 
 class RunFunctions:
@@ -114,12 +124,7 @@ class RunFunctions:
         if frame == FLOOR:
             T_map_frame = inverse(self._volumes.floor())
         found = field.query(transform_points(points, T_map_frame))
-        gradient = found.gradient @ T_map_frame[:3, :3]
-        return {
-            "distance": [float(d) if known else None for d, known in zip(found.distance, found.known, strict=True)],
-            "gradient": gradient.astype(float).tolist(), "known": found.known.tolist(),
-            "most_m": field.settings.max_distance,
-        }  # fmt: skip
+        return distance_values(found, T_map_frame[:3, :3], field.settings.max_distance)
 
     def plan(self, values: dict[str, Any]) -> dict[str, Any]:
         """A path on the floor."""

@@ -12,47 +12,33 @@ from pathlib import Path
 
 import numpy as np
 
-from ggslam.driving.bands import HeightLayers, floor_plane
 from ggslam.driving.robot import Robot
-from ggslam.errors import ConfigError
+from ggslam.errors import ConfigError, GgslamError
 from ggslam.jobs.plan.map_files import TSDF, floor_beside
 from ggslam.jobs.plan.ros_maps import RosMap, read_ros_map
-from ggslam.jobs.serve.channels import FLOOR, MAP
-from ggslam.jobs.serve.tiles import TileTuning, rows_by_key
+from ggslam.jobs.serve.channels import FLOOR
+from ggslam.jobs.serve.keyframe_volumes import KeyframeVolumes
+from ggslam.jobs.serve.volume_contents import (
+    RunVolumesTuning,
+    grid_of,
+    layers_of,
+    mesh_parts_of_tile,
+    published_mesh,
+    slice_of,
+    tiles_of_mesh,
+)
 from ggslam.jobs.volumes.fuse_volumes import fuse_volumes
-from ggslam.jobs.volumes.robot_maps import FloorMapTuning, parse_robots
+from ggslam.jobs.volumes.robot_maps import parse_robots
 from ggslam.messages.contents import Grid, Mesh, Points
 from ggslam.rendering.types import Gaussians
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.poses import translation
-from ggslam.system.tuning import Tuning
-from ggslam.volumes.cell_grid import CellGrid
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import floor_from_map
 from ggslam.volumes.map_upright import upright_of
-from ggslam.volumes.mesh import Mesh as SurfaceMesh
-from ggslam.volumes.mesh import extract_mesh
-from ggslam.volumes.slices import plane_at_height, slice_field
 from ggslam.volumes.tsdf_file import load_tsdf
 
 VOLUMES = "volumes"
-
-
-class RunVolumesTuning(Tuning):
-    """How volumes are published."""
-
-    min_piece_triangles = 50
-    """Pieces of the mesh with fewer triangles are left out."""
-    most_triangles = 150_000
-    """Most triangles of the mesh, whose vertices are united in larger cells until it has no more."""
-    part_triangles = 5000
-    """Most triangles of one message."""
-    slice_points = 30_000
-    """Most points of a slice through the distance field."""
-    most_cells = 4_000_000
-    """Most cells of a grid."""
-    close_s = 1.0
-    """Longest wait for volumes that are being made."""
 
 
 class RunVolumes:
@@ -61,13 +47,16 @@ class RunVolumes:
     Args:
         folder: the run.
         robots: that grids are made for, as `driving.robot.parse_robot` reads them, besides those that files are of.
+        keyframes: of the run, which volumes are made of where it has no recording; None: none are.
 
     Raises:
         ConfigError: a text is none of a robot's.
     """
 
-    def __init__(self, folder: RunFolder, robots: Sequence[str] = ()) -> None:
-        self._folder = folder
+    def __init__(
+        self, folder: RunFolder, robots: Sequence[str] = (), keyframes: KeyframeVolumes | None = None
+    ) -> None:
+        self._folder, self._keyframes = folder, keyframes
         self._robots = {robot.name: robot for robot in parse_robots(robots)}
         self._lock = threading.RLock()
         self._made: tempfile.TemporaryDirectory[str] | None = None
@@ -84,12 +73,21 @@ class RunVolumes:
             return there
         with self._lock:
             if self._made is None:
-                if not self._folder.has_recording:
-                    raise ConfigError(f"{self._folder.path}: has no recording that volumes could be made of")
                 made = tempfile.TemporaryDirectory(prefix="ggslam-")
-                fuse_volumes(self._folder.path, Path(made.name) / VOLUMES, esdf=True, objects=False)
+                self._make(Path(made.name) / VOLUMES)
                 self._made = made
             return Path(self._made.name) / VOLUMES
+
+    def _make(self, place: Path) -> None:
+        """Of the recording; where there is none, of the keyframes."""
+        try:
+            if not self._folder.has_recording:
+                raise ConfigError(f"{self._folder.path}: has no recording that volumes could be made of")
+            fuse_volumes(self._folder.path, place, esdf=True, objects=False)
+        except GgslamError:
+            if self._keyframes is None:
+                raise
+            self._keyframes.write(place)
 
     def field(self) -> DistanceField:
         """The distance field, up to date.
@@ -137,13 +135,8 @@ class RunVolumes:
         with self._lock:
             field = self.field()
             T, seen = floor_beside(self.place() / TSDF)
-            plane = floor_plane(field, np.eye(4) if T is None else T)
-            area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
-            cell = max(FloorMapTuning.cell_m, field.voxel, math.sqrt(area / RunVolumesTuning.most_cells))
-            band = HeightLayers(field, plane, cell, seen).band(self._robots.get(name, Robot()))
-        cells = np.where(band.occupied, 100, np.where(band.free, 0, -1)).astype(np.int8)[::-1]
-        x, y = band.plane.low
-        return Grid(FLOOR, translation(np.array([x, y, 0.0])), band.resolution, np.ascontiguousarray(cells))
+            layers = layers_of(field, np.eye(4) if T is None else T, seen)
+            return grid_of(layers, self._robots.get(name, Robot()))
 
     def mesh_parts(self) -> list[Mesh]:
         """The surface in parts, in the map's frame.
@@ -152,18 +145,9 @@ class RunVolumes:
             GgslamError: as of `place`, or the file is damaged.
         """
         with self._lock:
-            field = self.field()
-            mesh = extract_mesh(field.tsdf, min_triangles=RunVolumesTuning.min_piece_triangles)
-        cell = field.voxel
-        while len(mesh.triangles) > RunVolumesTuning.most_triangles:
-            cell *= 2
-            mesh = _coarser(mesh, cell)
-        middles = mesh.vertices[mesh.triangles].mean(axis=1)
-        made = []
-        for tile, rows in sorted(rows_by_key(np.floor(middles / TileTuning.edge_m).astype(np.int64)).items()):
-            name, count = ",".join(map(str, tile)), -(-len(rows) // RunVolumesTuning.part_triangles)
-            made += [_part(mesh, piece, f"{name}/{k}") for k, piece in enumerate(np.array_split(rows, count))]
-        return made
+            mesh = published_mesh(self.field().tsdf)
+        tiles = sorted(tiles_of_mesh(mesh).items())
+        return [part for tile, rows in tiles for part in mesh_parts_of_tile(mesh, tile, rows)]
 
     def distance_slice(self, poses: np.ndarray) -> Points:
         """The distance field at the height of the cameras T_map_camera [N, 4, 4]: where it is known, with `distance`
@@ -175,14 +159,7 @@ class RunVolumes:
         with self._lock:
             field = self.field()
             T, _ = floor_beside(self.place() / TSDF)
-            up = (np.eye(4) if T is None else T)[2, :3]
-            height = float(np.median((poses[:, :3, 3] - field.origin) @ up))
-            plane = plane_at_height(field, up, height)
-            area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
-            cell = max(FloorMapTuning.cell_m, math.sqrt(area / RunVolumesTuning.slice_points))
-            cut = slice_field(field, plane, cell)
-        places = CellGrid.over(plane, cell).places()
-        return Points(MAP, places[cut.known].astype(np.float32), None, {"distance": cut.distance[cut.known]})
+            return slice_of(field, (np.eye(4) if T is None else T)[2, :3], poses)
 
     def close(self) -> None:
         """Removes what was made; what is being made goes when the program ends."""
@@ -195,28 +172,6 @@ class RunVolumes:
                 self._made = None
         finally:
             self._lock.release()
-
-
-def _coarser(mesh: SurfaceMesh, cell: float) -> SurfaceMesh:
-    """The vertices of each cell as one, in their middle, and the triangles that are left."""
-    _, first, owner, count = np.unique(
-        np.floor(mesh.vertices / cell).astype(np.int64), axis=0, return_index=True, return_inverse=True,
-        return_counts=True,
-    )  # fmt: skip
-    owner = owner.reshape(-1)
-    sums = [np.bincount(owner, mesh.vertices[:, axis], len(first)) for axis in range(3)]
-    vertices = (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
-    triangles = owner[mesh.triangles].astype(np.int32)
-    a, b, c = triangles.T
-    kept = np.unique(triangles[(a != b) & (b != c) & (a != c)], axis=0)
-    return SurfaceMesh(vertices, mesh.normals[first], mesh.colors[first], mesh.labels[first], kept)
-
-
-def _part(mesh: SurfaceMesh, rows: np.ndarray, name: str) -> Mesh:
-    """Some triangles [N] and their vertices."""
-    used, triangles = np.unique(mesh.triangles[rows], return_inverse=True)
-    shape = triangles.reshape(-1, 3).astype(np.int32)
-    return Mesh(MAP, mesh.vertices[used].astype(np.float32), shape, mesh.colors[used], name)
 
 
 def _grid_of_file(found: RosMap) -> Grid:

@@ -7,17 +7,17 @@ and stand where its pose stands.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ggslam.jobs.serve.keyframe_volumes import PlacedKeyframe
 from ggslam.jobs.serve.tiles import TileTuning, thin_points
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.opened_points import surface_points
-from ggslam.scene.camera import Camera
-from ggslam.scene.poses import transform_points
+from ggslam.scene.poses import inverse, transform_points
 from ggslam.system.tuning import Tuning
 
 
@@ -39,43 +39,23 @@ class PointCloud:
     ids: np.ndarray
 
 
-@dataclass(frozen=True)
-class SeenImages:
-    """What a keyframe holds, as references: nothing of it is changed any more."""
-
-    number: int
-    camera: Camera
-    color: np.ndarray
-    depth: np.ndarray
-    depth_unit: float
-    mask: np.ndarray | None
-    moving: np.ndarray | None
-
-    @staticmethod
-    def of_keyframe(keyframe: Keyframe) -> SeenImages:
-        """Of a keyframe, read from where it was put away."""
-        k = keyframe
-        return SeenImages(k.index, k.camera, k.color, k.depth, k.depth_unit, k.mask, k.moving)
-
-
 class SeenPoints:
-    """Gathers keyframes. Not for several threads at a time."""
+    """Gathers keyframes' points. Not for several threads at a time."""
 
     def __init__(self) -> None:
         self._parts: dict[int, PointCloud] = {}
 
-    def add(self, images: SeenImages) -> None:
-        """Thins a keyframe's points."""
-        self._parts[images.number] = points_in_camera(images)
-
-    def cloud(self, poses: Mapping[int, np.ndarray], ids: np.ndarray | None) -> PointCloud:
-        """All points where their keyframes are.
+    def cloud(self, views: Sequence[PlacedKeyframe], ids: np.ndarray | None) -> PointCloud:
+        """The points of keyframes, where these are.
 
         Args:
-            poses: T_world_camera float64 [4, 4] by number; keyframes that are not among them are left out.
+            views: the keyframes.
             ids: uint16 [65536], object of each id of the masks; None: there are no objects.
         """
-        parts = [(part, poses[number]) for number, part in self._parts.items() if number in poses]
+        for view in views:
+            if view.keyframe.index not in self._parts:
+                self._parts[view.keyframe.index] = points_in_camera(view.keyframe)
+        parts = [(self._parts[view.keyframe.index], inverse(view.T_camera_world)) for view in views]
         xyz = [transform_points(part.xyz, T).astype(np.float32) for part, T in parts]
         labels = np.concatenate([np.zeros(0, np.uint16), *(part.ids for part, _ in parts)])
         labels = np.zeros_like(labels) if ids is None else ids[labels]
@@ -90,7 +70,7 @@ def saved_points(folder: RunFolder) -> PointCloud:
     return PointCloud(found.points.astype(np.float32), found.colors, ids)
 
 
-def points_in_camera(images: SeenImages) -> PointCloud:
+def points_in_camera(images: Keyframe) -> PointCloud:
     """A keyframe's points in its camera's frame, one for each cell of `TileTuning.point_m` that it sees."""
     step = max(1, -(-max(images.depth.shape) // SeenPointsTuning.columns))
     depth = images.depth.astype(np.float32) * np.float32(images.depth_unit)

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from ggslam.jobs.serve.channels import Flow, flow_of
-from ggslam.messages.contents import Channel, Content
+from ggslam.jobs.serve.channels import CHANGED, Flow, flow_of
+from ggslam.messages.contents import Channel, Content, Grid
 from ggslam.messages.outlet import Outlet
 from ggslam.system.tuning import Tuning
 
@@ -158,6 +158,8 @@ class OutletSender:
     def _queue(self, given: Given) -> None:
         """Notes what is to be sent; the lock is held."""
         flow, key = flow_of(given.channel), (given.channel.name, given.part)
+        if isinstance(given.content, Grid) and given.content.at is None:  # none of the one before waits on
+            self._waiting[flow].pop((given.channel.name, CHANGED), None)
         queue = self._waiting[flow].setdefault(key, deque())
         if any(one is given for one in queue):
             return
