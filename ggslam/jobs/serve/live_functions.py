@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ggslam.errors import ConfigError, GgslamError
+from ggslam.errors import ConfigError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
 from ggslam.formats.trajectory import write_tum
 from ggslam.jobs.serve.channels import MAP, VERDICTS
@@ -36,6 +36,8 @@ class LiveFunctionTuning(Tuning):
 
     copy_s = 20.0
     """Seconds in which the run has to give a copy of its map: it does so between two frames."""
+    copies = 20
+    """Times that a map is copied that another thread adds to meanwhile."""
 
 
 class LiveFunctions:
@@ -127,12 +129,12 @@ class LiveFunctions:
 
     def _ask(self, what: Callable[[Slam], None]) -> None:
         """Has something done between two frames, and waits for it."""
-        done, failures = threading.Event(), list[GgslamError]()
+        done, failures = threading.Event(), list[Exception]()
 
         def act(slam: Slam) -> None:
             try:
                 what(slam)
-            except GgslamError as error:
+            except Exception as error:  # it is the caller's, and the run goes on
                 failures.append(error)
             finally:
                 done.set()
@@ -144,12 +146,25 @@ class LiveFunctions:
             raise failures[0]
 
 
+def _map_copy(slam: Slam) -> GaussianMap:
+    """The map on the CPU. In real time the mapper's thread adds Gaussians meanwhile: then the copy is made again."""
+    for _ in range(LiveFunctionTuning.copies):
+        count = len(slam.map)
+        try:
+            with slam.mapper.in_turn(), torch.no_grad():
+                copy = slam.map.copy("cpu")
+        except RuntimeError:  # arrays of two lengths
+            continue
+        if len(copy) == count == len(slam.map):
+            return copy
+    raise ConfigError("the map changes faster than it can be copied; ask again")
+
+
 def _copy_of(slam: Slam) -> tuple[GaussianMap, np.ndarray, np.ndarray]:
     """The map on the CPU; times [N] and poses [N, 4, 4] of the frames."""
     if slam.pager is not None:
         raise ConfigError("memory_limit_mb: parts of the map are on disk; it can be saved at the end only")
-    with slam.mapper.in_turn(), torch.no_grad():
-        gaussians = slam.map.copy("cpu")
+    gaussians = _map_copy(slam)
     keyframes = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
     stamps = np.array([frame.timestamp for frame in slam.frames])
     return gaussians, stamps, tracked_poses(slam.frames, keyframes)
