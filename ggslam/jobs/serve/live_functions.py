@@ -102,9 +102,10 @@ class LiveFunctions:
 
     def reset(self, values: dict[str, Any]) -> dict[str, Any]:
         """Ends the run as Ctrl-C does. A fresh map is another run."""
-        self.wants_reset = True
         self._pause.switch(False)
-        os.kill(os.getpid(), signal.SIGINT)
+        if not self.wants_reset:  # a second Ctrl-C would cut the end short
+            self.wants_reset = True
+            os.kill(os.getpid(), signal.SIGINT)
         return {"ends": True}
 
     def save_map(self, values: dict[str, Any]) -> dict[str, Any]:

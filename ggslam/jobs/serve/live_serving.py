@@ -93,7 +93,8 @@ class LiveServing:
     @property
     def stays(self) -> bool:
         """Whether the run is shown until Ctrl-C when it is done: not if it goes to files only, or was reset."""
-        return not self._functions.wants_reset and not all(sender.is_file for sender in self.publisher.senders)
+        only_files = self._request.port is None and all(sender.is_file for sender in self.publisher.senders)
+        return not self._functions.wants_reset and not only_files
 
     def follow(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         """After a frame, in the thread that tracks."""
