@@ -81,7 +81,7 @@ class Killed:
         taken: of these by the run, at the least: frames taken later than it began to send.
         topics: that the second subscriber was told something on.
         trees: of frames that it was told.
-        status: of the run, which ends by Ctrl-C: 130 if it could end as it should.
+        status: of the run.
     """
 
     frames: int
@@ -111,7 +111,9 @@ def kill_by_turns(middleware: str, recording: Path, seconds: float, folder: Path
         second.wait_for("topic /tf", 60)
         time.sleep(seconds)
         player.interrupt(20)
-        status = run.interrupt(300)  # as Ctrl-C while it waits for more frames
+        run.process.send_signal(signal.SIGINT)  # while it waits for more frames: it ends as if there were no more
+        run.wait_for(SERVED, 300)
+        status = run.interrupt(60)
         second.finish(60)
     topics = [topic for topic, *_ in read_recorded(told)]
     taken = int((RunFolder.open(out).trajectory().timestamps > again).sum())
