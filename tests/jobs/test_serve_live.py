@@ -69,8 +69,8 @@ def test_a_forced_correction_moves_odom_and_not_the_camera_in_it(room: Path, tmp
     trees = [kept.content for kept in outlet.sent if kept.channel == c.TF]
     publisher.close()
     assert len(trees) == 25  # one a frame, and as it came out
-    stamps = [round(1e9 * kept.stamp) for kept in outlet.sent if kept.channel == c.TF]
-    assert stamps == sorted(set(stamps))  # of two of one time, tf2 may keep the first
+    stamps, of_poses = ([round(1e9 * kept.stamp) for kept in outlet.sent if kept.channel == x] for x in (c.TF, c.POSE))
+    assert stamps == of_poses == sorted(set(stamps))  # of two of one time, tf2 may keep the first
     odom = [chain(tree, c.ODOM, c.CAMERA) for tree in trees[:24]]
     tracked = [MOVE @ T if k <= 12 else T for k, T in enumerate(tracked)]
     for k in range(1, 24):

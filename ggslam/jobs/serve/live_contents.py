@@ -86,7 +86,8 @@ class LiveContentsTuning(Tuning):
     floor_keyframes = 5
     """Keyframes from which the floor is looked for."""
     end_after_s = 1e-6
-    """Seconds after the last frame at which the tree as it came out is stamped: tf2 may keep the first of one time."""
+    """Seconds after the last frame at which tree and pose as they came out are stamped: of two of one time, tf2
+    may keep the first."""
 
 
 @dataclass
@@ -343,7 +344,7 @@ class LiveContents:
         self.tree.correct(poses[known][-1])
         put = self._publisher.put
         put(TF, self.tree.transforms, stamp + LiveContentsTuning.end_after_s)
-        put(POSE, Pose(MAP, poses[known][-1] @ T_OPTICAL_CAMERA), stamp)
+        put(POSE, Pose(MAP, poses[known][-1] @ T_OPTICAL_CAMERA), stamp + LiveContentsTuning.end_after_s)
         put(PATH, Path(MAP, poses[known] @ T_OPTICAL_CAMERA, stamps[known]), stamp)
         if len(result.gaussians):
             g = result.gaussians
