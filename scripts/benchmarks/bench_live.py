@@ -200,7 +200,7 @@ def show_live(parts: list[str], frames: int, quick: bool, stall: list[str]) -> N
             print(f"\na generated recording, {'x'.join(size)}, at 30 Hz into a run in real time", flush=True)
             show_runs({name: play_into_run(name, recording, frames, folder / name, more) for name in some})
         if "stalls" in parts:
-            place, words = (recording, more) if quick else (Path(stall[0]), stall[1:])
+            place, words = (recording, [*more, "--stop", "12"]) if quick else (Path(stall[0]), stall[1:])
             show_stalls(place, words, some, 1 if quick else 3, folder / "stalls")
         if "kills" in parts:
             show_kills(some, recording, 1.0 if quick else 5.0, folder / "kills")
@@ -216,7 +216,7 @@ def main() -> None:
                         "default: redkitchen of GGSLAM_DATA --scale .5 --stop 45")  # fmt: skip
     parser.add_argument("--sender", nargs=3, metavar=("CARRIER", "PLACE", "PROFILE"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    frames = arguments.frames or (30 if arguments.quick else 1000)
+    frames = arguments.frames or (20 if arguments.quick else 1000)
     if arguments.sender:
         carrier, place, profile = arguments.sender
         send_frames(carrier, int(place), profile, frames, arguments.rate)
