@@ -143,8 +143,8 @@ class LivePlace:
         return self._start("-m", "ggslam", "run", str(recording), "--out", str(out), *self._network(1), *words)
 
     def listen(self, path: Path) -> Said:
-        """Somebody who keeps all that is published in a file, and is ready. Runs find it, not it them: a run that begins
-        later has it from its first frame on, where it would look for the run every few seconds only."""
+        """Somebody who keeps all that is published in a file, and is ready. Runs connect to it: a run that begins later
+        has it from its first frame on, where it would look for the run every few seconds only."""
         domain = str(self.domain)
         recorder = self._start(str(RECORDER), self.middleware, self._address(1, True), domain, str(path))
         recorder.wait_for("ready", 60)
