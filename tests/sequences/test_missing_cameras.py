@@ -188,7 +188,7 @@ def test_depth_beside_a_camera_that_a_user_tells(tmp_path: Path, monkeypatch: py
     """The bag's own calibration of depth, and /tf_static, bring depth to the user's colour camera."""
     path = write_bag(tmp_path / "walk.bag", False, registered=False)
     before = open_sequence(path).frame(0).depth
-    monkeypatch.setattr("ggslam.sequences.formats.ros_topics._info", lambda bag, topic: _only_depth(topic))
+    monkeypatch.setattr("ggslam.sequences.formats.ros_topics.info_above", lambda topic, types: _only_depth(topic))
     sequence = open_sequence(path, intrinsics="30 31 15 11")
     assert sequence.registered and np.array_equal(sequence.frame(0).depth, before)
 
