@@ -12,7 +12,8 @@ from typing import Any, cast
 import pytest
 
 from ggslam.errors import ConfigError
-from ggslam.jobs.serve.live_functions import LiveFunctions, LiveFunctionTuning, _map_copy
+from ggslam.jobs.serve.live_functions import LiveFunctions
+from ggslam.slam.map_copy import MapCopyTuning, whole_map
 from ggslam.slam.slam import Slam
 
 
@@ -40,10 +41,10 @@ def slam_of(times: int) -> Slam:
 
 
 def test_a_copy_is_whole() -> None:
-    copy: Any = _map_copy(slam_of(5))
+    copy: Any = whole_map(slam_of(5))
     assert copy == list(range(15))
     with pytest.raises(ConfigError, match="ask again"):
-        _map_copy(slam_of(LiveFunctionTuning.copies + 1))
+        whole_map(slam_of(MapCopyTuning.tries + 1))
 
 
 def test_a_question_that_fails_is_the_callers_and_the_run_goes_on() -> None:

@@ -99,5 +99,5 @@ def test_contents_of_tiles() -> None:
 
 
 def test_a_map_without_surfaces_has_no_objects() -> None:
-    nothing = growing_objects(np.zeros((0, 3), np.float32), np.zeros(0, np.uint16), {})
-    assert nothing.things == () and growing_objects(MEANS, IDS, {}).things == ()
+    nothing = growing_objects(np.zeros((0, 3), np.float32), np.zeros(0, np.uint16))
+    assert nothing.things == () and growing_objects(MEANS, IDS).things == ()

@@ -52,6 +52,7 @@ from ggslam.runs.folder import RunFolder
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
+from ggslam.slam.map_copy import shown_gaussians
 from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.slam import Slam
 from ggslam.system.plurals import quantity
@@ -112,15 +113,11 @@ class LiveContents:
 
     Args:
         publisher: that takes the contents.
-        names: of object ids, where known.
         robots: by name, that grids are made for.
     """
 
-    def __init__(
-        self, publisher: MapPublisher, names: Mapping[int, str] | None = None,
-        robots: Mapping[str, Robot] | None = None,
-    ) -> None:  # fmt: skip
-        self._publisher, self._names = publisher, names or {}
+    def __init__(self, publisher: MapPublisher, robots: Mapping[str, Robot] | None = None) -> None:
+        self._publisher = publisher
         self.volumes = GrowingVolumes(publisher, robots or {})
         self.tree = FramesTree()
         self._moves, self._unbroken = 0, False
@@ -244,16 +241,12 @@ class LiveContents:
             self._given.notify()
 
     def _snapshot_of(self, slam: Slam, T: np.ndarray | None, stamp: float) -> _Snapshot:
-        """In real time another thread trains the map meanwhile: rows of one copy may then be of different steps."""
-        g = slam.map
-        views = [g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh[:, :1], g.features[:, :0]]
-        count = min(len(view) for view in views)
-        with slam.mapper.in_turn():
-            copies = GaussianTensors(*(view[:count].to("cpu", copy=True) for view in views))
-            ids = np.zeros(count, np.uint16)
-            if self._publisher.is_wanted(OBJECTS) and slam.mapper.identity is not None:
-                labels = slam.mapper.vote_labels()[:count]
-                ids[: len(labels)] = labels
+        copies = shown_gaussians(slam, harmonics=1)
+        ids = np.zeros(len(copies.means), np.uint16)
+        if self._publisher.is_wanted(OBJECTS) and slam.mapper.identity is not None:
+            with slam.mapper.in_turn():
+                labels = slam.mapper.vote_labels()[: len(ids)]
+            ids[: len(labels)] = labels
         poses, stamps = _path_of(slam)
         keyframes = keyframes_now(slam.mapper.keyframes) if self.volumes.is_wanted or self._wants_points else []
         self._scale = slam.scale
@@ -306,7 +299,7 @@ class LiveContents:
             self._map.show(MapCopy(s.gaussians, s.ids, surface, s.whole), s.stamp)
         if wanted(OBJECTS) and s.ids.any():
             solid = opacities_of(s.gaussians) >= TileTuning.min_opacity
-            put(OBJECTS, growing_objects(s.gaussians.means.numpy()[solid], s.ids[solid], self._names), s.stamp)
+            put(OBJECTS, growing_objects(s.gaussians.means.numpy()[solid], s.ids[solid]), s.stamp)
         if wanted(RENDERED) and s.T_map_optical is not None:
             put(RENDERED, Picture(OPTICAL, self._render(s, s.T_map_optical)), s.stamp, keep=False)
         self.volumes.show(s.keyframes, s.scale, self._floor, s.poses, s.stamp)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ggslam.errors import ConfigError
 from ggslam.formats.gaussian_ply import write_gaussian_ply
@@ -25,6 +24,7 @@ from ggslam.jobs.serve.run_functions import distance_values, save_target, verdic
 from ggslam.jobs.serve.services import Function, choice_in, flag_in, points_in, text_in
 from ggslam.messages.contents import Verdicts
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.slam.map_copy import whole_map
 from ggslam.slam.result import tracked_poses
 from ggslam.slam.slam import Slam
 from ggslam.system.atomic import make_folder
@@ -36,8 +36,6 @@ class LiveFunctionTuning(Tuning):
 
     copy_s = 20.0
     """Seconds in which the run has to give a copy of its map: it does so between two frames."""
-    copies = 20
-    """Times that a map is copied that another thread adds to meanwhile."""
 
 
 class LiveFunctions:
@@ -111,7 +109,7 @@ class LiveFunctions:
     def save_map(self, values: dict[str, Any]) -> dict[str, Any]:
         """Writes the map as it is now as NAME.ply, and NAME.txt with the poses."""
         name = text_in(values, "name")
-        path, poses_path = (save_target(self._beside, {"name": f"{name}{end}"}) for end in (".ply", ".txt"))
+        path, poses_path = (save_target(self._beside, f"{name}{end}") for end in (".ply", ".txt"))
         copies: list[tuple[GaussianMap, np.ndarray, np.ndarray]] = []
         self._ask(lambda slam: copies.append(_copy_of(slam)))
         gaussians, stamps, poses = copies[0]
@@ -147,25 +145,11 @@ class LiveFunctions:
             raise failures[0]
 
 
-def _map_copy(slam: Slam) -> GaussianMap:
-    """The map on the CPU. In real time the mapper's thread adds Gaussians meanwhile: then the copy is made again."""
-    for _ in range(LiveFunctionTuning.copies):
-        count = len(slam.map)
-        try:
-            with slam.mapper.in_turn(), torch.no_grad():
-                copy = slam.map.copy("cpu")
-        except RuntimeError:  # arrays of two lengths
-            continue
-        if len(copy) == count == len(slam.map):
-            return copy
-    raise ConfigError("the map changes faster than it can be copied; ask again")
-
-
 def _copy_of(slam: Slam) -> tuple[GaussianMap, np.ndarray, np.ndarray]:
     """The map on the CPU; times [N] and poses [N, 4, 4] of the frames."""
     if slam.pager is not None:
         raise ConfigError("memory_limit_mb: parts of the map are on disk; it can be saved at the end only")
-    gaussians = _map_copy(slam)
+    gaussians = whole_map(slam)
     keyframes = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
     stamps = np.array([frame.timestamp for frame in slam.frames])
     return gaussians, stamps, tracked_poses(slam.frames, keyframes)

@@ -81,8 +81,7 @@ class LiveServing:
         self, publisher: MapPublisher, services: MapServices, functions: LiveFunctions, pause: Pause,
         request: ServeRequest, opened: ExitStack,
     ) -> None:  # fmt: skip
-        robots = {robot.name: robot for robot in parse_robots(request.robots)} or {"": Robot()}
-        self.publisher, self.contents = publisher, LiveContents(publisher, robots=robots)
+        self.publisher, self.contents = publisher, LiveContents(publisher, _robots_of(request))
         functions.distances = self.contents.volumes
         opened.callback(self.contents.stop)
         self._services, self._functions, self._pause = services, functions, pause
@@ -141,7 +140,7 @@ def serve_live(request: ServeRequest, beside: Path) -> Iterator[LiveServing]:
     """
     with ExitStack() as opened:
         outlets = opened.enter_context(open_outlets(request.publish))
-        channels = (*LIVE, *(grid_channel(name) for name in robot_names(request)), *AFTER)
+        channels = (*LIVE, *(grid_channel(name) for name in _robots_of(request)), *AFTER)
         publisher = MapPublisher(outlets.outlets, channels)
         opened.callback(publisher.close)
         pause = Pause()
@@ -154,6 +153,6 @@ def serve_live(request: ServeRequest, beside: Path) -> Iterator[LiveServing]:
         yield live
 
 
-def robot_names(request: ServeRequest) -> list[str]:
-    """Of the grids that there will be."""
-    return [robot.name for robot in parse_robots(request.robots)] or [""]
+def _robots_of(request: ServeRequest) -> dict[str, Robot]:
+    """By name, that there are grids for; "" is any robot's if none is named."""
+    return {robot.name: robot for robot in parse_robots(request.robots)} or {"": Robot()}

@@ -88,22 +88,21 @@ class MapContents:
             harmonics: most coefficients of a splat's colour.
             only: channels that are looked at.
         """
-        g = shown.gaussians
-        surface = opacities_of(g) >= TileTuning.min_opacity
-        means, rgb = g.means.numpy(), colors_to_uint8(0.5 + SH_C0 * g.sh.numpy()[:, 0])
-        solid = means[surface], rgb[surface], shown.ids[surface]
-        seen = solid if shown.surface is None else (shown.surface.xyz, shown.surface.rgb, shown.surface.ids)
         wanted = [c for c in (POINT_TILES, SPLAT_TILES) if c in only and self._publisher.is_wanted(c)]
-        if POINT_TILES in wanted:
-            self._point_tiles(shown, thin_points(*seen), stamp, final)
-        if SPLAT_TILES in wanted:
-            self._splat_tiles(shown, thin_points(*solid), stamp, final, harmonics)
-        if POINTS in only and self._is_due(POINTS, final):
+        due = [c for c in (POINTS, SPLATS) if c in only and self._is_due(c, final)]
+        solid = _solid_gaussians(shown) if SPLAT_TILES in wanted or shown.surface is None else None
+        seen = shown.surface or solid
+        if POINT_TILES in wanted and seen is not None:
+            self._point_tiles(shown, thin_points(seen.xyz, seen.rgb, seen.ids), stamp, final)
+        if SPLAT_TILES in wanted and solid is not None:
+            self._splat_tiles(shown, thin_points(solid.xyz, solid.rgb, solid.ids), stamp, final, harmonics)
+        if POINTS in due and seen is not None:
             self._whole_at[POINTS.name] = time.monotonic()
-            self._publisher.put(POINTS, points_of(at_most(*seen, TileTuning.max_points)), stamp)
-        if SPLATS in only and self._is_due(SPLATS, final):
+            thin = at_most(seen.xyz, seen.rgb, seen.ids, TileTuning.max_points)
+            self._publisher.put(POINTS, points_of(thin), stamp)
+        if SPLATS in due:
             self._whole_at[SPLATS.name] = time.monotonic()
-            rows = most_visible(g, MapContentsTuning.max_splats)
+            rows = most_visible(shown.gaussians, MapContentsTuning.max_splats)
             self._publisher.put(SPLATS, splats_of(shown, rows, harmonics), stamp)
 
     def _is_due(self, channel: Channel, final: bool = False) -> bool:
@@ -134,6 +133,14 @@ class MapContents:
     def _send_empty(self, channel: Channel, tile: Tile, empty: Points | Splats, stamp: float) -> None:
         self._publisher.put(channel, empty, stamp, part_name(tile), keep=False)
         self._publisher.forget(channel, part_name(tile))
+
+
+def _solid_gaussians(shown: MapCopy) -> PointCloud:
+    """The middles of those that belong to surfaces."""
+    g = shown.gaussians
+    solid = opacities_of(g) >= TileTuning.min_opacity
+    rgb = colors_to_uint8(0.5 + SH_C0 * g.sh.numpy()[solid, 0])
+    return PointCloud(g.means.numpy()[solid], rgb, shown.ids[solid])
 
 
 def part_name(tile: Tile) -> str:

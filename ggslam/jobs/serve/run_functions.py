@@ -40,13 +40,12 @@ class LocalizeTuning(Tuning):
     """Units of a depth image per metre, unless it is told."""
 
 
-def save_target(beside: Path, values: Mapping[str, Any]) -> Path:
-    """Where a map of the asked `name` is saved: a new folder or file in `beside`, whatever is asked.
+def save_target(beside: Path, name: str) -> Path:
+    """Where a map of the asked name is saved: a new folder or file in `beside`, whatever is asked.
 
     Raises:
         ConfigError: it is no name, or there is something.
     """
-    name = text_in(values, "name")
     if not is_plain_name(name) or not name.isprintable() or name[0] in ".-":  # hidden, or an option
         raise ConfigError(f"name: expected a name to save as, of something new in {beside}")
     if (beside / name).exists():
@@ -102,7 +101,7 @@ class RunFunctions:
     def save_map(self, values: dict[str, Any]) -> dict[str, Any]:
         """Copies the run."""
         source = self._folder.path.resolve()
-        target = save_target(source.parent, values)
+        target = save_target(source.parent, text_in(values, "name"))
         if not source.is_dir():
             raise ConfigError(f"{source}: is a file; copy it")
         staged = target.with_name(f".{target.name}-{secrets.token_hex(4)}")

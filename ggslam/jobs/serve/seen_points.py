@@ -70,21 +70,18 @@ def saved_points(folder: RunFolder) -> PointCloud:
     return PointCloud(found.points.astype(np.float32), found.colors, ids)
 
 
-def points_in_camera(images: Keyframe) -> PointCloud:
+def points_in_camera(keyframe: Keyframe) -> PointCloud:
     """A keyframe's points in its camera's frame, one for each cell of `TileTuning.point_m` that it sees."""
-    step = max(1, -(-max(images.depth.shape) // SeenPointsTuning.columns))
-    depth = images.depth.astype(np.float32) * np.float32(images.depth_unit)
+    depth = keyframe.depth_m()
+    step = max(1, -(-max(depth.shape) // SeenPointsTuning.columns))
     good = (depth > 0) & _is_smooth(depth)
-    if images.moving is not None:
-        good &= ~images.moving
-    good[np.arange(good.shape[0]) % step != 0] = False
-    good[:, np.arange(good.shape[1]) % step != 0] = False
-    rows, columns = np.nonzero(good)
-    z = depth[rows, columns]
-    c = images.camera
-    xyz = np.stack([(columns - c.cx) / c.fx * z, (rows - c.cy) / c.fy * z, z], axis=1).astype(np.float32)
-    ids = np.zeros(len(z), np.uint16) if images.mask is None else images.mask[rows, columns]
-    thin = thin_points(xyz, images.color[rows, columns], ids, TileTuning.point_m)
+    if keyframe.moving is not None:
+        good &= ~keyframe.moving
+    chosen = np.zeros(depth.shape, bool)
+    chosen[::step, ::step] = good[::step, ::step]
+    xyz = keyframe.camera.rays()[chosen] * depth[chosen][:, None]
+    ids = np.zeros(len(xyz), np.uint16) if keyframe.mask is None else keyframe.mask[chosen]
+    thin = thin_points(xyz, keyframe.color[chosen], ids, TileTuning.point_m)
     return PointCloud(thin.xyz, thin.rgb, thin.ids)
 
 

@@ -84,7 +84,7 @@ class MapServices:
             raise ConfigError(f"{name}: {_short(unknown[0])!r} is no argument; {takes}")
         function = self._functions.get(name)
         if function is None:
-            raise ConfigError(f"{name}: this map cannot do that; it can {', '.join(self.names)}")
+            raise self._unable(name)
         if name in ("status", "verdicts", "pause", "reset"):  # these wait for nobody
             return function(given)
         with self._turn:
@@ -93,9 +93,12 @@ class MapServices:
     def locate(self, color: np.ndarray, depth: np.ndarray, camera: Camera | None) -> dict[str, Any]:
         """As `localize`, of arrays, see `RunFunctions.locate`; errors as of `call`."""
         if self._locate is None:
-            raise ConfigError(f"localize: this map cannot do that; it can {', '.join(self.names)}")
+            raise self._unable("localize")
         with self._turn:
             return self._locate(color, depth, camera)
+
+    def _unable(self, name: str) -> ConfigError:
+        return ConfigError(f"{name}: this map cannot do that; it can {', '.join(self.names)}")
 
 
 # --- arguments -------------------------------------------------------------------------------------------------------

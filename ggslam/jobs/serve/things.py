@@ -48,13 +48,12 @@ def known_objects(table: ObjectTable) -> Things:
     ))  # fmt: skip
 
 
-def growing_objects(means: np.ndarray, ids: np.ndarray, names: Mapping[int, str]) -> Things:
-    """Those that the Gaussians on surfaces belong to by now.
+def growing_objects(means: np.ndarray, ids: np.ndarray) -> Things:
+    """Those that the Gaussians on surfaces belong to by now; they have no names yet.
 
     Args:
         means: [N, 3], metres.
         ids: [N], object of each, 0: none.
-        names: of ids, where known.
     """
     if not len(ids):
         return Things(MAP, ())
@@ -64,8 +63,7 @@ def growing_objects(means: np.ndarray, ids: np.ndarray, names: Mapping[int, str]
     for number, rows in zip(found.tolist(), np.split(order, starts[1:]), strict=True):
         if number and len(rows) >= ThingTuning.min_gaussians:
             box = oriented_box(means[rows])
-            name = names.get(number, "")
-            things.append(Thing(number, name, pose_of_box(box), np.array(box.size), _color(number)))
+            things.append(Thing(number, "", pose_of_box(box), np.array(box.size), _color(number)))
     return Things(MAP, tuple(things))
 
 

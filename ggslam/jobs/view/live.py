@@ -20,6 +20,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import SH_C0
 from ggslam.scene.poses import inverse
+from ggslam.slam.map_copy import shown_gaussians
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
 from ggslam.system.plurals import quantity
@@ -206,13 +207,8 @@ def _scene_of(snapshot: _Snapshot, camera: Camera, title: str, centers: np.ndarr
 
 
 def _snapshot(slam: Slam, frame: Frame, report: StepReport) -> _Snapshot:
-    """Copies what is shown. In real time another thread trains the map meanwhile: rows of one copy may then be of
-    different steps, which is gone with the next."""
-    g = slam.map
-    views = [g.means, g.quaternions, g.log_scales, g.opacity_logits, g.sh, g.features[:, :0]]
-    count = min(len(view) for view in views)
-    with slam.mapper.in_turn():
-        copies = GaussianTensors(*(view[:count].to("cpu", copy=True) for view in views))
+    """Copies what is shown."""
+    copies = shown_gaussians(slam)
     located = [f for f in slam.frames if f.status != "lost"]
     located = located[:: max(1, len(located) // LiveViewTuning.max_path_points)]
     poses = np.stack([slam.pose_of(f) for f in located])
