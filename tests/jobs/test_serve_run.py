@@ -19,7 +19,7 @@ from ggslam.jobs.serve.publishing import MapPublisher
 from ggslam.jobs.serve.run_contents import RunContents, ServedRun
 from ggslam.jobs.serve.run_volumes import VOLUMES, RunVolumes
 from ggslam.jobs.serve.tiles import tile_of
-from ggslam.jobs.serve.volume_contents import RunVolumesTuning
+from ggslam.jobs.serve.volume_contents import VolumeContentsTuning
 from ggslam.jobs.volumes.fuse_volumes import fuse_volumes
 from ggslam.runs.folder import RunFolder
 from ggslam.runs.opened_points import surface_points
@@ -103,7 +103,7 @@ def test_volumes_are_those_of_the_files(room_run: RunFolder, tmp_path: FilePath)
     assert len({part.part for part in parts}) == len(parts) and sum(len(part.triangles) for part in parts) > 100
     assert np.abs(field.query(np.concatenate([part.vertices for part in parts])).distance).max() < 0.04
     fine = sum(len(part.triangles) for part in parts)
-    with overridden(RunVolumesTuning, most_triangles=fine // 3, part_triangles=50):
+    with overridden(VolumeContentsTuning, most_triangles=fine // 3, part_triangles=50):
         coarse = volumes.mesh_parts()
     assert fine // 30 < sum(len(part.triangles) for part in coarse) <= fine // 3
     assert max(len(part.triangles) for part in coarse) <= 50

@@ -19,7 +19,6 @@ from ggslam.jobs.plan.ros_maps import RosMap, read_ros_map
 from ggslam.jobs.serve.channels import FLOOR
 from ggslam.jobs.serve.keyframe_volumes import KeyframeVolumes
 from ggslam.jobs.serve.volume_contents import (
-    RunVolumesTuning,
     grid_of,
     layers_of,
     mesh_parts_of_tile,
@@ -33,12 +32,20 @@ from ggslam.messages.contents import Grid, Mesh, Points
 from ggslam.rendering.types import Gaussians
 from ggslam.runs.folder import RunFolder
 from ggslam.scene.poses import translation
+from ggslam.system.tuning import Tuning
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.floor_frame import floor_from_map
 from ggslam.volumes.map_upright import upright_of
 from ggslam.volumes.tsdf_file import load_tsdf
 
 VOLUMES = "volumes"
+
+
+class RunVolumesTuning(Tuning):
+    """How volumes of runs are made."""
+
+    close_s = 1.0
+    """Longest wait, in seconds, for volumes that are being made."""
 
 
 class RunVolumes:

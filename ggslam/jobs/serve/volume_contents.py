@@ -24,7 +24,7 @@ from ggslam.volumes.slices import plane_at_height, slice_field
 from ggslam.volumes.tsdf import TsdfMap
 
 
-class RunVolumesTuning(Tuning):
+class VolumeContentsTuning(Tuning):
     """How volumes are published."""
 
     min_piece_triangles = 50
@@ -37,15 +37,13 @@ class RunVolumesTuning(Tuning):
     """Most points of a slice through the distance field."""
     most_cells = 4_000_000
     """Most cells of a grid."""
-    close_s = 1.0
-    """Longest wait for volumes that are being made."""
 
 
 def layers_of(field: DistanceField, T_floor_map: np.ndarray, seen: bool) -> HeightLayers:
     """What a volume, up to date, has above the floor of T_floor_map [4, 4], which was `seen` or is guessed."""
     plane = floor_plane(field, T_floor_map)
     area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
-    cell = max(FloorMapTuning.cell_m, field.voxel, math.sqrt(area / RunVolumesTuning.most_cells))
+    cell = max(FloorMapTuning.cell_m, field.voxel, math.sqrt(area / VolumeContentsTuning.most_cells))
     return HeightLayers(field, plane, cell, seen)
 
 
@@ -63,7 +61,7 @@ def slice_of(field: DistanceField, up: np.ndarray, poses: np.ndarray) -> Points:
     height = float(np.median((poses[:, :3, 3] - field.origin) @ up))
     plane = plane_at_height(field, up, height)
     area = (plane.high[0] - plane.low[0]) * (plane.high[1] - plane.low[1])
-    cell = max(FloorMapTuning.cell_m, math.sqrt(area / RunVolumesTuning.slice_points))
+    cell = max(FloorMapTuning.cell_m, math.sqrt(area / VolumeContentsTuning.slice_points))
     cut = slice_field(field, plane, cell)
     places = CellGrid.over(plane, cell).places()
     return Points(MAP, places[cut.known].astype(np.float32), None, {"distance": cut.distance[cut.known]})
@@ -71,9 +69,9 @@ def slice_of(field: DistanceField, up: np.ndarray, poses: np.ndarray) -> Points:
 
 def published_mesh(tsdf: TsdfMap) -> SurfaceMesh:
     """The surface without small pieces, and with no more triangles than are sent."""
-    mesh = extract_mesh(tsdf, min_triangles=RunVolumesTuning.min_piece_triangles)
+    mesh = extract_mesh(tsdf, min_triangles=VolumeContentsTuning.min_piece_triangles)
     cell = tsdf.settings.voxel
-    while len(mesh.triangles) > RunVolumesTuning.most_triangles:
+    while len(mesh.triangles) > VolumeContentsTuning.most_triangles:
         cell *= 2
         mesh = _coarser(mesh, cell)
     return mesh
@@ -92,7 +90,7 @@ def tiles_of_mesh(mesh: SurfaceMesh) -> dict[Tile, np.ndarray]:
 
 def mesh_parts_of_tile(mesh: SurfaceMesh, tile: Tile, rows: np.ndarray) -> Iterator[Mesh]:
     """The triangles [N] of a tile in parts, which are named after it and numbered."""
-    name, count = ",".join(map(str, tile)), -(-len(rows) // RunVolumesTuning.part_triangles)
+    name, count = ",".join(map(str, tile)), -(-len(rows) // VolumeContentsTuning.part_triangles)
     for number, piece in enumerate(np.array_split(rows, count) if count else ()):
         used, triangles = np.unique(mesh.triangles[piece], return_inverse=True)
         shape = triangles.reshape(-1, 3).astype(np.int32)
