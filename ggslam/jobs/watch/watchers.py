@@ -7,16 +7,19 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ggslam.jobs.run.pipeline import Follower, RunOutcome
-from ggslam.jobs.serve.live_serving import LiveServing, serve_live
-from ggslam.jobs.serve.serving import ServeRequest
 from ggslam.jobs.view.serve import LivePage, live_page
 from ggslam.jobs.watch.rerun_follower import LiveLog
 from ggslam.reporting.rerun_log import RerunLog
 from ggslam.scene.frame import Frame
 from ggslam.slam.result import StepReport
 from ggslam.slam.slam import Slam
+
+if TYPE_CHECKING:  # what a run that is not published has no need of
+    from ggslam.jobs.serve.live_serving import LiveServing
+    from ggslam.jobs.serve.serving import ServeRequest
 
 
 @dataclass
@@ -79,6 +82,8 @@ def watch_run(
                 lambda outcome: shown.show_result(outcome.folder) if outcome.error is None else None
             )
         if serve is not None:
+            from ggslam.jobs.serve.live_serving import serve_live
+
             watchers.served = served = opened.enter_context(serve_live(serve, beside))
             watchers._followers.append(served.follow)
             watchers._finish.append(served.finish)
