@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ggslam.middleware.node import HIGHEST_DOMAIN
+
 if TYPE_CHECKING:
     from ggslam.middleware.opening import NodeRequest
 
@@ -24,7 +26,7 @@ Middleware = Annotated[
     typer.Option(help="Carrier of ROS 2 messages: zenoh, as rmw_zenoh_cpp does, or dds, as rmw_cyclonedds_cpp does."),
 ]
 Domain = Annotated[
-    int, typer.Option(envvar="ROS_DOMAIN_ID", show_envvar=True, min=0, max=232, help="ROS 2 domain.")
+    int, typer.Option(envvar="ROS_DOMAIN_ID", show_envvar=True, min=0, max=HIGHEST_DOMAIN, help="ROS 2 domain.")
 ]
 Namespace = Annotated[
     str, typer.Option(metavar="NAME", help="Namespace of ROS 2 topics that do not begin with a slash.")

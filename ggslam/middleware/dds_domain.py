@@ -10,10 +10,10 @@ from typing import Any, Final
 from xml.sax.saxutils import quoteattr
 
 from ggslam.errors import MiddlewareError, MissingDependency
+from ggslam.middleware.node import HIGHEST_DOMAIN
 
 CONFIG: Final = "CYCLONEDDS_URI"
 """Variable that adds to the configuration, as for rmw_cyclonedds_cpp; what it says counts."""
-HIGHEST_DOMAIN: Final = 232
 RECEIVE_BUFFER: Final = "16MiB"
 """Wanted for a socket; the system gives what it allows (net.core.rmem_max). A picture comes as a burst of 1 MB."""
 UNACKNOWLEDGED: Final = "256MiB"

@@ -5,9 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 Middleware = Literal["zenoh", "dds"]
+
+
+HIGHEST_DOMAIN: Final = 232
+"""Largest ROS_DOMAIN_ID: DDS has no ports for higher ones."""
 
 
 @dataclass(frozen=True)

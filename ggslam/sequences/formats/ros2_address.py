@@ -12,6 +12,7 @@ from urllib.parse import parse_qsl, urlencode
 
 from ggslam.errors import SequenceError
 from ggslam.middleware.names import full_name
+from ggslam.middleware.node import HIGHEST_DOMAIN
 from ggslam.middleware.opening import NodeRequest
 from ggslam.sequences.association import PairingTuning
 
@@ -103,8 +104,8 @@ def _one_of(*words: str) -> Callable[[str], str]:
 
 
 def _domain(value: str) -> int:
-    if not value.isdecimal() or int(value) > 232:
-        raise ValueError("a number from 0 to 232")
+    if not value.isdecimal() or int(value) > HIGHEST_DOMAIN:
+        raise ValueError(f"a number from 0 to {HIGHEST_DOMAIN}")
     return int(value)
 
 

@@ -10,6 +10,7 @@ from typing import Final
 from ggslam.errors import SequenceError
 from ggslam.middleware.node import Node
 from ggslam.sequences.formats.ros2_address import TopicsAddress
+from ggslam.sequences.formats.ros_messages import short_type
 from ggslam.sequences.formats.ros_topics import IMAGE_TYPES, INFO_TYPE, info_above
 from ggslam.system.plurals import quantity
 from ggslam.system.tuning import Tuning
@@ -25,11 +26,6 @@ class DiscoveryTuning(Tuning):
     """Seconds between two looks."""
     told = 12
     """Topics that are named where one is missing."""
-
-
-def short_type(kind: str) -> str:
-    """A type as bags name it: `sensor_msgs/Image` of `sensor_msgs/msg/Image`."""
-    return kind.replace("/msg/", "/")
 
 
 def wait_until(found: Callable[[], bool], seconds: float) -> bool:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import struct
 import threading
 import time
 from collections import Counter, deque
@@ -12,6 +11,7 @@ from functools import partial
 from typing import Final
 
 from ggslam.middleware.node import Received
+from ggslam.sequences.formats.ros_messages import cdr_stamp
 from ggslam.sequences.live_pairs import Kind, PairMatcher, Stamped
 from ggslam.system.tuning import Tuning
 
@@ -40,11 +40,10 @@ class ImagePair:
 
 
 def stamp_of(content: bytes) -> float | None:
-    """Time in the header of a message, seconds, read as a bag's reader does; None: it is no whole header."""
+    """Time in the header of a message, seconds; None: it is no whole header."""
     if len(content) <= HEAD_BYTES:
         return None
-    seconds, nanoseconds = struct.unpack("<iI" if content[1] & 1 else ">iI", content[4:HEAD_BYTES])
-    return float(seconds + 1e-9 * nanoseconds)
+    return cdr_stamp(content[:HEAD_BYTES])
 
 
 def _with_time(pair: ImagePair) -> ImagePair:

@@ -20,6 +20,17 @@ ZSTD_START = b"\x28\xb5\x2f\xfd"
 """First bytes of what zstd compressed."""
 
 
+def short_type(kind: str) -> str:
+    """A type as ROS 1 names it: `sensor_msgs/Image` of `sensor_msgs/msg/Image`."""
+    return kind.replace("/msg/", "/")
+
+
+def cdr_stamp(head: bytes) -> float:
+    """Time in the header of a ROS 2 message, seconds, by its first 12 bytes."""
+    seconds, nanoseconds = struct.unpack("<iI" if head[1] & 1 else ">iI", head[4:12])
+    return float(seconds + 1e-9 * nanoseconds)
+
+
 class Bag:
     """A bag, open for as long as this object lives. May be used from several threads.
 
@@ -53,7 +64,7 @@ class Bag:
             raise SequenceError(f"{path}: not a whole bag (truncated, or not indexed?): {_text(error)}") from None
         if path.is_file() and self._reader.is2:
             self._check_uncompressed()
-        self.types = {c.topic: c.msgtype.replace("/msg/", "/") for c in self._reader.connections}
+        self.types = {c.topic: short_type(c.msgtype) for c in self._reader.connections}
 
     def _check_uncompressed(self) -> None:
         """Of one file of a bag nothing tells that each message is compressed."""
@@ -129,9 +140,8 @@ class Bag:
         """Only the header is looked at: images are large."""
         head = bytes(raw[:12])
         if self._reader.is2:
-            seconds, nanoseconds = struct.unpack("<iI" if head[1] & 1 else ">iI", head[4:12])
-        else:
-            _, seconds, nanoseconds = struct.unpack("<III", head)
+            return cdr_stamp(head)
+        _, seconds, nanoseconds = struct.unpack("<III", head)
         return float(seconds + 1e-9 * nanoseconds)
 
 
