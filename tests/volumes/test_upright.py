@@ -68,7 +68,8 @@ def test_without_surfaces_the_cameras_decide() -> None:
     assert np.array_equal(estimate_up(two, np.zeros((5, 3)), np.zeros((5, 3))).up, [0, -1, 0])
 
 
-def test_up_of_a_map_whose_gaussians_lie_on_planes_and_are_turned_anyhow() -> None:
+@pytest.mark.parametrize("samples", [None, 4000])
+def test_up_of_a_map_whose_gaussians_lie_on_planes_and_are_turned_anyhow(samples: int | None) -> None:
     """Training leaves the axes of single Gaussians anywhere; the planes that neighbours lie in tell all the same."""
     random = np.random.default_rng(0)
     up = np.array([0.25, -0.95, 0.2]) / np.linalg.norm([0.25, -0.95, 0.2])
@@ -79,6 +80,6 @@ def test_up_of_a_map_whose_gaussians_lie_on_planes_and_are_turned_anyhow() -> No
     gaussians = GaussianMap(with_moments=False)
     anyhow = [torch.from_numpy(random.normal(size=(9000, width))).float() for width in (4, 3)]
     gaussians.insert(torch.from_numpy(points).float(), anyhow[0], anyhow[1] - 4, 2.0, torch.full((9000, 3), 0.5))
-    found = upright_of(gaussians, np.tile(np.eye(4), (5, 1, 1)))
+    found = upright_of(gaussians, np.tile(np.eye(4), (5, 1, 1)), samples)
     assert np.degrees(np.arccos(min(1.0, float(found.up @ up)))) < 0.5 and found.support > 0.3
     assert found.floor == pytest.approx(-1.2, abs=0.01)

@@ -86,6 +86,9 @@ class LiveContentsTuning(Tuning):
     """Seconds between two verdicts."""
     floor_keyframes = 5
     """Keyframes from which the floor is looked for."""
+    floor_samples = 4000
+    """Gaussians by which the floor is looked for while the map grows: three times as fast as all that a finished map
+    is asked by."""
     end_after_s = 1e-6
     """Seconds after the last frame at which tree and pose as they came out are stamped: of two of one time, tf2
     may keep the first."""
@@ -291,7 +294,7 @@ class LiveContents:
         put, wanted = self._publisher.put, self._publisher.is_wanted
         if self._floor_due and len(s.poses) >= LiveContentsTuning.floor_keyframes:
             self._floor_due = False
-            self._send_floor(s.gaussians, s.poses, s.stamp)
+            self._send_floor(s.gaussians, s.poses, s.stamp, LiveContentsTuning.floor_samples)
         if wanted(PATH) and len(s.poses):
             put(PATH, Path(MAP, s.poses @ T_OPTICAL_CAMERA, s.stamps), s.stamp)
         if self._map.is_wanted:
@@ -304,8 +307,10 @@ class LiveContents:
             put(RENDERED, Picture(OPTICAL, self._render(s, s.T_map_optical)), s.stamp, keep=False)
         self.volumes.show(s.keyframes, s.scale, self._floor, s.poses, s.stamp)
 
-    def _send_floor(self, gaussians: GaussianTensors, poses: np.ndarray, stamp: float) -> None:
-        upright = upright_of(gaussians, poses)
+    def _send_floor(
+        self, gaussians: GaussianTensors, poses: np.ndarray, stamp: float, samples: int | None = None
+    ) -> None:
+        upright = upright_of(gaussians, poses, samples)
         self._floor = Floor(floor_from_map(upright, poses), upright.floor is not None)
         self._publisher.put(TF_STATIC, fixed_frames(self._floor.T_floor_map), stamp)
 
