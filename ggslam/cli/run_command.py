@@ -348,7 +348,7 @@ def _run_and_show(run: Callable[..., RunOutcome], name: str, watched: _Watched) 
         if page is not None:
             console.print(f"the map as it grows: {page.address}", highlight=False, markup=False)
         with progress_bar() as bar:
-            outcome = run(observer=ProgressObserver(bar), follower=watchers.follower)
+            outcome = run(observer=ProgressObserver(bar), follower=watchers.follower, waiting=watchers.while_waiting)
         _print(outcome)
         watchers.finish(outcome)
         if outcome.error is None and (page is not None or (served is not None and served.stays)):

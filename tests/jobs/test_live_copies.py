@@ -12,9 +12,10 @@ from typing import Any, cast
 import pytest
 
 from ggslam.errors import ConfigError
-from ggslam.jobs.serve.live_functions import LiveFunctions
+from ggslam.jobs.serve.live_functions import LiveFunctions, LiveFunctionTuning
 from ggslam.slam.map_copy import MapCopyTuning, whole_map
 from ggslam.slam.slam import Slam
+from ggslam.system.tuning import overridden
 
 
 class GrowingMap:
@@ -66,3 +67,32 @@ def test_a_question_that_fails_is_the_callers_and_the_run_goes_on() -> None:
     while caller.is_alive():
         functions.between_frames(cast(Slam, frames))
     assert [str(error) for error in raised] == ["a fault of ours"]
+
+
+def test_a_question_that_came_too_late_is_not_done_later() -> None:
+    functions = LiveFunctions(cast(Any, None), cast(Any, None), Path())
+    asked: list[Slam] = []
+    with overridden(LiveFunctionTuning, copy_s=0.01), pytest.raises(ConfigError, match="no frame was done in 0.01 s"):
+        functions._ask(asked.append)
+    functions.between_frames(cast(Slam, SimpleNamespace(frames=[], dropped_frames=[])))
+    assert not asked
+
+
+def test_before_the_first_keyframe_there_is_no_map_to_save(tmp_path: Path) -> None:
+    functions = LiveFunctions(cast(Any, None), cast(Any, None), tmp_path)
+    frames: Any = SimpleNamespace(frames=[], dropped_frames=[], pager=None, mapper=SimpleNamespace(keyframes=[]))
+    running = threading.Event()
+
+    def run() -> None:
+        while not running.wait(0.005):
+            functions.between_frames(frames)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        with pytest.raises(ConfigError, match="there is no map yet"):
+            functions.save_map({"name": "early"})
+    finally:
+        running.set()
+        thread.join()
+    assert not list(tmp_path.iterdir())

@@ -4,14 +4,20 @@
 from __future__ import annotations
 
 import sys
+import threading
+import time
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
 from ggslam.errors import RunFolderError, SequenceError
+from ggslam.formats.gaussian_ply import read_gaussian_ply
 from ggslam.jobs.run.pipeline import RunRequest, execute
+from ggslam.jobs.serve.live_functions import LiveFunctions
+from ggslam.jobs.serve.pausing import Pause
 from ggslam.runs.recordings import LiveRequest, SequenceRequest, open_recording_of
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
@@ -34,6 +40,52 @@ def place(room: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     monkeypatch.setitem(sys.modules, "room_camera", types.SimpleNamespace(RoomCamera=RoomCamera))
     return Path("python:room_camera:RoomCamera")
+
+
+def test_what_is_asked_is_done_while_no_frame_comes(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A camera that falls silent after four frames, until the map was saved."""
+    beside, asked = tmp_path / "maps", threading.Event()
+    functions = LiveFunctions(cast(Any, None), Pause(), beside)
+    saved: list[dict[str, Any]] = []
+
+    class SilentCamera:
+        arrived = 0.0
+
+        def __init__(self) -> None:
+            self.sequence = open_sequence(room, stop=4)
+            self.name, self.camera = "silent", self.sequence.camera
+
+        def follow(self, going_on: Callable[[], bool], say: Callable[[str], None]) -> None:
+            self.going_on = going_on
+
+        def frames(self) -> Iterator[Frame]:
+            yield from self.sequence.stream(masks=False)
+            asked.set()
+            while self.going_on() and not saved:
+                time.sleep(0.01)
+
+        def counts(self) -> dict[str, int]:
+            return {}
+
+        def reasons(self) -> dict[str, int]:
+            return {}
+
+        def close(self) -> None:
+            pass
+
+    def ask() -> None:
+        asked.wait(60)
+        saved.append(functions.save_map({"name": "now"}))
+
+    monkeypatch.setitem(sys.modules, "silent_camera", types.SimpleNamespace(SilentCamera=SilentCamera))
+    thread = threading.Thread(target=ask)
+    thread.start()
+    place = Path("python:silent_camera:SilentCamera")
+    execute(RunRequest(LiveRequest(place), tmp_path / "run", overrides=FAST), waiting=functions.between_frames)
+    thread.join(30)
+    assert saved[0]["frames"] == 4 and len(read_gaussian_ply(beside / "now.ply")) == saved[0]["gaussians"] > 0
 
 
 FAST = ["mapping.iterations_per_frame=1", "mapping.first_frame_iterations=1"]

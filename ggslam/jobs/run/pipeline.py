@@ -24,7 +24,7 @@ from ggslam.jobs.run.named_loss import NamedLoss
 from ggslam.jobs.run.rescue import save_somewhere
 from ggslam.jobs.run.resuming import Resumption
 from ggslam.jobs.run.run_verdict import judge_result
-from ggslam.jobs.run.slam_loop import Follower, SlamLoop
+from ggslam.jobs.run.slam_loop import Follower, SlamLoop, Waiting
 from ggslam.jobs.run.start_check import check_depth
 from ggslam.runs.checkpoints import Checkpoints
 from ggslam.runs.folder import RunFolder
@@ -111,7 +111,10 @@ class RunOutcome:
         return ", ".join(parts)
 
 
-def execute(request: RunRequest, observer: Observer | None = None, follower: Follower | None = None) -> RunOutcome:
+def execute(
+    request: RunRequest, observer: Observer | None = None, follower: Follower | None = None,
+    waiting: Waiting | None = None,
+) -> RunOutcome:  # fmt: skip
     """Runs a recording into a run folder. If it stops in the middle (damaged frame, interrupt), what was done is saved
     all the same and the outcome carries the error.
 
@@ -119,6 +122,7 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
         request: what to do.
         observer: receives progress updates.
         follower: does more with each frame.
+        waiting: does something while a camera's next frame is waited for.
 
     Raises:
         GgslamError: nothing could be done at all: settings, recording or output folder at fault.
@@ -146,14 +150,14 @@ def execute(request: RunRequest, observer: Observer | None = None, follower: Fol
     verdicts = check_depth(sequence, observer) if request.check else None
     folder = RunFolder.create(out, overwrite=request.overwrite)
     with stop_on_request() as stop, folder_lock(folder.path):
-        run = _Run(request, config, sequence, earlier, folder, observer, follower, stop, loss, depth=verdicts)
+        run = _Run(request, config, sequence, earlier, folder, observer, follower, stop, loss, waiting, verdicts)
         return run.run(None)
 
 
 def resume(
     run: Path, observer: Observer | None = None, follower: Follower | None = None, *, recording: Path | None = None,
     evaluate: bool | None = None, checkpoint_every: int | None = None, model: str | None = None,
-    loss: str | None = None, energy: bool = False, encode: EncodeRequest | None = None,
+    loss: str | None = None, energy: bool = False, encode: EncodeRequest | None = None, waiting: Waiting | None = None,
 ) -> RunOutcome:  # fmt: skip
     """Goes on with a run that was cut off, from its newest checkpoint. A synchronous run on the CPU becomes what it
     would have become, bit for bit.
@@ -170,6 +174,7 @@ def resume(
         loss: name of the user's own loss that the run was begun with, likewise. What it remembers is not saved.
         energy: count what each part uses from now on.
         encode: what to code the finished run as; a run does not remember what it was to be coded as.
+        waiting: as of `execute`.
 
     Raises:
         GgslamError: there is nothing to go on from; the recording is another one; the run was made with another
@@ -187,7 +192,9 @@ def resume(
         )  # fmt: skip
         own = None if loss is None else NamedLoss.load(loss)
         observer = observer or SilentObserver()
-        run_again = _Run(asked, found.config, found.sequence, found.earlier, folder, observer, follower, stop, own)
+        run_again = _Run(
+            asked, found.config, found.sequence, found.earlier, folder, observer, follower, stop, own, waiting
+        )  # fmt: skip
         return run_again.run(found)
 
 
@@ -204,6 +211,7 @@ class _Run:
     follower: Follower | None
     stop: StopRequest
     loss: NamedLoss | None = None
+    waiting: Waiting | None = None
     depth: list[Verdict] | None = None
     fit: MapFit | None = None
     saw_all: bool = False
@@ -228,7 +236,7 @@ class _Run:
             checkpointing = self._make_checkpointing(checkpoints, resumption)
             loop = SlamLoop(
                 sequence, self.config, observer, folder, self.earlier, not self.request.localize_only, self.follower,
-                checkpointing, self.stop, loss=self.loss,
+                self.waiting, checkpointing, self.stop, loss=self.loss,
             )  # fmt: skip
             if resumption is not None and checkpointing is not None:
                 loop.resume = lambda slam: resumption.restore(slam, checkpoints, checkpointing, observer)
@@ -392,7 +400,8 @@ class _Run:
     def _verdict(self, outcome: RunOutcome) -> RunVerdict:
         folder = outcome.folder
         table = folder.object_table() if folder.has_objects() else None
-        recording = str(self.request.sequence.path)
+        live = self.sequence if isinstance(self.sequence, LiveSequence) else None
+        recording = str(self.request.sequence.path if live is None else live.record or "")
         cut = outcome.error is not None and outcome.error is not outcome.failure
         return judge_result(
             outcome.result, outcome.verdicts, self.fit, table, outcome.metrics, recording,

@@ -62,7 +62,7 @@ def judge_result(
         fit: of its map.
         table: its objects; None: it has none.
         metrics: its scores; None: it was not scored.
-        recording: its path, for commands.
+        recording: its path, for commands; "": a live camera of which nothing was kept.
         stopped: whether it ended before the recording did, by an error or by the user.
         unrefined: whether it ended in the final refinement, after all frames.
     """
@@ -145,7 +145,7 @@ def _advice(
             for verdict in found:
                 if (verdict.code, verdict.severity) == (code, severity) and "; " in verdict.text:
                     return verdict.text.rpartition("; ")[2].removeprefix("try ")
-    look = f"ggslam inspect {recording}"
+    look = f"ggslam inspect {recording or 'FOLDER, of frames that ggslam run CAMERA --record FOLDER kept'}"
     if (
         fit is not None
         and not 1 / MapGradeTuning.doubtful_brightness <= fit.brightness <= MapGradeTuning.doubtful_brightness

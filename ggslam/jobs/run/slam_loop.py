@@ -36,6 +36,8 @@ from ggslam.system.staging import new_staging
 
 Follower = Callable[[Slam, Frame, StepReport], None]
 """Is called after every frame, in the thread that tracks."""
+Waiting = Callable[[Slam], None]
+"""Is called again and again while a camera's next frame is waited for, in the same thread."""
 
 
 @dataclass
@@ -50,6 +52,7 @@ class SlamLoop:
         earlier: run whose map this one begins with.
         growing: whether that map grows.
         follower: does more with each frame.
+        waiting: does something while no frame comes.
         checkpointing: saves the state; None: never.
         stop: says when to end early.
         resume: brings a fresh `Slam` to where it was, and tells which frame comes next, None if it was nowhere yet.
@@ -66,6 +69,7 @@ class SlamLoop:
     earlier: RunFolder | None = None
     growing: bool = True
     follower: Follower | None = None
+    waiting: Waiting | None = None
     checkpointing: Checkpointing | None = None
     stop: StopRequest = field(default_factory=StopRequest)
     resume: Callable[[Slam], int | None] | None = None
@@ -114,7 +118,7 @@ class SlamLoop:
             frames = sequence.stream(masks="lazy", begin=begin)  # only those of keyframes are read
         else:
             frames = sequence.stream(masks="lazy")
-            sequence.say, sequence.goes_on = observer.note, lambda: self.stop.number is None
+            sequence.say, sequence.goes_on = observer.note, lambda: self._waits_on(slam)
             self.latency = LatencyMeter(sequence.moment_of)
         self._between_steps = self.config.realtime_fps == 0
         if self.config.realtime_fps > 0:
@@ -125,6 +129,12 @@ class SlamLoop:
             steps = slam.step_together(together)
             for frame, step in zip(together, steps, strict=True):
                 self._report(slam, frame, step, whole=frame is together[-1])
+
+    def _waits_on(self, slam: Slam) -> bool:
+        """Whether a frame that does not come yet is waited for."""
+        if self.waiting is not None:
+            self.waiting(slam)
+        return self.stop.number is None
 
     def _side_by_side(self, slam: Slam, frames: Iterator[Frame]) -> None:
         """All frames in real time."""

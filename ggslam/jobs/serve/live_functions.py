@@ -35,7 +35,8 @@ class LiveFunctionTuning(Tuning):
     """How long is waited for the run."""
 
     copy_s = 20.0
-    """Seconds in which the run has to give a copy of its map: it does so between two frames."""
+    """Seconds in which the run has to give a copy of its map: it does so between two frames, and while it waits for
+    one."""
 
 
 class LiveFunctions:
@@ -66,7 +67,7 @@ class LiveFunctions:
     # --- the thread of the run ---------------------------------------------------------------------------------------
 
     def between_frames(self, slam: Slam) -> None:
-        """Does what was asked for."""
+        """Does what was asked for: after a frame, and again and again until the next."""
         self._frames, self._dropped = len(slam.frames), len(slam.dropped_frames)
         self._status = slam.frames[-1].status if slam.frames else ""
         while not self._asked.empty():
@@ -128,9 +129,11 @@ class LiveFunctions:
 
     def _ask(self, what: Callable[[Slam], None]) -> None:
         """Has something done between two frames, and waits for it."""
-        done, failures = threading.Event(), list[Exception]()
+        done, too_late, failures = threading.Event(), threading.Event(), list[Exception]()
 
         def act(slam: Slam) -> None:
+            if too_late.is_set():
+                return
             try:
                 what(slam)
             except Exception as error:  # it is the caller's, and the run goes on
@@ -140,7 +143,8 @@ class LiveFunctions:
 
         self._asked.put(act)
         if self._ended or not done.wait(LiveFunctionTuning.copy_s):
-            raise ConfigError(f"no frame came in {LiveFunctionTuning.copy_s:g} s, so there is no copy of the map")
+            too_late.set()
+            raise ConfigError(f"no frame was done in {LiveFunctionTuning.copy_s:g} s, so there is no copy of the map")
         if failures:
             raise failures[0]
 
@@ -149,6 +153,8 @@ def _copy_of(slam: Slam) -> tuple[GaussianMap, np.ndarray, np.ndarray]:
     """The map on the CPU; times [N] and poses [N, 4, 4] of the frames."""
     if slam.pager is not None:
         raise ConfigError("memory_limit_mb: parts of the map are on disk; it can be saved at the end only")
+    if not slam.mapper.keyframes:
+        raise ConfigError("there is no map yet")
     gaussians = whole_map(slam)
     keyframes = [keyframe.T_world_camera for keyframe in slam.mapper.keyframes]
     stamps = np.array([frame.timestamp for frame in slam.frames])

@@ -101,6 +101,10 @@ class LiveServing:
         self._functions.between_frames(slam)
         self._pause.hold(lambda: self._functions.between_frames(slam))
 
+    def wait(self, slam: Slam) -> None:
+        """While the next frame does not come, in the same thread."""
+        self._functions.between_frames(slam)
+
     def finish(self, outcome: RunOutcome) -> None:
         """Publishes what came out, and notes in timing.json what was sent."""
         self._functions.end()

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ggslam.jobs.run.pipeline import Follower, RunOutcome
+from ggslam.jobs.run.pipeline import Follower, RunOutcome, Waiting
 from ggslam.jobs.view.serve import LivePage, live_page
 from ggslam.jobs.watch.rerun_follower import LiveLog
 from ggslam.reporting.rerun_log import RerunLog
@@ -44,6 +44,11 @@ class Watching:
     def _tell_all(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         for follower in self._followers:
             follower(slam, frame, report)
+
+    @property
+    def while_waiting(self) -> Waiting | None:
+        """For `execute`; None: no one asks for anything."""
+        return None if self.served is None else self.served.wait
 
     def finish(self, outcome: RunOutcome) -> None:
         """Shows what came out. A run that was cut off is not shown on the page."""
