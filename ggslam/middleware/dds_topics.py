@@ -146,8 +146,7 @@ class DdsSubscription:
     """Takes messages of a topic. DDS gives no numbers of messages to Python; it counts itself what was lost.
 
     Attributes:
-        lost: messages that DDS knows were sent and did not come, or that had to make room for newer ones here; counted
-            when a message comes.
+        lost: messages that DDS knows were sent and did not come, counted when a message comes.
     """
 
     def __init__(
@@ -163,7 +162,12 @@ class DdsSubscription:
     def _put(self, sample: Any) -> None:
         writer = f"{sample.sample_info.publication_handle & (1 << 64) - 1:016x}"
         self._delivery.put(Received(sample.content, time.time(), writer))
-        self.lost = int(self._reader.get_sample_lost_status().total_count) + self._delivery.overrun
+        self.lost = int(self._reader.get_sample_lost_status().total_count)
+
+    @property
+    def overrun(self) -> int:
+        """Messages that came and had to make room before they were taken."""
+        return self._delivery.overrun
 
     @property
     def failures(self) -> int:

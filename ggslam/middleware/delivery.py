@@ -20,7 +20,7 @@ NUMBERS_BACK: Final = 1000
 
 class Delivery:
     """Messages of a subscription, taken one at a time in a thread of its own. The newest win: where the taker is slow,
-    the oldest of `depth` messages makes room and counts as lost.
+    the oldest of `depth` messages makes room and is counted.
 
     Attributes:
         failures: calls of the taker that raised.

@@ -98,13 +98,17 @@ class Subscription(Protocol):
     """Takes messages of one topic.
 
     Attributes:
-        lost: messages that were sent and did not come, or that came and had to make room for newer ones.
+        lost: messages that were sent and did not come.
+        overrun: messages that came and had to make room for newer ones before they were taken.
         failures: messages whose `take` raised. The first is written to the log.
     """
 
     topic: str
     kind: str
     lost: int
+
+    @property
+    def overrun(self) -> int: ...
 
     @property
     def failures(self) -> int: ...

@@ -92,7 +92,7 @@ class ZenohSubscription:
     """Takes messages of a topic.
 
     Attributes:
-        lost: messages that were sent and did not come, or had to make room for newer ones here.
+        lost: messages that were sent and did not come.
     """
 
     def __init__(
@@ -124,7 +124,12 @@ class ZenohSubscription:
         number, _, gid = found or (None, 0, b"")
         if self._gaps.note(gid.hex(), number):
             self._delivery.put(Received(sample.payload.to_bytes(), at, gid.hex(), number))
-            self.lost = self._gaps.lost + self._delivery.overrun
+            self.lost = self._gaps.lost
+
+    @property
+    def overrun(self) -> int:
+        """Messages that came and had to make room before they were taken."""
+        return self._delivery.overrun
 
     @property
     def failures(self) -> int:

@@ -147,7 +147,7 @@ def measure(carrier: str, profile: str, frames: int, rate: float) -> dict[str, A
     while sum(len(one.stamps) for one in taken.values()) < wanted and time.monotonic() < end:
         time.sleep(0.01)
     used = time.process_time() - used
-    counted = sum(subscription.lost for subscription in subscriptions)
+    counted = sum(one.lost + one.overrun for one in subscriptions)
     sender.communicate(timeout=10)
     node.close()
     return figures(Sent(**json.loads(line)), list(taken.values()), counted, used, wanted)

@@ -145,7 +145,8 @@ def show_runs(runs: dict[str, LiveRun]) -> None:
         row("taken", a.taken)
         row("overwritten (newest wins)", a.overwritten)
         row("lost or unmatched images, damaged", f"{a.lost}, {a.unmatched}, {a.damaged}")
-        row("not counted by anybody", run.sent - a.taken - a.overwritten - (a.lost + a.unmatched + 1) // 2)
+        left = (a.lost + a.overrun + a.unmatched + 1) // 2
+        row("not counted by anybody", run.sent - a.taken - a.overwritten - a.waiting - left)
         for name, delays in (("pose", latency.pose), ("map", latency.map)):
             row(f"capture -> {name}, median (95 %)", f"{1e3 * delays.median_s:.0f} ({1e3 * delays.p95_s:.0f}) ms")
         for decoder in ("mcap-ros2-support", "cyclonedds"):

@@ -46,7 +46,7 @@ def test_a_camera_is_mapped_and_what_is_told_is_read_by_others(room: Path, tmp_p
     folder = RunFolder.open(out)
     latency = folder.timing().latency
     assert sent == 24 and latency is not None and latency.arrivals is not None and latency.pose is not None
-    assert latency.arrivals.pairs == latency.arrivals.taken + latency.arrivals.overwritten
+    assert latency.arrivals.pairs == latency.arrivals.taken + latency.arrivals.overwritten + latency.arrivals.waiting
     poses = folder.trajectory()
     assert 12 <= len(poses.T_world_camera) == latency.arrivals.taken and latency.pose.count == latency.arrivals.taken
 

@@ -76,7 +76,7 @@ def main(middleware: Any, address: str, domain: int, path: Path) -> None:
     ends = [node.subscribe(topic, kind, qos, kept.taker(topic, kind)) for topic, kind, qos in published()]
     print("ready", flush=True)
     sys.stdin.read()
-    lost = sum(end.lost for end in ends)
+    lost = sum(end.lost + end.overrun for end in ends)
     node.close()
     kept.write(path)
     print(f"kept {len(kept.messages)} messages, {lost} lost", flush=True)

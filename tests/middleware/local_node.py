@@ -108,7 +108,11 @@ class LocalSubscription:
 
     @property
     def lost(self) -> int:
-        return self.gaps.lost + self.delivery.overrun
+        return self.gaps.lost
+
+    @property
+    def overrun(self) -> int:
+        return self.delivery.overrun
 
     @property
     def failures(self) -> int:

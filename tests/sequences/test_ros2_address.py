@@ -31,7 +31,7 @@ def test_addresses() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("ros2://a", "expected ros2://COLOR,DEPTH"), ("ros2:", "expected ros2://COLOR,DEPTH"),
+        ("ros2://a", "expected ros2://COLOR,DEPTH"), ("ros2:/a", "ros2://a: expected"), ("ros2:", "expected ros2://COLOR,DEPTH"),
         ("ros2://a,b,c,d,e", "found 'e'"), ("ros2://a,b,color=c", "found 'color=c'"), ("ros2://a,", "found ''"),
         ("ros2://a,b?speed=3", "found 'speed'"), ("ros2://a,b?domain=233", "domain: expected a number from 0 to 232"),
         ("ros2://a,b?idle=-1", "idle: expected seconds, above 0, found '-1'"), ("ros2://a,b?qos=best", "reliable or"),

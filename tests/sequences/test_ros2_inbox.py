@@ -60,3 +60,13 @@ def test_two_cameras_on_one_topic_are_told_once() -> None:
     for number in range(10):
         pair_of(alone, 5.0 + number / 10, 5.0)
     assert not alone.events()
+
+
+def test_each_pair_is_counted_once() -> None:
+    inbox = PairInbox(("/color", "/depth"), 0.02)
+    for number in range(5):
+        pair_of(inbox, 5.0 + number, 5.0 + number)
+        if number == 1:
+            assert inbox.take(0.5) is not None
+    counts = inbox.counts()
+    assert (counts["pairs"], counts["taken"], counts["overwritten"], counts["waiting"]) == (5, 1, 3, 1)

@@ -64,7 +64,7 @@ def test_frames(network: LocalNetwork, compressed: bool, metres: bool) -> None:
         np.testing.assert_allclose(frame.depth, depth_of(i), rtol=0 if exact else 0.02, atol=0 if exact else 1e-3)
     counts = source.counts()
     assert counts == {"color": 3, "depth": 3, "pairs": 3, "taken": 3} | dict.fromkeys(
-        ("unmatched", "overwritten", "damaged", "lost"), 0
+        ("waiting", "unmatched", "overwritten", "damaged", "lost", "overrun"), 0
     )
     source.close()
 

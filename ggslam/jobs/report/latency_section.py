@@ -9,8 +9,10 @@ from ggslam.runs.records.timing import SINCE, TimingRecord
 
 _COUNTS = (
     ("colour images", "color"), ("depth images", "depth"), ("pairs", "pairs"), ("pairs taken", "taken"),
+    ("pairs that waited at the end", "waiting"),
     ("pairs overwritten by newer ones", "overwritten"), ("images without a partner", "unmatched"),
     ("damaged messages", "damaged"), ("lost by the network", "lost"),
+    ("came faster than they were paired", "overrun"),
 )  # fmt: skip
 
 

@@ -74,18 +74,21 @@ class DelaysRecord(Record):
 
 
 class ArrivalsRecord(Record):
-    """What came from a camera over the network: images of colour and depth, pairs of them, pairs that the run took;
-    images without a partner in time, pairs that a newer one overwrote before the run was free, damaged messages, and
-    messages that were sent and did not come. `reasons`: why images were left out."""
+    """What came from a camera over the network: images of colour and depth, pairs of them, pairs that the run took, and
+    whether one more waited when it ended; pairs that a newer one overwrote before the run was free, images without a
+    partner in time, damaged messages, messages that were sent and did not come, and those that came faster than they
+    could be paired. `reasons`: why images were left out."""
 
     color: int = 0
     depth: int = 0
     pairs: int = 0
     taken: int = 0
+    waiting: int = 0
     unmatched: int = 0
     overwritten: int = 0
     damaged: int = 0
     lost: int = 0
+    overrun: int = 0
     reasons: dict[str, int] = {}
 
 
@@ -122,6 +125,7 @@ class LatencyRecord(Record):
         return (
             f"{line}; {quantity(a.pairs, 'pair')} of {a.color} + {a.depth} images, {a.taken} taken, {a.overwritten} "
             f"overwritten; images: {a.unmatched} unmatched, {a.damaged} damaged, {a.lost} lost"
+            f"{f', {a.overrun} not paired in time' if a.overrun else ''}"
         )
 
 

@@ -54,6 +54,7 @@ def parse_address(text: str) -> TopicsAddress:
     """
     scheme, _, rest = text.partition(":")
     named, _, query = rest.lstrip("/").partition("?")
+    text = f"{scheme}://{rest.lstrip('/')}" if scheme == SCHEME else text
     if scheme != SCHEME or not named:
         raise SequenceError(f"{text}: {_LAYOUT}")
     values = _values(text, query)

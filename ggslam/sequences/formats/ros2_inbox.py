@@ -169,7 +169,8 @@ class PairInbox:
         with self._changed:
             return {
                 "color": self.received["color"], "depth": self.received["depth"], "pairs": self.pairs,
-                "taken": self.taken, "unmatched": self._matcher.unmatched.total(), "overwritten": self.overwritten,
+                "taken": self.taken, "waiting": int(self._slot is not None),
+                "overwritten": self.overwritten, "unmatched": self._matcher.unmatched.total(),
                 "damaged": self.damaged.total(),
             }  # fmt: skip
 

@@ -188,7 +188,8 @@ class Ros2Camera:
 
     def counts(self) -> dict[str, int]:
         """What came and what became of it, so far."""
-        return {**self._inbox.counts(), "lost": sum(end.lost for end in self._ends[:2])}
+        lost, overrun = (sum(getattr(end, name) for end in self._ends[:2]) for name in ("lost", "overrun"))
+        return {**self._inbox.counts(), "lost": lost, "overrun": overrun}
 
     def reasons(self) -> dict[str, int]:
         """Why images were left out, and how often."""
