@@ -121,13 +121,15 @@ class _Listener:
 
 
 class FileOutlet(_Outlet):
-    """An MCAP file, for Foxglove and everything else that reads it."""
+    """An MCAP file, for Foxglove and everything else that reads it. One that nothing was told to is removed at the end:
+    it would be in the way of the next try."""
 
     name = "file"
 
     def __init__(self, path: Path, overwrite: bool = False) -> None:
         """Raises InputError if the file is there already, or cannot be written."""
         super().__init__()
+        self._path, self._is_empty = path, True
         try:
             self._writer = foxglove_package().open_mcap(path, allow_overwrite=overwrite, context=self._context)
         except FileExistsError:
@@ -142,9 +144,17 @@ class FileOutlet(_Outlet):
     def on_join(self, told: Callable[[Channel], None]) -> None:
         """Nobody joins a file."""
 
+    def send(self, channel: Channel, content: Content, stamp: float) -> int:
+        """Writes a message."""
+        self._is_empty = False
+        return super().send(channel, content, stamp)
+
     def close(self) -> None:
         """Finishes the file."""
         for opened in self._channels.values():
             opened.close()
         with suppress(RuntimeError):  # closed before
             self._writer.close()
+        if self._is_empty:
+            self._path.unlink(missing_ok=True)
+            self._is_empty = False

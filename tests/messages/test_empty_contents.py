@@ -77,3 +77,17 @@ def test_pictures_without_pixels_are_left_out(tmp_path: Path) -> None:
     assert outlet.send(channel, Picture("camera", np.zeros((0, 5, 3), np.uint8)), STAMP) == 0
     assert outlet.left_out() == 1
     outlet.close()
+
+
+def test_a_file_that_nothing_was_told_to_is_not_left_behind(tmp_path: Path) -> None:
+    outlet = FileOutlet(tmp_path / "none.mcap")
+    outlet.open(next(iter(NOTHING)))
+    outlet.close()
+    assert not list(tmp_path.iterdir())
+    again = FileOutlet(tmp_path / "none.mcap")  # the next try finds the name free
+    channel, content = next(iter(NOTHING.items()))
+    again.open(channel)
+    again.send(channel, content, STAMP)
+    again.close()
+    again.close()
+    assert (tmp_path / "none.mcap").stat().st_size > 100

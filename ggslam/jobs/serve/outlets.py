@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from ggslam.errors import ConfigError, MissingDependency
+from ggslam.errors import ConfigError, GgslamError, MissingDependency
 from ggslam.messages.outlet import Outlet
 from ggslam.middleware.node import Node
 from ggslam.middleware.opening import NodeRequest, open_node
@@ -100,7 +100,8 @@ def _is_file(word: str) -> bool:
 
 @contextmanager
 def open_outlets(request: PublishRequest) -> Iterator[Opened]:
-    """Opens outlets, and leaves the network at the end. The outlets themselves are closed by who sends.
+    """Opens outlets, and leaves the network at the end. The outlets themselves are closed by who sends, or at once if
+    one of them cannot be opened.
 
     Raises:
         MissingDependency: a package is not installed.
@@ -111,8 +112,10 @@ def open_outlets(request: PublishRequest) -> Iterator[Opened]:
         for name in request.names:
             try:
                 _open(name, request, found, opened)
-            except MissingDependency as error:
-                if not request.optional:
+            except GgslamError as error:
+                if not (request.optional and isinstance(error, MissingDependency)):
+                    for outlet, _ in found.outlets:
+                        outlet.close()
                     raise
                 found.lines.append(f"without {name}: {error}")
         yield found
