@@ -140,7 +140,7 @@ class Ros2Channel:
     def _single(self, content: Content, stamp: float) -> Messages:
         """Contents of one topic."""
         if isinstance(content, Pose):
-            return [("", pose_message(self._types, content, stamp))]
+            return [("", pose_message(content, stamp))]
         if isinstance(content, Path):
             return [("", path_message(content, stamp))]
         if isinstance(content, Lens):
@@ -156,7 +156,7 @@ class Ros2Channel:
         if content.fixed:
             self._fixed |= {child: (parent, child, T, at) for parent, child, T, at in edges}
             edges = list(self._fixed.values())
-        return [("", transforms_message(self._types, edges))]
+        return [("", transforms_message(edges))]
 
     def _picture(self, content: Picture, stamp: float) -> Messages:
         """As images and compressed, as somebody listens; if nobody is known to, as the content says."""

@@ -10,7 +10,6 @@ import numpy as np
 from ggslam.messages.cdr_writer import CdrWriter
 from ggslam.messages.contents import Path, Pose
 from ggslam.messages.pose_numbers import position_and_quaternion
-from ggslam.messages.ros2_images import header
 from ggslam.messages.sound_content import plain_text
 from ggslam.messages.stamps import seconds_and_nanoseconds
 from ggslam.middleware.types import MessageTypes
@@ -42,28 +41,23 @@ def pose(types: MessageTypes, T: np.ndarray) -> Any:
     )  # fmt: skip
 
 
-def transforms_message(types: MessageTypes, edges: list[Edge]) -> bytes:
-    """tf2_msgs/TFMessage."""
-    made = []
+def transforms_message(edges: list[Edge]) -> bytes:
+    """tf2_msgs/TFMessage. By hand, as it goes out after every frame."""
+    writer = CdrWriter()
+    writer.numbers("I", len(edges))
     for parent, child, T, stamp in edges:
-        numbers = position_and_quaternion(T)
-        transform = types.make(
-            "geometry_msgs/msg/Transform", translation=vector(types, numbers[:3]),
-            rotation=quaternion(types, numbers[3:]),
-        )  # fmt: skip
-        made.append(
-            types.make(
-                "geometry_msgs/msg/TransformStamped", header=header(types, plain_text(parent), stamp),
-                child_frame_id=plain_text(child), transform=transform,
-            )
-        )  # fmt: skip
-    return types.encode(TRANSFORMS, types.make(TRANSFORMS, transforms=made))
+        write_header(writer, plain_text(parent), stamp)
+        writer.text(plain_text(child))
+        writer.numbers("d", *position_and_quaternion(T))
+    return writer.content()
 
 
-def pose_message(types: MessageTypes, content: Pose, stamp: float) -> bytes:
+def pose_message(content: Pose, stamp: float) -> bytes:
     """geometry_msgs/PoseStamped."""
-    made = types.make(POSE, header=header(types, plain_text(content.frame), stamp), pose=pose(types, content.T))
-    return types.encode(POSE, made)
+    writer = CdrWriter()
+    write_header(writer, plain_text(content.frame), stamp)
+    writer.numbers("d", *position_and_quaternion(content.T))
+    return writer.content()
 
 
 def path_message(content: Path, stamp: float) -> bytes:
