@@ -91,7 +91,7 @@ def test_a_forced_correction_moves_odom_and_not_the_camera_in_it(room: Path, tmp
 def test_everything_is_told_and_the_end_is_the_map_as_saved(room: Path, tmp_path: Path) -> None:
     outlet = KeptOutlet()
     publisher = MapPublisher([(outlet, True)], LIVE)
-    with overridden(LiveContentsTuning, min_rest_s=0.0, processor_share=10.0, picture_every_s=0.0):
+    with overridden(LiveContentsTuning, min_rest_s=0.0, map_share=10.0, image_share=10.0, picture_every_s=0.0):
         contents = LiveContents(publisher)
         outcome = run_of(room, tmp_path / "run", contents.follow)
         contents.finish(outcome.result, outcome.folder)
@@ -114,7 +114,7 @@ def test_what_it_costs_is_bounded(room: Path, tmp_path: Path) -> None:
     """With a budget of nothing, one copy of the map is made and no image is sent; poses go out all the same."""
     outlet = KeptOutlet()
     publisher = MapPublisher([(outlet, True)], LIVE)
-    with overridden(LiveContentsTuning, min_rest_s=0.0, processor_share=0.0, ahead_s=0.0):
+    with overridden(LiveContentsTuning, min_rest_s=0.0, map_share=0.0, image_share=0.0, ahead_s=0.0):
         contents = LiveContents(publisher)
         run_of(room, tmp_path / "run", contents.follow, 12)
         contents.stop()

@@ -181,7 +181,7 @@ def test_a_run_shows_volumes_and_has_them_without_a_recording(room: Path, tmp_pa
     few = ["mapping.iterations_per_frame=2", "refine_iterations=10"]
     recording = Path(copytree(room, tmp_path / "recording"))
     request = RunRequest(SequenceRequest(recording), out=tmp_path / "run", overrides=few, evaluate=False, check=False)
-    with overridden(LiveContentsTuning, min_rest_s=0.0, processor_share=10.0):
+    with overridden(LiveContentsTuning, min_rest_s=0.0, map_share=10.0, image_share=10.0):
         contents = LiveContents(publisher, robots={"": Robot()})
         outcome = execute(request, follower=contents.follow)
         live = len(outlet.of(c.MESH.name))

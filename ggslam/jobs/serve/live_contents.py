@@ -2,9 +2,9 @@
 """Follows a run and publishes it as it grows, at a small, bounded cost.
 
 Poses and frames go out after every frame. For the rest the thread of the run copies the map now and then, and another
-thread makes contents of the copy. Images and copies wait until all of publishing, writing messages included, has used
-no more than `LiveContentsTuning.processor_share` of the program's processor time. What nobody listens to is neither
-copied nor made.
+thread makes contents of the copy. Images wait until those before, writing messages included, have used no more than
+`LiveContentsTuning.image_share` of the program's processor time, and copies until those before and what was made of
+them have used no more than `LiveContentsTuning.map_share`. What nobody listens to is neither copied nor made.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from ggslam.jobs.serve.channels import (
     TF,
     TF_STATIC,
     VERDICTS,
+    Flow,
 )
 from ggslam.jobs.serve.frames_tree import T_OPTICAL_CAMERA, FramesTree, fixed_frames
 from ggslam.jobs.serve.keyframe_volumes import Floor, KeyframeVolumes, PlacedKeyframe, keyframes_now
@@ -68,10 +69,12 @@ _log = logging.getLogger(__name__)
 class LiveContentsTuning(Tuning):
     """What publishing a growing map costs and shows."""
 
-    processor_share = 0.025
-    """Share of the program's processor time that publishing may take."""
+    map_share = 0.03
+    """Share of the program's processor time that copies of the map, and what is made of them, may take."""
+    image_share = 0.01
+    """The same of the camera's images."""
     ahead_s = 0.1
-    """Processor seconds that may be used before."""
+    """Processor seconds that either may use before."""
     look_s = 0.2
     """Seconds between two looks whether there is time for the next copy."""
     min_rest_s = 1.0
@@ -140,7 +143,7 @@ class LiveContents:
         """How many times the map was copied."""
         self.follow_s = 0.0
         """Seconds that the run's own thread spent here."""
-        self._cpu_s, self._began_cpu = 0.0, time.process_time()
+        self._map_s, self._follow_s, self._began_cpu = 0.0, 0.0, time.process_time()
         self._thread = threading.Thread(target=self._work, name="publish-map", daemon=True)
         self._thread.start()
 
@@ -152,16 +155,22 @@ class LiveContents:
         if frame.camera_number == 0:
             self._follow(slam, frame, report)
         self.follow_s += time.perf_counter() - began
-        self._cpu_s += time.thread_time() - began_cpu
+        self._follow_s += time.thread_time() - began_cpu
 
     @property
     def cpu_s(self) -> float:
         """Processor seconds that publishing took so far."""
-        return self._cpu_s + self._publisher.cpu_s
+        return self._map_s + self._follow_s + sum(self._publisher.cpu_s(flow) for flow in Flow)
 
-    def _may_spend(self) -> bool:
+    def _may_spend(self, taken_s: float, share: float) -> bool:
         used = time.process_time() - self._began_cpu
-        return self.cpu_s < LiveContentsTuning.ahead_s + LiveContentsTuning.processor_share * used
+        return taken_s < LiveContentsTuning.ahead_s + share * used
+
+    def _may_copy(self) -> bool:
+        return self._may_spend(self._map_s + self._publisher.cpu_s(Flow.map), LiveContentsTuning.map_share)
+
+    def _may_send_pictures(self) -> bool:
+        return self._may_spend(self._publisher.cpu_s(Flow.images), LiveContentsTuning.image_share)
 
     def _follow(self, slam: Slam, frame: Frame, report: StepReport) -> None:
         stamp = frame.timestamp
@@ -175,7 +184,7 @@ class LiveContents:
             self._publisher.put(POSE, Pose(MAP, T @ T_OPTICAL_CAMERA), stamp, keep=False)
             self._send_movers(slam, frame, T)
         now = time.monotonic()
-        if now - self._picture_at >= LiveContentsTuning.picture_every_s and self._may_spend():
+        if now - self._picture_at >= LiveContentsTuning.picture_every_s and self._may_send_pictures():
             self._picture_at = now
             self._send_pictures(frame)
         if now - self._verdict_at >= LiveContentsTuning.verdict_every_s:
@@ -237,7 +246,10 @@ class LiveContents:
         if not self._ready.is_set() or not slam.mapper.keyframes or not (heavy or self._floor_due):
             return
         self._ready.clear()
+        began = time.thread_time()
         snapshot = self._snapshot_of(slam, T, stamp)
+        self._map_s += (took := time.thread_time() - began)
+        self._follow_s -= took
         self.copies += 1
         with self._given:
             self._snapshot = snapshot
@@ -277,7 +289,7 @@ class LiveContents:
                 self._show(snapshot)
             except Exception:  # the run goes on
                 _log.exception("a map could not be published")
-            self._cpu_s += time.thread_time() - began_cpu
+            self._map_s += time.thread_time() - began_cpu
             self._rest(began)
             self._ready.set()
 
@@ -286,7 +298,7 @@ class LiveContents:
         with self._given:
             while not self._ended:
                 rested = time.monotonic() - since >= LiveContentsTuning.min_rest_s
-                if rested and self._may_spend():
+                if rested and self._may_copy():
                     return
                 self._given.wait(LiveContentsTuning.look_s)
 

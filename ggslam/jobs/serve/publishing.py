@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import Any
 
+from ggslam.jobs.serve.channels import Flow
 from ggslam.jobs.serve.sending import ChannelCounts, Given, OutletSender
 from ggslam.messages.contents import Channel, Content
 from ggslam.messages.outlet import Outlet
@@ -85,10 +86,9 @@ class MapPublisher:
 
     # --- figures -----------------------------------------------------------------------------------------------------
 
-    @property
-    def cpu_s(self) -> float:
-        """Processor seconds that writing messages took."""
-        return sum(sender.cpu_s for sender in self.senders)
+    def cpu_s(self, flow: Flow) -> float:
+        """Processor seconds that writing messages of a kind took."""
+        return sum(sender.cpu_s[flow] for sender in self.senders)
 
     def counts(self) -> dict[str, dict[str, ChannelCounts]]:
         """By outlet and channel."""
@@ -98,6 +98,7 @@ class MapPublisher:
         """The same for files: of each outlet its channels, what it could not take, and why, if it failed."""
         return {
             "seconds": time.monotonic() - self._began,
+            "processor_seconds": {flow.value: self.cpu_s(flow) for flow in Flow},
             "outlets": {
                 sender.outlet.name: {
                     "channels": {name: asdict(counts) for name, counts in sorted(sender.counts.items())},

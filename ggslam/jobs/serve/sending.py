@@ -95,7 +95,7 @@ class OutletSender:
     ) -> None:  # fmt: skip
         self.outlet, self.is_file, self._joined = outlet, is_file, joined
         self.counts: dict[str, ChannelCounts] = {}
-        self.cpu_s = 0.0
+        self.cpu_s = dict.fromkeys(Flow, 0.0)
         """Processor seconds that this thread spent on messages."""
         self.failure = ""
         """Why something could not be sent, the first time."""
@@ -209,7 +209,7 @@ class OutletSender:
         try:
             self._try(given)
         finally:
-            self.cpu_s += time.thread_time() - began
+            self.cpu_s[flow_of(given.channel)] += time.thread_time() - began
 
     def _try(self, given: Given) -> None:
         try:

@@ -100,10 +100,10 @@ def _nearest(points: np.ndarray, middles: np.ndarray, count: np.ndarray) -> np.n
         middles: [M, 3].
         count: [M], of the points of each group.
     """
-    group = np.repeat(np.arange(len(count)), count)
-    far = np.square(points - middles[group]).sum(axis=1)
-    by_group = np.lexsort((far, group))
-    return by_group[np.cumsum(count) - count]
+    first = np.cumsum(count) - count
+    far = np.square(points - np.repeat(middles, count, axis=0)).sum(axis=1)
+    nearest = np.flatnonzero(far == np.repeat(np.minimum.reduceat(far, first), count))
+    return nearest[np.searchsorted(nearest, first)]
 
 
 def at_most(means: np.ndarray, rgb: np.ndarray, ids: np.ndarray, most: int) -> ThinPoints:
