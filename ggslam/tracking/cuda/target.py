@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import weakref
 from ctypes import sizeof
 
@@ -12,8 +11,7 @@ import torch
 
 from ggslam.abi.arrays import address
 from ggslam.abi.core import Voxel, VoxelMoments
-from ggslam.abi.cuda import VoxelBlock, VoxelLevel, VoxelLevelJob, VoxelSlot
-from ggslam.cuda.library import CudaLibrary
+from ggslam.abi.cuda import TrackJob, VoxelBlock, VoxelLevel, VoxelLevelJob, VoxelSlot
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Upload
 from ggslam.native.loader import load_library
@@ -32,27 +30,27 @@ class CudaTarget:
     """The newest target on the device. It is sent when it is first used, in one copy; the next one takes its memory.
 
     Args:
-        library: the compiled kernels.
         device: where to.
     """
 
-    def __init__(self, library: CudaLibrary, device: torch.device) -> None:
-        self._library, self._device = library, device
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
         self._core = load_library()
         self._memory = GrowingMemory(device)
         self._upload = Upload(device)
         self._target: weakref.ref[GicpTarget] | None = None
-        self._levels: tuple[VoxelLevel, VoxelLevel] | None = None
 
-    def levels(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
-        """Fine and coarse voxels of the target, valid until another one is asked for."""
-        if self._levels is None or self._target is None or self._target() is not target:
-            self._levels = None
-            self._levels = self._send(target)
+    def fill(self, target: GicpTarget, job: TrackJob) -> None:
+        """Sets the levels of the job to those of the target, and whether they have to be made."""
+        job.makes_levels = 0
+        if self._target is None or self._target() is not target:
+            self._target = None
+            job.fine, job.coarse = self._send(target)
+            job.align.fine, job.align.coarse = job.fine.level, job.coarse.level
+            job.makes_levels = 1
             self._target = weakref.ref(target)
-        return self._levels
 
-    def _send(self, target: GicpTarget) -> tuple[VoxelLevel, VoxelLevel]:
+    def _send(self, target: GicpTarget) -> tuple[VoxelLevelJob, VoxelLevelJob]:
         """Sends blocks and voxels of both levels; of voxels without shapes the moments, for the device to finish."""
         core, handle, settings = self._core, target.gathered_handle, target.settings_to_finish
         copy, size = core.ggslam_gicp_target_voxels, sizeof(Voxel)
@@ -72,14 +70,13 @@ class CudaTarget:
         for level in (0, 1):
             job = VoxelLevelJob(
                 blocks=first + begins[2 + level], voxels=first + begins[level], block_count=blocks[level],
-                voxel_count=voxels[level], stream=self._library.stream(self._device), device=self._device.index or 0,
+                voxel_count=voxels[level], device=self._device.index or 0,
             )  # fmt: skip
             if settings is not None:
                 job.moments, job.settings = first + begins[level], settings
                 job.voxels = self._memory.block(f"voxels {level}", sizeof(Voxel) * voxels[level]).data_ptr()
             job.level = self._level(level, job, target.voxel)
-            self._library.call("voxel_level", ctypes.byref(job))
-            made.append(job.level)
+            made.append(job)
         return made[0], made[1]
 
     def _level(self, level: int, job: VoxelLevelJob, voxel: float) -> VoxelLevel:
