@@ -171,7 +171,7 @@ class GicpTracker(Tracker):
         guess, coarse = judge.first_start()
         photometric = self._photometric_part(judge.view) if mode == "always" or self.state.motion.lost else None
         found = self._align_held(judge, points, target, guess, photometric, coarse)
-        photometric = _textured(photometric)
+        photometric = _with_texture(photometric)
         if photometric is not None and not judge.explains_greys(found) and not found.degenerate:
             # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
             found = self._align(points, target, guess, None, coarse)
@@ -181,7 +181,7 @@ class GicpTracker(Tracker):
             photometric = self._photometric_part(judge.view)
             if photometric is not None:
                 found = self._align_held(judge, points, target, guess, photometric, coarse)
-                photometric = _textured(photometric)
+                photometric = _with_texture(photometric)
         sure = mode == "never" or not found.degenerate or judge.explains_greys(found)
         if sure and judge.is_convincing(found) and not judge.is_far_off(found):
             return found, ""
@@ -224,7 +224,7 @@ class GicpTracker(Tracker):
         settings, least = self.settings.photometric, GicpTrackerTuning.min_textured
         greys, earlier = self.engine.greys, self.state.motion.reference_view
         if greys is not None:
-            return None if earlier is None else greys.part(view, earlier, settings, self._shrinking(), least)
+            return None if earlier is None else greys.part(view, earlier, settings, self._shrink_factor(), least)
         reference = self._current_reference()
         if reference is None:
             return None
@@ -238,12 +238,12 @@ class GicpTracker(Tracker):
             motion.reference = PhotometricReference.from_view(self._shrink(view), view.T_world_camera)
         return motion.reference
 
-    def _shrinking(self) -> int:
+    def _shrink_factor(self) -> int:
         """By how much images are reduced for their grey values."""
         return self.settings.photometric.shrink * max(1, round(self.camera.width / 320))
 
     def _shrink(self, view: FeatureView) -> GreyDepth:
-        return GreyDepth.from_images(view.color, view.depth, self.camera, self._shrinking())
+        return GreyDepth.from_images(view.color, view.depth, self.camera, self._shrink_factor())
 
     def _retry(
         self, judge: PoseJudge, points: PointSource, target: GicpTarget, found: AlignmentResult,
@@ -254,7 +254,7 @@ class GicpTracker(Tracker):
         best, reason = found, ""
         if photometric is not None and found.photometric_share == 0:  # all starts are compared by the same measure
             best = self._align(points, target, self.state.motion.predict(), photometric)
-            photometric = _textured(photometric)
+            photometric = _with_texture(photometric)
             best = found if photometric is None else best
         for name, guess, coarse in judge.other_starts():
             candidate = self._align(points, target, guess, photometric, coarse)
@@ -288,6 +288,6 @@ class GicpTracker(Tracker):
         return TrackingResult.by_gicp(pose, TrackingStatus.LOST, reason, points, found)
 
 
-def _textured(part: PhotometricSource | None) -> PhotometricSource | None:
+def _with_texture(part: PhotometricSource | None) -> PhotometricSource | None:
     """The part, unless an alignment has told that it has not enough texture."""
     return part if part is not None and part.has_texture else None

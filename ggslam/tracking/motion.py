@@ -31,7 +31,7 @@ class MotionTuning(Tuning):
     """...if it is above this value, in [0, 1]."""
 
 
-@savable(not_saved="reference")
+@savable(not_saved="reference before")
 @dataclass
 class CameraMotion:
     """Pose and motion of the camera.
@@ -46,7 +46,9 @@ class CameraMotion:
         greys: how much grey values of the last located frames differed from the reference, the newest first.
         wary: so many more frames are located as if something near moved.
         small: of the last frame, located or not, see `small_image`; None: there was none.
-        turned: float64 [4, 4], by how the image shifted, from the last located frame to the one at hand.
+        turned: float64 [4, 4], by how the image shifted, from the last located frame to the one at hand, once
+            `settle_turn` was called.
+        before: small image of the frame before, and the camera, if `turned` is still to be made; None: it is made.
     """
 
     T_world_camera: Pose
@@ -59,14 +61,24 @@ class CameraMotion:
     wary: int = 0
     small: Annotated[np.ndarray, Form("f4", "h", "w")] | None = None
     turned: Pose = field(default_factory=lambda: np.eye(4))
+    before: tuple[np.ndarray | None, Camera] | None = None
 
     def watch(self, color: np.ndarray, camera: Camera) -> None:
-        """Sees the next frame's colour uint8 [H, W, 3]: `turned`."""
-        before, self.small = self.small, small_image(color)
-        step = (
-            np.eye(4) if before is None or before.shape != self.small.shape else image_turn(before, self.small, camera)
-        )
-        self.turned = self.turned @ step if self.lost else step
+        """Sees the next frame's colour uint8 [H, W, 3]."""
+        if self.lost:
+            self.settle_turn()
+        turned, self.before = self.turned, (self.small, camera)
+        self.small = small_image(color)
+        if self.lost:
+            self.turned = turned @ self.settle_turn()
+
+    def settle_turn(self) -> np.ndarray:
+        """Makes `turned` of the last two frames, where few ask for it; gives it."""
+        if self.before is not None:
+            (before, camera), now, self.before = self.before, self.small, None
+            alike = before is not None and now is not None and before.shape == now.shape
+            self.turned = image_turn(before, now, camera) if alike else np.eye(4)  # type: ignore[arg-type]
+        return self.turned
 
     def predict(self) -> np.ndarray:
         """The next pose [4, 4] at constant velocity; of a lost camera, as the images shifted since it was located."""
@@ -91,6 +103,7 @@ class CameraMotion:
 
     def lose(self) -> None:
         """A frame was not located: the camera stays where it was last known, standing still."""
+        self.settle_turn()
         self.velocity, self.lost = np.eye(4), True
 
     def restart(self, view: FeatureView, T_world_camera: np.ndarray) -> None:

@@ -102,9 +102,9 @@ class CudaTrackingEngine:
         stride = grid_stride(int(np.count_nonzero(self._depth.staged > 0)), settings.count)
         arguments = native_points_settings(self.camera, settings, noise, stride, depth)
         border = arguments.window * arguments.window_step
-        columns, rows = (
-            max(0, math.ceil((size - 2 * border - stride // 2) / stride)) for size in (depth.shape[1], depth.shape[0])
-        )
+        first = 2 * border + stride // 2
+        columns = max(0, math.ceil((self.camera.width - first) / stride))
+        rows = max(0, math.ceil((self.camera.height - first) / stride))
         room = columns * rows
         found = CudaPoints(room, self._point_blocks.take(words_for(room)), self._extract, self._ring)
         job = self._job.points

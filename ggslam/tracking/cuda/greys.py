@@ -157,7 +157,10 @@ class CudaGreys:
         self._made = self._view_of = None
 
     def _image_of(self, view: FeatureView, shrink: int) -> _Image | None:
-        return next((image for image in self._images if image.view is view and image.shrink == shrink), None)
+        for image in self._images:
+            if image.view is view and image.shrink == shrink:
+                return image
+        return None
 
     def _place_for(self, view: FeatureView, shrink: int, other: FeatureView) -> _Image:
         """Where a view's image goes: not where that of another view is."""

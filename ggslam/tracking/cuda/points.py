@@ -49,8 +49,9 @@ class CudaPoints:
 
     def arrays(self) -> PointArrays:
         """Addresses on the device; this object must stay alive."""
-        begin, room = self.block.address, self.room
-        return PointArrays(begin, *(begin + 4 * (_BEGIN + room * words) for words in _BEFORE))
+        header, room = self.block.address, 4 * self.room
+        first = header + 4 * _BEGIN
+        return PointArrays(header, first, first + 3 * room, first + 6 * room, first + 12 * room, first + 14 * room)
 
     @property
     def is_extracted(self) -> bool:
