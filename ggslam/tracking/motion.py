@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Annotated, Any
 
 import numpy as np
@@ -124,7 +125,7 @@ class CameraMotion:
         that moves may have taken the pose along."""
         if len(self.greys) < MotionTuning.frames:
             return False
-        return residual > max(MotionTuning.sudden_factor * float(np.median(self.greys)), MotionTuning.min_sudden)
+        return residual > max(MotionTuning.sudden_factor * median(self.greys), MotionTuning.min_sudden)
 
     def note_greys(self, residual: float) -> None:
         """The grey values of a located frame differ by so much from the reference."""

@@ -145,10 +145,10 @@ class CudaGreys:
         job.blur_side, job.blur_middle = float(weights[0, 0]), float(weights[1, 0])
         job.min_squared_gradient = settings.min_gradient**2
         job.width, job.height, job.shrink = self._camera.width, self._camera.height, shrink
-        job.most_points = settings.points
-        points = self._memory.block("points", _COUNT_BYTES + 16 * settings.points).data_ptr()
+        most = job.most_points = min(settings.points, camera.width * camera.height)
+        points = self._memory.block("points", _COUNT_BYTES + 16 * most).data_ptr()
         job.count, job.points = points, points + _COUNT_BYTES
-        job.intensity = job.points + 12 * settings.points
+        job.intensity = job.points + 12 * most
         size = self._library.functions.ggslam_cuda_grey_bytes(ctypes.byref(job))
         job.workspace = self._memory.block("workspace", size).data_ptr()
         pixels = 4 * camera.width * camera.height
