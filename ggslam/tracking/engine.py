@@ -52,6 +52,9 @@ class TrackingEngine(Protocol):
     ) -> AlignmentResult:  # fmt: skip
         """Aligns points that this engine gave; see `gicp.align`."""
 
+    def expect_target(self, target: GicpTarget) -> None:
+        """See `Tracker.expect_target`."""
+
 
 @dataclass(frozen=True)
 class CpuTrackingEngine:
@@ -81,3 +84,6 @@ class CpuTrackingEngine:
         """See `TrackingEngine`."""
         assert photometric is None or isinstance(photometric, PhotometricPart)
         return align(source.read(), target, T_world_camera_guess, settings, noise, self.context, photometric)
+
+    def expect_target(self, target: GicpTarget) -> None:
+        """Nothing: it is where it is used."""

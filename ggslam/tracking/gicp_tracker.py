@@ -77,6 +77,10 @@ class GicpTracker(Tracker):
     def engine(self, engine: TrackingEngine) -> None:
         self._given_engine = engine
 
+    def expect_target(self, target: GicpTarget) -> None:
+        """See `Tracker.expect_target`."""
+        self.engine.expect_target(target)
+
     def track(self, frame: Frame) -> TrackingResult:
         """See `Tracker.track`."""
         target, motion = self.target, self.state.motion

@@ -77,6 +77,9 @@ class RigTrackingEngine:
         told = [overlap for overlap in self.overlaps(found, settings, noise) if overlap is not None]
         return dataclasses.replace(found, overlap=max(told, default=found.overlap))
 
+    def expect_target(self, target: GicpTarget) -> None:
+        """Nothing: it is where it is used."""
+
     def overlaps(self, found: AlignmentResult, settings: AlignSettings, noise: DepthNoise) -> list[float | None]:
         """Share of each view's points with an inlier match; None of a view with too few points to tell.
 

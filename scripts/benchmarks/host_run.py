@@ -21,7 +21,8 @@ from host_counts import CallCounter, TimedFunctions, count_operations, take_reco
 from ggslam.cuda.library import CudaLibrary
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
-from ggslam.slam.config import load_config
+from ggslam.slam.config import Config, load_config
+from ggslam.slam.filters.depth_edges import DepthEdges
 from ggslam.slam.slam import Slam
 from ggslam.tracking.residual_noise import ResidualNoise
 
@@ -72,6 +73,14 @@ def settings(options: argparse.Namespace, *more: str) -> list[str]:
     return [*few, *every, *options.set, *more]
 
 
+def start(frames: list[Frame], config: Config, library: CudaLibrary | None) -> Slam:
+    """A run that knows already what it looks for in its first frames: whether outlines of depth are sharp."""
+    slam = Slam(frames[0].camera, config, has_masks=frames[0].mask is not None, library=library)
+    for chain in slam.chains:
+        chain.get(DepthEdges).soft = False
+    return slam
+
+
 def counted_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
     """Under the watch."""
     looks, steps, found = Looks(), [], Counter[str]()
@@ -80,7 +89,7 @@ def counted_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
         count_operations(watch, found)
         calls = CallCounter(found)
         config = load_config(None, settings(options, "device=cuda"))
-        slam = Slam(frames[0].camera, config, has_masks=frames[0].mask is not None)
+        slam = start(frames, config, None)
         for frame in frames:
             take_records(watch, found)
             with calls.counting():
@@ -98,7 +107,7 @@ def timed_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
     functions = TimedFunctions(library.functions, Counter())
     library.functions = functions
     config = load_config(None, settings(options))
-    slam = Slam(frames[0].camera, config, has_masks=frames[0].mask is not None, library=library)
+    slam = start(frames, config, library)
     gc.collect()
     gc.freeze()
     for frame in frames:

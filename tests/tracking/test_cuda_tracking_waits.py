@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,20 @@ import pytest
 from device_watch import DeviceTensor, DeviceWatch
 from torch.utils._pytree import tree_flatten
 
+from ggslam.cuda.library import CudaLibrary
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
+from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.gicp_tracker import GicpTracker
-from ggslam.tracking.settings import AlignSettings, PhotometricMode, PhotometricSettings, PointSettings, TrackerSettings
+from ggslam.tracking.settings import (
+    AlignSettings,
+    DepthNoise,
+    PhotometricMode,
+    PhotometricSettings,
+    PointSettings,
+    TrackerSettings,
+)
 from ggslam.tracking.surface import MeasuredSurface
 
 
@@ -74,3 +84,23 @@ def test_a_frame_is_one_call_and_one_wait(
             assert len(watch.waits) == waited
             assert np.isfinite(result.points.read().points).all() and len(result.points.read()) == len(result.points)
     assert tracker.state.residuals.residuals  # some frames were looked at
+
+
+def test_a_target_may_be_got_ready_by_another_thread(
+    frames: list[Frame], target: GicpTarget, cuda_library: CudaLibrary
+) -> None:
+    settings, noise, align = PointSettings(count=1500), DepthNoise(), AlignSettings(coarse_points=500)
+    other = MeasuredSurface(TrackerSettings().target, NativeContext(1))
+    engine = CudaTrackingEngine(frames[0].camera, library=cuda_library)
+    points = engine.points(frames[2].depth, settings, noise)
+    assert frames[2].T_world_camera is not None
+    aims = (target, other.add(points, frames[2].T_world_camera), target)
+    expected = [engine.align(points, aim, frames[2].T_world_camera, align, noise) for aim in aims]
+    with ThreadPoolExecutor(1) as beside:
+        for aim, one in zip(aims, expected, strict=True):
+            beside.submit(engine.expect_target, aim).result()
+            found = engine.align(points, aim, frames[2].T_world_camera, align, noise)
+            assert np.array_equal(found.T_world_camera, one.T_world_camera) and found.cost == one.cost
+            engine.expect_target(aims[0])  # something else is staged: the next is copied again
+            found = engine.align(points, aim, frames[2].T_world_camera, align, noise)
+            assert found.cost == one.cost

@@ -148,6 +148,10 @@ class CudaTrackingEngine:
             photometric.textured = int(found[AlignResult.TEXTURED])
         return cuda_alignment(found, matched, max(1, room), source.looks, settings)
 
+    def expect_target(self, target: GicpTarget) -> None:
+        """See `Tracker.expect_target`."""
+        self._target.stage(target)
+
     # --- parts -------------------------------------------------------------------------------------------------------
 
     def _extract(self, points: CudaPoints) -> None:
