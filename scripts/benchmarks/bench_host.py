@@ -13,8 +13,8 @@ first frames (whether outlines of depth are sharp, 12 ms a frame) is decided bef
     counts  under the tests' device watch. Calls of Python functions and of C functions (`sys.setprofile`; all threads
             of Python, not the compiled core's), operations of torch and how many tensors they allocate on the device,
             page-locked allocations, calls of the kernels' library (each function of it, those that only ask for sizes
-            included), waits, copies and their bytes. The watch's own work is left out; a stand-in of torch.cuda counts
-            as one call.
+            included), waits, copies of torch and their bytes (not those within a call of the library, such as the
+            tracker's result). The watch's own work is left out; a stand-in of torch.cuda counts as one call.
     time    without the watch, tensors on the CPU: a step by the clock, and processor time of its thread, both less what
             calls of the kernels' library took. It has all of Python, the compiled core's work of this thread, OpenCV,
             waiting for threads, and torch's operations as the CPU does them: copies are made here that a GPU makes by

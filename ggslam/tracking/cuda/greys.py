@@ -164,7 +164,8 @@ class CudaGreys:
 
     def _place_for(self, view: FeatureView, shrink: int, other: FeatureView) -> _Image:
         """Where a view's image goes: not where that of another view is."""
-        image = next(image for image in self._images if image.view is not other)
+        first, second = self._images
+        image = second if first.view is other else first
         image.view, image.shrink = view, shrink
         return image
 
