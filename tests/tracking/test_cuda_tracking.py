@@ -353,3 +353,18 @@ def test_what_is_not_asked_for_is_not_fetched(
     assert len(matches.voxels) == len(matches.squared_distances) == len(points) and len(fetched) == 2
     moved = replace(found, T_world_camera=np.eye(4))
     assert np.array_equal(moved.matches.read().voxels, matches.voxels) and len(fetched) == 2
+
+
+def test_points_that_were_not_asked_for_outlive_the_next_depth_image(
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget
+) -> None:
+    first, second = (engine.points(frames[k].depth, POINTS, NOISE) for k in (2, 3))
+    one, two = (native.points(frames[k].depth, POINTS, NOISE) for k in (2, 3))
+    check_points(first, one)
+    check_points(second, two)
+    found, expected = (
+        e.align(p, target, truth_of(frames[2]), SETTINGS, NOISE) for e, p in ((engine, first), (native, one))
+    )
+    assert np.abs(se3_log(inverse(expected.T_world_camera) @ found.T_world_camera)).max() < 1e-5
+    with pytest.raises(TypeError, match="on the device"):
+        engine.align(one, target, np.eye(4), SETTINGS, NOISE)
