@@ -10,5 +10,5 @@ import torch
 def address(array: np.ndarray | torch.Tensor | None) -> int | None:
     """Address of the first element, which the caller keeps alive and contiguous; None stays None (a null pointer)."""
     if isinstance(array, np.ndarray):
-        return array.ctypes.data
+        return array.__array_interface__["data"][0]  # array.ctypes.data makes objects of Python
     return None if array is None else array.data_ptr()

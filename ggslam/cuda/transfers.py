@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 
-class _Marker:
+class Marker:
     """A point in the work of torch's current stream."""
 
     def __init__(self, device: torch.device) -> None:
@@ -51,7 +51,7 @@ class Upload:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._buffer = _allocate_page_locked(1, device)
-        self._sent = _Marker(device)
+        self._sent = Marker(device)
 
     def begin(self, size: int) -> np.ndarray:
         """uint8 [size] to be filled."""
@@ -78,7 +78,7 @@ class Download:
         self.source = torch.zeros(count, dtype=torch.float64, device=device)
         """On the device."""
         self._copy = _allocate_page_locked(8 * count, device).view(torch.float64)
-        self._done = _Marker(device)
+        self._done = Marker(device)
 
     def wait(self) -> np.ndarray:
         """What `source` is when everything started before is done: the host's one wait."""
@@ -104,7 +104,7 @@ def download(*tensors: torch.Tensor) -> list[np.ndarray]:
     copies = [torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True) for tensor in tensors]
     for copy, tensor in zip(copies, tensors, strict=True):
         copy.copy_(tensor, non_blocking=True)
-    done = _Marker(tensors[0].device)
+    done = Marker(tensors[0].device)
     done.set()
     done.wait()
     return [copy.numpy() for copy in copies]
@@ -121,7 +121,7 @@ class HostMirror:
     def __init__(self, source: torch.Tensor) -> None:
         self._source = source
         self._arriving = torch.zeros(source.shape, dtype=source.dtype, pin_memory=source.device.type == "cuda")
-        self._sent = _Marker(source.device)
+        self._sent = Marker(source.device)
         self._under_way = False
         self._lock = threading.Lock()
         self._newest = self._arriving.numpy().copy()

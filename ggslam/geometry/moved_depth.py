@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+
 import numpy as np
 
 from ggslam.scene.camera import Camera
@@ -12,11 +15,18 @@ from ggslam.scene.poses import inverse
 def largest_shift(T_new_old: np.ndarray, camera: Camera, depth_m: float) -> float:
     """About how many pixels what is seen at a depth (metres) shifts in the image when the camera makes a motion
     [4, 4]."""
-    corners = np.array([[u, v] for u in (0, camera.width - 1) for v in (0, camera.height - 1)], float)
-    rays = np.column_stack([(corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(4)])
+    corners, rays = _corners(camera)
     moved = depth_m * rays @ T_new_old[:3, :3].T + T_new_old[:3, 3]
     seen = moved[:, :2] / np.maximum(moved[:, 2:], 1e-6) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    return float(np.linalg.norm(seen - corners, axis=1).max())
+    apart = seen - corners
+    return math.sqrt(np.add.reduce(apart * apart, axis=1).max())
+
+
+@lru_cache(maxsize=8)
+def _corners(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels at an image's corners [4, 2] and their rays [4, 3]."""
+    corners = np.array([[u, v] for u in (0, camera.width - 1) for v in (0, camera.height - 1)], float)
+    return corners, np.column_stack([(corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(4)])
 
 
 def moved_depth(depth: np.ndarray, camera: Camera, T_new_old: np.ndarray) -> np.ndarray:

@@ -40,7 +40,11 @@ def _median(depth: np.ndarray) -> float:
     """Of the depths that are known, 0 if none is."""
     seen = depth[::8, ::8]
     seen = seen[(seen > 0) & np.isfinite(seen)]
-    return float(np.median(seen)) if len(seen) else 0.0
+    if not len(seen):
+        return 0.0
+    seen.sort()
+    half = len(seen) // 2
+    return float(seen[half] if len(seen) % 2 else (seen[half - 1] + seen[half]) / 2)
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:

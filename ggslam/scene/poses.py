@@ -90,12 +90,14 @@ def transform_points(points: np.ndarray, T_to_from: np.ndarray) -> np.ndarray:
 
 def turning_angle(T_one: np.ndarray, T_other: np.ndarray) -> float:
     """Angle in radians between the rotations of two poses [4, 4]."""
-    return 2.0 * math.asin(min(1.0, float(np.linalg.norm(T_one[:3, :3] - T_other[:3, :3])) / math.sqrt(8.0)))
+    apart = (T_one[:3, :3] - T_other[:3, :3]).ravel()
+    return 2.0 * math.asin(min(1.0, math.sqrt(apart.dot(apart)) / math.sqrt(8.0)))
 
 
 def separation(T_one: np.ndarray, T_other: np.ndarray) -> tuple[float, float]:
     """How far two poses [4, 4] are apart: metres and degrees."""
-    return float(np.linalg.norm(T_one[:3, 3] - T_other[:3, 3])), math.degrees(turning_angle(T_one, T_other))
+    shift = T_one[:3, 3] - T_other[:3, 3]
+    return math.sqrt(shift.dot(shift)), math.degrees(turning_angle(T_one, T_other))
 
 
 def motion_of(T_new_old: np.ndarray, middle: np.ndarray) -> tuple[float, float]:
@@ -112,8 +114,8 @@ def to_matrix(T: np.ndarray) -> Matrix:
 
 def inverse(T: np.ndarray) -> np.ndarray:
     """Inverse of rigid transforms, [..., 4, 4]."""
-    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
+    R_t = T[..., :3, :3].swapaxes(-1, -2)
+    out = np.zeros(T.shape, T.dtype)
     out[..., :3, :3] = R_t
     out[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]
     out[..., 3, 3] = 1
@@ -123,8 +125,10 @@ def inverse(T: np.ndarray) -> np.ndarray:
 def orthonormalize(T: np.ndarray) -> np.ndarray:
     """The transform with its 3x3 part replaced by the nearest rotation (removes accumulated rounding)."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
-    out = np.eye(4)
-    out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    sign, out = np.zeros((3, 3)), np.zeros((4, 4))
+    sign[0, 0] = sign[1, 1] = out[3, 3] = 1.0
+    sign[2, 2] = np.linalg.det(U @ Vt)
+    out[:3, :3] = U @ sign @ Vt
     out[:3, 3] = T[:3, 3]
     return out
 

@@ -22,7 +22,7 @@ from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult
 
 
-@savable(not_saved="_surface _mapper _pager _masks publishing")
+@savable(not_saved="_surface _mapper _pager _masks _beside publishing")
 class MapCorrections:
     """Keeps the surface, which the tracker's thread reads, in step with the corrections that the mapper's makes.
 
@@ -40,6 +40,7 @@ class MapCorrections:
     ) -> None:
         self._surface, self._mapper, self._pager, self._masks = surface, mapper, pager, masks
         self.moves = []
+        self._beside: ThreadPoolExecutor | None = None
         self.publishing = threading.Lock()
         """Is held while the surface changes, or what the tracker reads beside it."""
 
@@ -70,9 +71,12 @@ class MapCorrections:
                 self._surface.add(tracking.points, tracking.T_world_camera)
             return
         tracking.points.read()  # what waits for the GPU is done in this thread
-        with ThreadPoolExecutor(1, thread_name_prefix="surface") as beside:
-            added = beside.submit(self.add_points, tracking)
+        if self._beside is None:
+            self._beside = ThreadPoolExecutor(1, thread_name_prefix="surface")
+        added = self._beside.submit(self.add_points, tracking)
+        try:
             meanwhile()
+        finally:
             added.result()
 
     def apply(self, correction: Correction, loops: LoopCloser) -> None:

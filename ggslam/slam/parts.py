@@ -89,6 +89,7 @@ def make_parts(
     surface = MeasuredSurface(config.tracking.target, context, None if pager is None else pager.archive)
     # A device makes the voxels' shapes itself; features are tracked on the CPU, which has them made here.
     surface.finish = library is None or config.tracker != "gicp"
+    surface.prepare = tracker.expect_target
     loops = LoopCloser(camera, config.loops, surface, tracker, context) if config.loops.enabled else None
     mapper = make_mapper(config, masks.active, context, library, compact)
     if pager is not None:

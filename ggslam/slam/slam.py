@@ -135,6 +135,7 @@ class Slam(RunState):
 
         # 4. Insert Gaussians where the map lacks what the keyframe shows, after removing what it looks through. Its
         #    place and its points are prepared meanwhile, in other threads.
+        tracking.points.send()
         chain.before_insertion(self.removal, frame, tracking)
         self.mapper.has_soft_outlines = bool(chain.get(DepthEdges).soft)
         if self.pager is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import io
 from array import array
-from dataclasses import astuple, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated
 
@@ -70,7 +70,8 @@ class StepLog:
             gaussians: of the map.
         """
         spent = _spent(times, loops_s, mapper.times)
-        sums, iterations = np.array(astuple(mapper.losses)), mapper.times.iterations
+        losses_so_far = mapper.losses
+        sums, iterations = np.array([getattr(losses_so_far, name) for name in _LOSSES]), mapper.times.iterations
         count, steps = iterations - self._iterations, mapper.times.steps
         made = steps - self._steps
         losses = (sums - self._losses) / made if made > 0 else np.full(len(sums), np.nan)

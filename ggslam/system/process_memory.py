@@ -27,6 +27,7 @@ class MemoryTuning(Tuning):
 
 
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
+_OWN_MEMORY = Path("/proc/self/statm")
 
 
 def peak_memory_bytes() -> int:
@@ -48,7 +49,7 @@ def peak_memory_mb() -> float:
 def resident_bytes() -> int:
     """Resident memory of this process now; where the system does not tell, the largest so far."""
     try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        return int(_OWN_MEMORY.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
         return peak_memory_bytes()
 

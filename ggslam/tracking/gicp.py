@@ -20,7 +20,7 @@ from ggslam.scene.origin import moved_pose
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.observability import PointSpread, about_point, observability
 from ggslam.tracking.photometric import PhotometricPoints, PhotometricReference
-from ggslam.tracking.points import FramePoints
+from ggslam.tracking.points import FramePoints, PointSource
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PhotometricSettings, TargetSettings
 
 
@@ -181,6 +181,21 @@ class AlignmentStatus(enum.Enum):
 
 
 @dataclass(frozen=True)
+class MatchedMedians:
+    """Of the points that have a match.
+
+    Attributes:
+        count: how many they are.
+        squared_distance: median of their squared point-to-plane distances, square metres.
+        depth: their median depth, metres.
+    """
+
+    count: int
+    squared_distance: float
+    depth: float
+
+
+@dataclass(frozen=True)
 class PointMatches:
     """What each point of a frame was matched to.
 
@@ -196,12 +211,24 @@ class PointMatches:
         """See `MatchSource`."""
         return self
 
+    def medians(self, points: PointSource) -> MatchedMedians:
+        """See `MatchSource`."""
+        matched = np.isfinite(self.squared_distances)
+        count = int(matched.sum())
+        if not count:
+            return MatchedMedians(0, 0.0, 0.0)
+        squared = np.median(self.squared_distances[matched])
+        return MatchedMedians(count, float(squared), float(np.median(points.read().z[matched])))
+
 
 class MatchSource(Protocol):
     """Matches, which may still have to be fetched."""
 
     def read(self) -> PointMatches:
         """The matches on the host."""
+
+    def medians(self, points: PointSource) -> MatchedMedians:
+        """What the matches of these points, which were aligned, say of them."""
 
 
 @dataclass(frozen=True)
@@ -259,6 +286,18 @@ class GicpTuning(Tuning):
     """Variance along the normal of a match of two planes: twice the default thickness. It scales the cost to metres."""
 
 
+class PhotometricSource(Protocol):
+    """The photometric terms of an alignment, made or still to be made."""
+
+    @property
+    def settings(self) -> PhotometricSettings:
+        """See there."""
+
+    @property
+    def has_texture(self) -> bool:
+        """False: an alignment told that they have too few points, and was made without them."""
+
+
 @dataclass(frozen=True)
 class PhotometricPart:
     """The photometric terms of an alignment: points of the frame, the image they are compared with, and settings."""
@@ -266,6 +305,11 @@ class PhotometricPart:
     points: PhotometricPoints
     reference: PhotometricReference
     settings: PhotometricSettings
+
+    @property
+    def has_texture(self) -> bool:
+        """See `PhotometricSource`."""
+        return True
 
 
 def native_align_settings(

@@ -17,7 +17,7 @@ from ggslam.system.plurals import quantity
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.engine import CpuTrackingEngine, TrackingEngine
-from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart
+from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, PhotometricPart, PhotometricSource
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import PointSource
@@ -76,6 +76,10 @@ class GicpTracker(Tracker):
     @engine.setter
     def engine(self, engine: TrackingEngine) -> None:
         self._given_engine = engine
+
+    def expect_target(self, target: GicpTarget) -> None:
+        """See `Tracker.expect_target`."""
+        self.engine.expect_target(target)
 
     def track(self, frame: Frame) -> TrackingResult:
         """See `Tracker.track`."""
@@ -138,12 +142,15 @@ class GicpTracker(Tracker):
         if self.state.motion.wary:
             near = min(settings.near_weight, self.settings.recovery.near_weight)
             settings = dataclasses.replace(settings, near_weight=near)
-        return self.engine.points(depth, settings, noise)
+        points = self.engine.points(depth, settings, noise)
+        if self.settings.noise is None and self.state.residuals.will_be_due():
+            points.expect_look()
+        return points
 
     def _look_at_residuals(self, points: PointSource, found: AlignmentResult) -> None:
         """Noise that was measured on the first frame is taken to be larger where frames do not lie on one another."""
         if self.settings.noise is None and self.noise is not None and self.state.residuals.due():
-            self.noise = self.state.residuals.observe(points.read(), found.matches.read().squared_distances, self.noise)
+            self.noise = self.state.residuals.observe_medians(found.matches.medians(points), self.noise)
 
     def _locate(
         self, view: FeatureView, points: PointSource, target: GicpTarget
@@ -168,6 +175,7 @@ class GicpTracker(Tracker):
         guess, coarse = judge.first_start()
         photometric = self._photometric_part(judge.view) if mode == "always" or self.state.motion.lost else None
         found = self._align_held(judge, points, target, guess, photometric, coarse)
+        photometric = _with_texture(photometric)
         if photometric is not None and not judge.explains_greys(found) and not found.degenerate:
             # Images that do not agree (too far apart, shutters out of step) must not pull at good geometry.
             found = self._align(points, target, guess, None, coarse)
@@ -177,6 +185,7 @@ class GicpTracker(Tracker):
             photometric = self._photometric_part(judge.view)
             if photometric is not None:
                 found = self._align_held(judge, points, target, guess, photometric, coarse)
+                photometric = _with_texture(photometric)
         sure = mode == "never" or not found.degenerate or judge.explains_greys(found)
         if sure and judge.is_convincing(found) and not judge.is_far_off(found):
             return found, ""
@@ -186,7 +195,7 @@ class GicpTracker(Tracker):
 
     def _align_held(
         self, judge: PoseJudge, points: PointSource, target: GicpTarget, guess: np.ndarray,
-        photometric: PhotometricPart | None, coarse: bool,
+        photometric: PhotometricSource | None, coarse: bool,
     ) -> AlignmentResult:  # fmt: skip
         """An alignment, held to the features that vouch for its start unless that is `coarse`."""
         found = self._align(points, target, guess, photometric, coarse)
@@ -204,7 +213,7 @@ class GicpTracker(Tracker):
         return "always" if noise > settings.noisy_m else "degenerate"
 
     def _align(
-        self, points: PointSource, target: GicpTarget, guess: np.ndarray, photometric: PhotometricPart | None,
+        self, points: PointSource, target: GicpTarget, guess: np.ndarray, photometric: PhotometricSource | None,
         coarse: bool = True,
     ) -> AlignmentResult:  # fmt: skip
         settings = self.settings.align if coarse else dataclasses.replace(self.settings.align, coarse_iterations=0)
@@ -214,14 +223,17 @@ class GicpTracker(Tracker):
         assert self.noise is not None
         return self.noise
 
-    def _photometric_part(self, view: FeatureView) -> PhotometricPart | None:
-        """Textured points of the view and the reference; None without either."""
-        settings = self.settings.photometric
+    def _photometric_part(self, view: FeatureView) -> PhotometricSource | None:
+        """Textured points of the view and the reference; None without either, as far as is known."""
+        settings, least = self.settings.photometric, GicpTrackerTuning.min_textured
+        greys, earlier = self.engine.greys, self.state.motion.reference_view
+        if greys is not None:
+            return None if earlier is None else greys.part(view, earlier, settings, self._shrink_factor(), least)
         reference = self._current_reference()
         if reference is None:
             return None
         points = textured_points(self._shrink(view), settings)
-        return PhotometricPart(points, reference, settings) if len(points) >= GicpTrackerTuning.min_textured else None
+        return PhotometricPart(points, reference, settings) if len(points) >= least else None
 
     def _current_reference(self) -> PhotometricReference | None:
         motion = self.state.motion
@@ -230,19 +242,24 @@ class GicpTracker(Tracker):
             motion.reference = PhotometricReference.from_view(self._shrink(view), view.T_world_camera)
         return motion.reference
 
+    def _shrink_factor(self) -> int:
+        """By how much images are reduced for their grey values."""
+        return self.settings.photometric.shrink * max(1, round(self.camera.width / 320))
+
     def _shrink(self, view: FeatureView) -> GreyDepth:
-        shrink = self.settings.photometric.shrink * max(1, round(self.camera.width / 320))
-        return GreyDepth.from_images(view.color, view.depth, self.camera, shrink)
+        return GreyDepth.from_images(view.color, view.depth, self.camera, self._shrink_factor())
 
     def _retry(
         self, judge: PoseJudge, points: PointSource, target: GicpTarget, found: AlignmentResult,
-        photometric: PhotometricPart | None,
+        photometric: PhotometricSource | None,
     ) -> tuple[AlignmentResult, str]:  # fmt: skip
         """The best alignment over all starts."""
         photometric = photometric or self._photometric_part(judge.view)
         best, reason = found, ""
         if photometric is not None and found.photometric_share == 0:  # all starts are compared by the same measure
             best = self._align(points, target, self.state.motion.predict(), photometric)
+            photometric = _with_texture(photometric)
+            best = found if photometric is None else best
         for name, guess, coarse in judge.other_starts():
             candidate = self._align(points, target, guess, photometric, coarse)
             vouched = not coarse and judge.features.vouch(guess)
@@ -273,3 +290,8 @@ class GicpTracker(Tracker):
             reason = f"only {quantity(len(points), 'point has', 'points have')} depth, {needed} needed"
         pose = self.state.motion.T_world_camera.copy()
         return TrackingResult.by_gicp(pose, TrackingStatus.LOST, reason, points, found)
+
+
+def _with_texture(part: PhotometricSource | None) -> PhotometricSource | None:
+    """The part, unless an alignment has told that it has not enough texture."""
+    return part if part is not None and part.has_texture else None

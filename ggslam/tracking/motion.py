@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from statistics import median
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -31,7 +32,26 @@ class MotionTuning(Tuning):
     """...if it is above this value, in [0, 1]."""
 
 
-@savable(not_saved="reference")
+class SeenFrame:
+    """A frame's image at reduced size, see `small_image`; made when it is first asked for.
+
+    Args:
+        color: uint8 [H, W, 3]; None: `small` is given.
+        small: of the frame.
+    """
+
+    def __init__(self, color: np.ndarray | None, small: np.ndarray | None = None) -> None:
+        self._color, self._small = color, small
+
+    def small(self) -> np.ndarray:
+        """Float32 [h, w]."""
+        if self._small is None:
+            assert self._color is not None
+            self._small, self._color = small_image(self._color), None
+        return self._small
+
+
+@savable(not_saved="reference seen before", save="state", after="forget_images")
 @dataclass
 class CameraMotion:
     """Pose and motion of the camera.
@@ -45,8 +65,12 @@ class CameraMotion:
         reference: the same, prepared; None: not yet.
         greys: how much grey values of the last located frames differed from the reference, the newest first.
         wary: so many more frames are located as if something near moved.
-        small: of the last frame, located or not, see `small_image`; None: there was none.
-        turned: float64 [4, 4], by how the image shifted, from the last located frame to the one at hand.
+        small: of the last frame, located or not, see `small_image`; None: there was none. Only in a saved state: a run
+            has `seen`.
+        turned: float64 [4, 4], by how the image shifted, from the last located frame to the one at hand, once
+            `settle_turn` was called.
+        seen: the last frame, located or not; None: there was none.
+        before: the frame before, and the camera, if `turned` is still to be made; None: it is made.
     """
 
     T_world_camera: Pose
@@ -59,14 +83,38 @@ class CameraMotion:
     wary: int = 0
     small: Annotated[np.ndarray, Form("f4", "h", "w")] | None = None
     turned: Pose = field(default_factory=lambda: np.eye(4))
+    seen: SeenFrame | None = None
+    before: tuple[SeenFrame | None, Camera] | None = None
 
     def watch(self, color: np.ndarray, camera: Camera) -> None:
-        """Sees the next frame's colour uint8 [H, W, 3]: `turned`."""
-        before, self.small = self.small, small_image(color)
-        step = (
-            np.eye(4) if before is None or before.shape != self.small.shape else image_turn(before, self.small, camera)
-        )
-        self.turned = self.turned @ step if self.lost else step
+        """Sees the next frame's colour uint8 [H, W, 3]."""
+        if self.lost:
+            self.settle_turn()
+        earlier = SeenFrame(None, self.small) if self.seen is None and self.small is not None else self.seen
+        turned, self.before = self.turned, (earlier, camera)
+        self.seen = SeenFrame(color)
+        if self.lost:
+            self.turned = turned @ self.settle_turn()
+
+    def settle_turn(self) -> np.ndarray:
+        """Makes `turned` of the last two frames, where few ask for it; gives it."""
+        if self.before is not None:
+            (earlier, camera), self.before, self.turned = self.before, None, np.eye(4)
+            if earlier is not None and self.seen is not None:
+                before, now = earlier.small(), self.seen.small()
+                if before.shape == now.shape:
+                    self.turned = image_turn(before, now, camera)
+        return self.turned
+
+    def state(self) -> dict[str, Any]:
+        """What is saved."""
+        self.settle_turn()
+        self.small = self.small if self.seen is None else self.seen.small()
+        return vars(self)
+
+    def forget_images(self) -> None:
+        """The state is that of a file: what images the object saw is not."""
+        self.seen = self.before = None
 
     def predict(self) -> np.ndarray:
         """The next pose [4, 4] at constant velocity; of a lost camera, as the images shifted since it was located."""
@@ -77,7 +125,7 @@ class CameraMotion:
         that moves may have taken the pose along."""
         if len(self.greys) < MotionTuning.frames:
             return False
-        return residual > max(MotionTuning.sudden_factor * float(np.median(self.greys)), MotionTuning.min_sudden)
+        return residual > max(MotionTuning.sudden_factor * median(self.greys), MotionTuning.min_sudden)
 
     def note_greys(self, residual: float) -> None:
         """The grey values of a located frame differ by so much from the reference."""
@@ -91,6 +139,7 @@ class CameraMotion:
 
     def lose(self) -> None:
         """A frame was not located: the camera stays where it was last known, standing still."""
+        self.settle_turn()
         self.velocity, self.lost = np.eye(4), True
 
     def restart(self, view: FeatureView, T_world_camera: np.ndarray) -> None:

@@ -21,6 +21,14 @@ from ggslam.scene.poses import inverse
 from ggslam.tracking.settings import PhotometricSettings
 
 
+def reduced_camera(camera: Camera, shrink: int) -> Camera:
+    """The intrinsics of images `shrink` times smaller (rows and columns left over are cut)."""
+    return Camera(
+        camera.width // shrink, camera.height // shrink, camera.fx / shrink, camera.fy / shrink,
+        (camera.cx + 0.5) / shrink - 0.5, (camera.cy + 0.5) / shrink - 0.5,
+    )  # fmt: skip
+
+
 @dataclass(frozen=True)
 class GreyDepth:
     """A frame at reduced resolution.
@@ -38,11 +46,8 @@ class GreyDepth:
     @classmethod
     def from_images(cls, color: np.ndarray, depth: np.ndarray, camera: Camera, shrink: int) -> GreyDepth:
         """From colour uint8 [H, W, 3] and depth float32 [H, W], `shrink` times smaller (rows left over are cut)."""
-        h, w = camera.height // shrink, camera.width // shrink
-        smaller = Camera(
-            w, h, camera.fx / shrink, camera.fy / shrink, (camera.cx + 0.5) / shrink - 0.5,
-            (camera.cy + 0.5) / shrink - 0.5,
-        )  # fmt: skip
+        smaller = reduced_camera(camera, shrink)
+        h, w = smaller.height, smaller.width
         grey = cv2.cvtColor(color[: h * shrink, : w * shrink], cv2.COLOR_RGB2GRAY)
         grey = cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         nearest = _over_cells(np.minimum, depth, (h, w), shrink)  # 0 if any is unknown

@@ -43,6 +43,12 @@ class PointSource(Protocol):
     def read(self) -> FramePoints:
         """The points on the host."""
 
+    def send(self) -> None:
+        """They will be read soon: what has to be fetched is on its way from now on."""
+
+    def expect_look(self) -> None:
+        """The `MatchedMedians` of their alignment will be asked for."""
+
 
 @savable()
 @dataclass(frozen=True)
@@ -87,6 +93,12 @@ class FramePoints:
         """See `PointSource`."""
         return self
 
+    def send(self) -> None:
+        """Nothing: they are here."""
+
+    def expect_look(self) -> None:
+        """Nothing: they are here."""
+
 
 class DeferredPoints:
     """Points of a frame that are extracted when they are read: keyframes need them, not every tracker does.
@@ -94,10 +106,13 @@ class DeferredPoints:
     Args:
         extract: gives them.
         median_depth: estimate of their median depth, metres, that needs no extraction.
+        source: what they are extracted from; None: that is here.
     """
 
-    def __init__(self, extract: Callable[[], FramePoints], median_depth: float) -> None:
-        self._extract = extract
+    def __init__(
+        self, extract: Callable[[], FramePoints], median_depth: float, source: PointSource | None = None
+    ) -> None:
+        self._extract, self._source = extract, source
         self._points: FramePoints | None = None
         self.median_depth = median_depth
         """Metres, an estimate."""
@@ -114,6 +129,14 @@ class DeferredPoints:
         if self._points is None:
             self._points = self._extract()
         return self._points
+
+    def send(self) -> None:
+        """See `PointSource`."""
+        if self._source is not None:
+            self._source.send()
+
+    def expect_look(self) -> None:
+        """Nothing: no alignment tells of them."""
 
 
 def grid_stride(pixels: int, count: int) -> int:

@@ -77,7 +77,7 @@ class PoseJudge:
     def other_starts(self) -> Iterator[tuple[str, np.ndarray, bool]]:
         """Other starts than constant velocity, the likeliest first: a name, a pose [4, 4], and whether it is coarse.
         Feature matches are good to a centimetre or two; the coarse level would slide off along a bare wall."""
-        tried, turned = [self.motion.predict()], self.motion.T_world_camera @ self.motion.turned
+        tried, turned = [self.motion.predict()], self.motion.T_world_camera @ self.motion.settle_turn()
         starts = [(name, pose, False) for name, pose in self.features.starts()]
         starts.append(("last pose", self.motion.T_world_camera, True))
         if self.is_wide(turned):

@@ -14,6 +14,7 @@ import numpy as np
 
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
+from ggslam.tracking.gicp import MatchedMedians, PointMatches
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
 
@@ -26,9 +27,11 @@ class ResidualNoiseTuning(Tuning):
     early_frames = 24
     """Frames of that start."""
     late_stride = 16
-    """One frame in this many is measured later: on a GPU, each measurement waits for the device."""
+    """One frame in this many is measured later."""
     latest = 12
     """Latest measurements that count."""
+    min_points = 100
+    """Fewest matched points of a measurement."""
     min_measurements = 4
     """Fewest measurements that noise is estimated from."""
     max_factor = 2.5
@@ -71,15 +74,16 @@ class ResidualNoise:
     def due(self) -> bool:
         """Whether the next frame is looked at; counts it."""
         self.frames += 1
-        return (
-            self.frames
-            % (
-                ResidualNoiseTuning.early_stride
-                if self.frames <= ResidualNoiseTuning.early_frames
-                else ResidualNoiseTuning.late_stride
-            )
-            == 0
-        )
+        return self._looks_at(self.frames)
+
+    def will_be_due(self) -> bool:
+        """Whether the next frame is looked at."""
+        return self._looks_at(self.frames + 1)
+
+    @staticmethod
+    def _looks_at(frame: int) -> bool:
+        early = frame <= ResidualNoiseTuning.early_frames
+        return frame % (ResidualNoiseTuning.early_stride if early else ResidualNoiseTuning.late_stride) == 0
 
     def observe(self, points: FramePoints, squared_distances: np.ndarray, noise: DepthNoise) -> DepthNoise:
         """The noise that agrees with the residuals so far: the one given, or a larger one of the same shape.
@@ -89,14 +93,15 @@ class ResidualNoise:
             squared_distances: of each to the surface, square metres, infinite without a match.
             noise: as known so far.
         """
-        matched = np.isfinite(squared_distances)
-        if matched.sum() < 100:
+        matches = PointMatches(np.empty(0, np.int32), squared_distances)
+        return self.observe_medians(matches.medians(points), noise)
+
+    def observe_medians(self, found: MatchedMedians, noise: DepthNoise) -> DepthNoise:
+        """The same, of the medians of such a frame."""
+        if found.count < ResidualNoiseTuning.min_points:
             return noise
-        sigma = float(np.sqrt(np.median(squared_distances[matched]))) / _MEDIAN_OF_NORMAL
-        self.residuals = [
-            *self.residuals[1 - ResidualNoiseTuning.latest :],
-            (float(np.median(points.z[matched])), sigma),
-        ]
+        sigma = float(np.sqrt(np.float32(found.squared_distance))) / _MEDIAN_OF_NORMAL
+        self.residuals = [*self.residuals[1 - ResidualNoiseTuning.latest :], (found.depth, sigma)]
         if len(self.residuals) < ResidualNoiseTuning.min_measurements:
             return noise
         ratios = [
@@ -107,9 +112,9 @@ class ResidualNoise:
         factor = float(np.median(ratios))
         if factor < ResidualNoiseTuning.max_factor:
             return noise
-        depth, found = (float(np.median(values)) for values in zip(*self.residuals, strict=True))
+        depth, shown = (float(np.median(values)) for values in zip(*self.residuals, strict=True))
         self.residuals = []
-        larger = larger_noise(noise, depth, found)
+        larger = larger_noise(noise, depth, shown)
         self.hidden *= larger.sigma(depth) / noise.sigma(depth)
         return larger
 

@@ -13,7 +13,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
 from ggslam.system.tuning import Tuning
-from ggslam.tracking.gicp import AlignmentResult, GicpTarget, PhotometricPart, align
+from ggslam.tracking.gicp import AlignmentResult, GicpTarget, PhotometricPart, PhotometricSource, align
 from ggslam.tracking.points import FramePoints, PointSource, check_depth, extract_points
 from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings
 
@@ -54,6 +54,11 @@ class RigTrackingEngine:
         self.parts: list[FramePoints] = []
         """Points of each view, in its own camera's frame."""
 
+    @property
+    def greys(self) -> None:
+        """See `TrackingEngine`."""
+        return None
+
     def points(self, depth: np.ndarray, settings: PointSettings, noise: DepthNoise) -> FramePoints:
         """Points of all views in the first camera's frame; see `TrackingEngine`."""
         for view in self.views:
@@ -63,13 +68,17 @@ class RigTrackingEngine:
 
     def align(
         self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
-        noise: DepthNoise, photometric: PhotometricPart | None = None,
+        noise: DepthNoise, photometric: PhotometricSource | None = None,
     ) -> AlignmentResult:  # fmt: skip
         """See `gicp.align`. The overlap is that of the camera whose points fit best: one that sees what was never
         mapped must not make a good pose look doubtful."""
+        assert photometric is None or isinstance(photometric, PhotometricPart)
         found = align(source.read(), target, T_world_camera_guess, settings, noise, self._context, photometric)
         told = [overlap for overlap in self.overlaps(found, settings, noise) if overlap is not None]
         return dataclasses.replace(found, overlap=max(told, default=found.overlap))
+
+    def expect_target(self, target: GicpTarget) -> None:
+        """Nothing: it is where it is used."""
 
     def overlaps(self, found: AlignmentResult, settings: AlignSettings, noise: DepthNoise) -> list[float | None]:
         """Share of each view's points with an inlier match; None of a view with too few points to tell.

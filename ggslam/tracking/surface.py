@@ -10,7 +10,7 @@ G-ICP Gaussian SLAM escapes this by hardly training positions at all, at the pri
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -113,7 +113,7 @@ class _Begun:
         return same and np.array_equal(T_world_camera, self.T_world_camera)
 
 
-@savable(not_saved="_context _archive target finish _helper _begun", after="gather_again", check="check")
+@savable(not_saved="_context _archive target finish prepare _helper _begun", after="gather_again", check="check")
 class MeasuredSurface:
     """Keyframes' points gathered into one target, keyframe by keyframe. Which of the keyframes take part can be
     chosen, and keyframes can be moved: after a loop was closed the surface is where they are. Holds the run's
@@ -138,6 +138,8 @@ class MeasuredSurface:
         self._parts = []
         self.finish = True
         """False: the targets' voxels are left without shapes; see `GicpTarget.from_arrays`."""
+        self.prepare: Callable[[GicpTarget], None] | None = None
+        """Gets targets that grew, before others see them; in the thread that adds keyframes."""
         self.active = set()
         """Numbers of the keyframes that take part."""
         self.target: GicpTarget | None = None
@@ -192,6 +194,8 @@ class MeasuredSurface:
     def _note_joined(self, numbers: list[int], target: GicpTarget) -> GicpTarget:
         self.active |= set(numbers)
         self._joined.append(numbers)
+        if self.prepare is not None:
+            self.prepare(target)
         self.target = target
         return target
 

@@ -183,6 +183,11 @@ class Tracker(ABC):
         """Frames are aligned to `target` from the next one on."""
         self.state.target = target
 
+    def expect_target(self, target: GicpTarget) -> None:
+        """Frames will be aligned to `target` soon: it is brought nearer to where that is done, in the caller's thread.
+        """
+        return  # most have nothing to do
+
     def expect_motion(self) -> None:
         """Something may move: near points are trusted less for a while, whoever they belong to."""
         self.state.motion.wary = self.settings.recovery.wary_frames

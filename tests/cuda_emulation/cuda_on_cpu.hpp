@@ -125,6 +125,14 @@ inline double rsqrt(double x) { return 1 / std::sqrt(x); }
 inline double sinpi(double x) { return std::sin(3.14159265358979323846 * x); }
 inline double cospi(double x) { return std::cos(3.14159265358979323846 * x); }
 inline float __fdividef(float a, float b) { return a / b; }
+// What is rounded by itself, however the compiler would join it with what follows.
+inline float rounded(float x) {
+  volatile float kept = x;
+  return kept;
+}
+inline float __fmul_rn(float a, float b) { return rounded(a * b); }
+inline float __fadd_rn(float a, float b) { return rounded(a + b); }
+inline float __fmaf_rn(float a, float b, float c) { return std::fma(a, b, c); }
 inline std::uint32_t __float_as_uint(float x) {
   std::uint32_t bits;
   std::memcpy(&bits, &x, sizeof(bits));
@@ -177,6 +185,7 @@ inline cudaError_t cudaEventCreateWithFlags(cudaEvent_t* event, unsigned) {
 inline cudaError_t cudaEventRecord(cudaEvent_t, cudaStream_t) { return cudaSuccess; }
 inline cudaError_t cudaEventSynchronize(cudaEvent_t) { return cudaSuccess; }
 inline cudaError_t cudaEventDestroy(cudaEvent_t) { return cudaSuccess; }
+inline cudaError_t cudaStreamSynchronize(cudaStream_t) { return cudaSuccess; }
 
 namespace ggslam::cuda {
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from ggslam.cuda.transfers import Download
+from ggslam.cuda.library import CudaLibrary
 from ggslam.features.orb import FeatureView
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
@@ -22,7 +23,6 @@ from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, P
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import PointSource
-from ggslam.tracking.residual_noise import ResidualNoise
 from ggslam.tracking.settings import (
     AlignSettings,
     DepthNoise,
@@ -289,9 +289,13 @@ def test_a_tracker_goes_the_same_way_with_either_engine(
 def test_the_host_waits_once_for_a_frame(
     engine: CudaTrackingEngine, frames: list[Frame], mode: PhotometricMode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ResidualNoise, "due", lambda self: False)  # a look at residuals waits, too; they are rare
     waits = []
-    monkeypatch.setattr(Download, "wait", lambda self, wait=Download.wait: waits.append("result") or wait(self))
+
+    def call(library: CudaLibrary, name: str, *arguments: object, call: Any = CudaLibrary.call) -> None:
+        waits.extend(["result"] if name.endswith("_wait") else [])
+        call(library, name, *arguments)
+
+    monkeypatch.setattr(CudaLibrary, "call", call)
     cpu = torch.Tensor.cpu
     monkeypatch.setattr(torch.Tensor, "cpu", lambda self: waits.append("tensor") or cpu(self))
     settings = tracker_settings(mode)
@@ -343,10 +347,24 @@ def test_what_is_not_asked_for_is_not_fetched(
     found = engine.align(points, target, truth_of(frames[2]), SETTINGS, NOISE)
     assert len(points) > 1000 and 0.5 < points.median_depth < 5 and found.overlap > 0.5
     assert not fetched
-    for_points = 0 if engine.device.type == "cuda" else 1  # a GPU sends them along with the alignment
     read = points.read()
-    assert len(read.normals) == len(points.read().weights) == len(points) and len(fetched) == for_points
+    assert len(read.normals) == len(points.read().weights) == len(points) and len(fetched) == 1
     matches = found.matches.read()
-    assert len(matches.voxels) == len(matches.squared_distances) == len(points) and len(fetched) == for_points + 1
+    assert len(matches.voxels) == len(matches.squared_distances) == len(points) and len(fetched) == 2
     moved = replace(found, T_world_camera=np.eye(4))
-    assert np.array_equal(moved.matches.read().voxels, matches.voxels) and len(fetched) == for_points + 1
+    assert np.array_equal(moved.matches.read().voxels, matches.voxels) and len(fetched) == 2
+
+
+def test_points_that_were_not_asked_for_outlive_the_next_depth_image(
+    engine: CudaTrackingEngine, native: CpuTrackingEngine, frames: list[Frame], target: GicpTarget
+) -> None:
+    first, second = (engine.points(frames[k].depth, POINTS, NOISE) for k in (2, 3))
+    one, two = (native.points(frames[k].depth, POINTS, NOISE) for k in (2, 3))
+    check_points(first, one)
+    check_points(second, two)
+    found, expected = (
+        e.align(p, target, truth_of(frames[2]), SETTINGS, NOISE) for e, p in ((engine, first), (native, one))
+    )
+    assert np.abs(se3_log(inverse(expected.T_world_camera) @ found.T_world_camera)).max() < 1e-5
+    with pytest.raises(TypeError, match="on the device"):
+        engine.align(one, target, np.eye(4), SETTINGS, NOISE)

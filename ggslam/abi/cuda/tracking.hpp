@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The CUDA kernels' tracking. Pointers lead to device memory. Calls only start work on the caller's stream; those with a
-// status return 0 or a cudaError_t.
+// The CUDA kernels' tracking. Pointers lead to device memory. Calls only start work on the caller's stream, but for
+// ggslam_cuda_track_wait; those with a status return 0 or a cudaError_t.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -79,10 +79,12 @@ struct AlignJob {
   double* results;          // [kAlignResults], in the order of AlignResult
   void* workspace;          // see align_workspace
   void* stream;
+  const std::int32_t* textured;  // how many photometric points are in use, as the device knows; null: all
   double guess[12];  // T_world_camera: rotation row by row, then translation
   AlignSettings settings;
   std::int32_t device;
   std::int32_t room;  // points at most
+  std::int32_t least_textured;  // with `textured`: with fewer there is no photometric part
 };
 
 // Places of the results. Information (upper triangle row by row) is of a twist about the camera centre, world axes.
@@ -96,7 +98,37 @@ enum AlignResult {
   kPointCount, kMedianDepth,           // of the points' header
   kSpreadTotal, kCentroid,             // sum of 1 / sigma(z)^2; mean point with these weights, camera frame
   kRadius = kCentroid + 3,             // root mean square distance from it
+  kTextured,                           // photometric points in use
+  kMatched, kMedianSquared, kMatchedDepth,  // see TrackJob::looks; else unchanged
   kAlignResults
+};
+
+// Grey values of a frame to be made at reduced resolution, h = height / shrink rows of w = width / shrink pixels.
+struct GreyJob {
+  const std::uint8_t* color;  // [height, width, 3]
+  const float* depth;         // [height, width], metres, 0 where unknown
+  float* pixels;              // [h, w, 4] as of PhotometricReferenceView
+  float* points;              // [most_points, 3] textured ones, evenly thinned, camera frame
+  float* intensity;           // [most_points]
+  std::int32_t* count;        // of these; null: they are not wanted
+  void* workspace;            // see grey_workspace
+  double fx, fy, cx, cy;      // of the reduced image
+  float blur_side, blur_middle;  // weights of three neighbours by which grey values are smoothed
+  float min_squared_gradient;    // of a textured point
+  std::int32_t width, height, shrink, most_points;
+};
+
+// All the work that tracking has with an alignment: what is wanted of its parts, one after the other.
+struct TrackJob {
+  DepthPointsJob points;
+  GreyJob reference, greys;
+  VoxelLevelJob fine, coarse;
+  AlignJob align;
+  double* results;  // [kAlignResults] in page-locked memory of the host, a copy of those of `align`
+  std::int32_t makes_points, makes_reference, makes_greys, makes_levels;
+  // Whether to tell of the matched points how many they are, and the medians of their squared distances and of their
+  // depths.
+  std::int32_t looks;
 };
 
 }  // namespace ggslam::cuda
@@ -117,3 +149,9 @@ GGSLAM_EXPORT std::int64_t ggslam_cuda_align_bytes(const ggslam::cuda::AlignJob*
 
 // Aligns points to a target from a guess.
 GGSLAM_EXPORT int ggslam_cuda_align(const ggslam::cuda::AlignJob* job);
+
+// Bytes of memory that making grey values works in. Asks for width, height and shrink.
+GGSLAM_EXPORT std::int64_t ggslam_cuda_grey_bytes(const ggslam::cuda::GreyJob* job);
+
+// Makes what is wanted and not there yet, aligns, and waits for the results.
+GGSLAM_EXPORT int ggslam_cuda_track_wait(const ggslam::cuda::TrackJob* job);

@@ -214,4 +214,4 @@ def _without(points: PointSource, mask: np.ndarray) -> DeferredPoints:
             None if read.depths is None else read.depths[stays],
         )  # fmt: skip
 
-    return DeferredPoints(choose, points.median_depth)
+    return DeferredPoints(choose, points.median_depth, points)

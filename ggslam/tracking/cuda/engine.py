@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking on an NVIDIA GPU: the work of `CpuTrackingEngine` by kernels, with one wait per alignment.
+"""Tracking on an NVIDIA GPU: the work of `CpuTrackingEngine` by kernels, in one call and one wait per alignment.
 
-A frame's depth is sent once. Points, their number, the whole optimisation from the coarse voxels to the fine ones and
-its result stay on the device; the host gets the result in one copy, and waits for that alone. Sums have a fixed order:
-results repeat bit for bit.
+A frame's depth is sent once, and its colour where grey values are compared. Points, their number, grey images, textured
+points, the whole optimisation from the coarse voxels to the fine ones and its result stay on the device; the host gets
+the result in one copy, and waits for that alone. Sums have a fixed order: results repeat bit for bit.
 
-What grey values contribute is chosen on the host, from images at reduced resolution, while the device extracts points:
-the textured points of a frame are sent in one copy (80 kB at most), the reference image when it is another one.
+What the kernels are asked for is one structure that is filled once: of it, what changes is written.
 """
 
 from __future__ import annotations
@@ -14,23 +13,34 @@ from __future__ import annotations
 import ctypes
 import math
 import weakref
+from typing import Final
 
 import numpy as np
 import torch
 
-from ggslam.abi import core as structures
-from ggslam.abi.cuda import AlignJob, AlignResult, DepthPointsJob
+from ggslam.abi.cuda import AlignJob, AlignResult, TrackJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
-from ggslam.cuda.transfers import Download, Upload
 from ggslam.scene.camera import Camera
-from ggslam.tracking.cuda.points import CudaPoints
+from ggslam.tracking.cuda.blocks import BlockPool
+from ggslam.tracking.cuda.fetches import FetchRing
+from ggslam.tracking.cuda.frame_upload import FrameUpload
+from ggslam.tracking.cuda.greys import CudaGreys, CudaPhotometricPart
+from ggslam.tracking.cuda.host_greys import HostGreys
+from ggslam.tracking.cuda.points import CudaPoints, words_for
 from ggslam.tracking.cuda.results import cuda_alignment
 from ggslam.tracking.cuda.target import CudaTarget
-from ggslam.tracking.gicp import AlignmentResult, GicpTarget, PhotometricPart, native_align_settings
-from ggslam.tracking.photometric import PhotometricReference
+from ggslam.tracking.gicp import (
+    AlignmentResult,
+    GicpTarget,
+    PhotometricPart,
+    PhotometricSource,
+    native_align_settings,
+)
 from ggslam.tracking.points import PointSource, check_depth, grid_stride, native_points_settings
-from ggslam.tracking.settings import AlignSettings, DepthNoise, PointSettings
+from ggslam.tracking.settings import AlignSettings, DepthNoise, PhotometricSettings, PointSettings
+
+_GUESS: Final = TrackJob.align.offset + AlignJob.guess.offset
 
 
 class CudaTrackingEngine:
@@ -52,15 +62,31 @@ class CudaTrackingEngine:
         self.library, self.device = library_and_device(device, library)
         self.camera = camera
         self._memory = GrowingMemory(self.device)
-        self._target = CudaTarget(self.library, self.device)
-        self._depth = torch.empty(4 * camera.width * camera.height, dtype=torch.uint8, device=self.device)
-        self._depth_upload, self._grey_upload, self._reference_upload = (Upload(self.device) for _ in range(3))
-        self._results = Download(AlignResult.ALIGN_RESULTS, self.device)
+        self._target = CudaTarget(self.device)
+        self._depth = FrameUpload((camera.height, camera.width), np.float32, self.device)
+        self.greys = CudaGreys(self.library, self.device, camera, self._depth)
+        self._host_greys = HostGreys(self.device)
+        self._point_blocks, self._match_blocks = BlockPool(self.device), BlockPool(self.device)
+        self._ring = FetchRing(self.device)
+        self._pending: weakref.ref[CudaPoints] | None = None
+        self._grid = (-1, -1)  # that there is memory for
         self._workspace = torch.zeros(0, dtype=torch.uint8, device=self.device)
-        self._reference: weakref.ref[PhotometricReference] | None = None
+        self._largest = (0, 0)  # room and textured points that the workspace is known to have room for
+        self._settings_of: tuple[AlignSettings, DepthNoise, PhotometricSettings | None] | None = None
+        self._results = torch.zeros(AlignResult.ALIGN_RESULTS, dtype=torch.float64, device=self.device)
+        pinned = self.device.type == "cuda"
+        self._arrived = torch.zeros(AlignResult.ALIGN_RESULTS, dtype=torch.float64, pin_memory=pinned)
+        self._found = self._arrived.numpy()
+        self._job = TrackJob(results=self._arrived.data_ptr())
+        self._reference = ctypes.byref(self._job)
+        guess = np.frombuffer(self._job, np.float64, 12, _GUESS)
+        self._guess_rotation, self._guess_translation = guess[:9].reshape(3, 3), guess[9:]
+        job = self._job
+        job.align.results, job.points.depth = self._results.data_ptr(), self._depth.address
+        job.align.device = job.points.device = self.device.index or 0
 
     def points(self, depth: np.ndarray, settings: PointSettings, noise: DepthNoise) -> CudaPoints:
-        """Starts `points.extract_points`.
+        """Sends a depth image, and gets `points.extract_points` ready, which the first alignment or reader starts.
 
         Args:
             depth: float32 [H, W], metres, 0 where unknown.
@@ -69,76 +95,111 @@ class CudaTrackingEngine:
             ValueError: `depth` has another shape than the camera.
         """
         check_depth(depth, self.camera)
-        staged = self._depth_upload.begin(self._depth.numel()).view(np.float32).reshape(depth.shape)
-        np.copyto(staged, depth)
-        self._depth_upload.send(self._depth)
-        stride = grid_stride(int(np.count_nonzero(staged > 0)), settings.count)
+        before = None if self._pending is None else self._pending()
+        if before is not None:
+            self._extract(before)
+        self._depth.send(depth)
+        stride = grid_stride(int(np.count_nonzero(self._depth.staged > 0)), settings.count)
         arguments = native_points_settings(self.camera, settings, noise, stride, depth)
         border = arguments.window * arguments.window_step
-        columns, rows = (
-            max(0, math.ceil((size - 2 * border - stride // 2) / stride)) for size in (depth.shape[1], depth.shape[0])
-        )
-        found = CudaPoints(columns * rows, self.device)
-        job = DepthPointsJob(
-            self._depth.data_ptr(), found.arrays(), None, self.library.stream(self.device), arguments,
-            self.device.index or 0, columns, rows,
-        )  # fmt: skip
-        size = self.library.functions.ggslam_cuda_depth_points_bytes(ctypes.byref(job))
-        job.workspace = self._memory.block("points", size).data_ptr()
-        self.library.call("depth_points", ctypes.byref(job))
+        first = 2 * border + stride // 2
+        columns = max(0, math.ceil((self.camera.width - first) / stride))
+        rows = max(0, math.ceil((self.camera.height - first) / stride))
+        room = columns * rows
+        found = CudaPoints(room, self._point_blocks.take(words_for(room)), self._extract, self._ring)
+        job = self._job.points
+        job.settings, job.columns, job.rows, job.out = arguments, columns, rows, found.arrays()
+        if self._grid != (columns, rows):
+            size = self.library.functions.ggslam_cuda_depth_points_bytes(ctypes.byref(job))
+            job.workspace = self._memory.block("points", size).data_ptr()
+            self._grid = columns, rows
+        self._pending = weakref.ref(found)
         return found
 
     def align(
         self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
-        noise: DepthNoise, photometric: PhotometricPart | None = None,
+        noise: DepthNoise, photometric: PhotometricSource | None = None,
     ) -> AlignmentResult:  # fmt: skip
         """As `gicp.align`, of points that `points` gave; waits for the result.
 
         Raises:
-            TypeError: other points.
+            TypeError: other points, or a photometric part of another engine.
         """
         if not isinstance(source, CudaPoints):
             raise TypeError("expected points that are on the device")
-        matched = torch.empty((2, max(1, source.room)), dtype=torch.float32, device=self.device)
-        fine, coarse = self._target.levels(target)
-        job = AlignJob(
-            points=source.arrays(), fine=fine, coarse=coarse, match=matched[0].data_ptr(),
-            squared_distance=matched[1].data_ptr(), results=self._results.source.data_ptr(),
-            stream=self.library.stream(self.device), device=self.device.index or 0, room=source.room,
-            settings=native_align_settings(settings, noise, photometric.settings if photometric else None),
-        )  # fmt: skip
-        T = np.asarray(T_world_camera_guess, np.float64)
-        job.guess[:] = [*T[:3, :3].ravel().tolist(), *T[:3, 3].tolist()]
-        if photometric is not None and len(photometric.points):
-            self._add_photometric(job, photometric)
-        job.workspace = self._aligning_memory(job).data_ptr()
-        self.library.call("align", ctypes.byref(job))
-        source.send()  # some hundred kilobytes, so that a keyframe has them without another wait
-        found = self._results.wait()
+        job, align, room = self._job, self._job.align, source.room
+        matched = self._match_blocks.take(2 * max(1, room))
+        align.points, align.room = source.arrays(), room
+        align.match, align.squared_distance = matched.address, matched.address + 4 * max(1, room)
+        self._guess_rotation[...] = T_world_camera_guess[:3, :3]
+        self._guess_translation[...] = T_world_camera_guess[:3, 3]
+        self._set_settings(settings, noise, None if photometric is None else photometric.settings)
+        self._target.fill(target, job)
+        self._set_photometric(photometric)
+        self._make_room(align)
+        job.makes_points = not source.is_extracted
+        job.looks = source.looks
+        align.stream = self.library.stream(self.device)
+        self.library.call("track_wait", self._reference)
+        source.note_extracted()
+        found = self._found.copy()
         source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
-        return cuda_alignment(found, matched, settings)
+        if isinstance(photometric, CudaPhotometricPart):
+            photometric.textured = int(found[AlignResult.TEXTURED])
+        return cuda_alignment(found, matched, max(1, room), source.looks, settings)
 
-    def _aligning_memory(self, job: AlignJob) -> torch.Tensor:
-        """What an alignment works in, all zero when new."""
-        size = self.library.functions.ggslam_cuda_align_bytes(ctypes.byref(job))
+    def expect_target(self, target: GicpTarget) -> None:
+        """See `Tracker.expect_target`."""
+        self._target.stage(target)
+
+    # --- parts -------------------------------------------------------------------------------------------------------
+
+    def _extract(self, points: CudaPoints) -> None:
+        """Starts to extract the points that `points` got ready last, if that was not done yet."""
+        if not points.is_extracted:
+            self._job.points.stream = self.library.stream(self.device)
+            self.library.call("depth_points", ctypes.byref(self._job.points))
+            points.note_extracted()
+
+    def _set_settings(self, settings: AlignSettings, noise: DepthNoise, greys: PhotometricSettings | None) -> None:
+        before = self._settings_of
+        if before is None or before[0] is not settings or before[1] is not noise or before[2] is not greys:
+            self._job.align.settings = native_align_settings(settings, noise, greys)
+            self._settings_of = settings, noise, greys
+
+    def _set_photometric(self, part: PhotometricSource | None) -> None:
+        """Sets what grey values contribute, and what has to be made for that.
+
+        Raises:
+            TypeError: it is of another engine.
+        """
+        job, align = self._job, self._job.align
+        job.makes_reference = job.makes_greys = 0
+        align.textured = None
+        if part is None:
+            align.photometric_points.count = 0
+        elif isinstance(part, CudaPhotometricPart):
+            reference, greys = self.greys.prepare(part)
+            if reference is not None:
+                job.reference, job.makes_reference = reference, 1
+            if greys is not None:
+                job.greys, job.makes_greys = greys, 1
+            align.photometric_points, align.textured = self.greys.points
+            align.reference, align.least_textured = self.greys.reference, part.least
+        elif isinstance(part, PhotometricPart):
+            self._host_greys.send(part, align)
+        else:
+            raise TypeError("expected a photometric part of this engine or of the host")
+
+    def _make_room(self, align: AlignJob) -> None:
+        """Memory that an alignment works in, all zero when new."""
+        room, textured = align.room, align.photometric_points.count
+        if room <= self._largest[0] and textured <= self._largest[1]:
+            return
+        self._largest = max(room, self._largest[0]), max(textured, self._largest[1])
+        align.room, align.photometric_points.count = self._largest
+        size = self.library.functions.ggslam_cuda_align_bytes(ctypes.byref(align))
+        align.room, align.photometric_points.count = room, textured
         if self._workspace.numel() < size:
             self._workspace = torch.zeros(size + size // 4, dtype=torch.uint8, device=self.device)
-        return self._workspace
-
-    def _add_photometric(self, job: AlignJob, part: PhotometricPart) -> None:
-        """Sends the textured points, and the reference unless it is there already."""
-        count = len(part.points)
-        staged = self._grey_upload.begin(16 * count).view(np.float32)
-        staged[: 3 * count], staged[3 * count :] = part.points.points.ravel(), part.points.intensity
-        points = self._memory.block("grey points", 16 * count)
-        self._grey_upload.send(points[: 16 * count])
-        job.photometric_points = structures.PhotometricPoints(points.data_ptr(), points.data_ptr() + 12 * count, count)
-        reference = part.reference
-        pixels = self._memory.block("reference", reference.pixels.nbytes)
-        if self._reference is None or self._reference() is not reference:
-            staged = self._reference_upload.begin(reference.pixels.nbytes).view(np.float32)
-            np.copyto(staged, reference.pixels.ravel())
-            self._reference_upload.send(pixels[: reference.pixels.nbytes])
-            self._reference = weakref.ref(reference)
-        job.reference = reference.native()
-        job.reference.pixels = pixels.data_ptr()
+        align.workspace = self._workspace.data_ptr()

@@ -3,52 +3,77 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from ctypes import sizeof
-from itertools import accumulate
 from typing import Final
 
 import numpy as np
-import torch
 
 from ggslam.abi.cuda import PointArrays, PointsHeader
+from ggslam.tracking.cuda.blocks import Block
+from ggslam.tracking.cuda.fetches import Fetch, FetchRing
 from ggslam.tracking.points import FramePoints
 
-_ROWS = {"points": 3, "normals": 3, "covariances": 6, "pixels": 2, "weights": 1}
+_WORDS: Final = {"points": 3, "normals": 3, "covariances": 6, "pixels": 2, "weights": 1}
 _BEGIN: Final = 64
 """Words before the arrays of the block. Its header takes the first two."""
+_BEFORE: Final = (0, 3, 6, 12, 14)
+"""Words of a point before each of the arrays."""
+
+
+def words_for(room: int) -> int:
+    """Words of a block with room for so many points."""
+    return _BEGIN + room * sum(_WORDS.values())
 
 
 class CudaPoints:
-    """`FramePoints` on a device. They come to the host with the frame's alignment; before it their number and median
-    depth, or all of them, are fetched when they are first asked for.
+    """`FramePoints` on a device, extracted when they are aligned or asked for. They come to the host when they are
+    first read, their number and median depth with the frame's alignment.
 
     Args:
         room: points at most; their number is known to the device alone.
-        device: where they are.
+        block: see `words_for`.
+        extract: has the points extracted.
+        ring: for copies to the host.
     """
 
-    def __init__(self, room: int, device: torch.device) -> None:
-        self.room = room
-        self._block = torch.empty(_BEGIN + room * sum(_ROWS.values()), dtype=torch.float32, device=device)
-        sizes = (room * width for width in _ROWS.values())
-        self._begins = dict(zip(_ROWS, accumulate(sizes, initial=_BEGIN), strict=False))
+    def __init__(self, room: int, block: Block, extract: Callable[[CudaPoints], None], ring: FetchRing) -> None:
+        self.room, self.block = room, block
+        self.looks = False
+        """Whether an alignment tells the medians of what was matched, see `expect_look`."""
+        self._extract: Callable[[CudaPoints], None] | None = extract
+        self._ring = ring
         self._header: tuple[int, float] | None = None
-        self._copy: torch.Tensor | None = None  # on the host; filled when the device has come to it
+        self._fetch: Fetch | None = None
         self._points: FramePoints | None = None
 
     def arrays(self) -> PointArrays:
         """Addresses on the device; this object must stay alive."""
-        begin = self._block.data_ptr()
-        return PointArrays(begin, *(begin + 4 * offset for offset in self._begins.values()))
+        header, room = self.block.address, 4 * self.room
+        first = header + 4 * _BEGIN
+        return PointArrays(header, first, first + 3 * room, first + 6 * room, first + 12 * room, first + 14 * room)
+
+    @property
+    def is_extracted(self) -> bool:
+        """Whether the device was told to extract them."""
+        return self._extract is None
+
+    def note_extracted(self) -> None:
+        """The device was told to extract them."""
+        self._extract = None
+
+    def expect_look(self) -> None:
+        """See `PointSource`."""
+        self.looks = True
 
     def send(self) -> None:
-        """Starts to copy the arrays to the host."""
-        if self._copy is None and self._block.device.type == "cuda":
-            copy = torch.empty(self._block.shape, dtype=self._block.dtype, pin_memory=True)
-            self._copy = copy.copy_(self._block, non_blocking=True)
+        """See `PointSource`."""
+        self._ensure()
+        if self._fetch is None and self._points is None and self.block.memory.device.type == "cuda":
+            self._fetch = self._ring.start(self.block.memory[: words_for(self.room)])
 
     def set_header(self, count: int, median_depth: float) -> None:
-        """Takes what the device says of the points, once it is known; what was sent has arrived then."""
+        """Takes what the device says of the points, once it is known."""
         self._header = count, median_depth
 
     def __len__(self) -> int:
@@ -67,19 +92,37 @@ class CudaPoints:
     def read(self) -> FramePoints:
         """The points on the host. Waits for the device unless what was sent has arrived."""
         if self._points is None:
-            arrived = self._copy is not None and self._header is not None
-            words = (self._copy if self._copy is not None and arrived else self._block.cpu()).numpy()
-            count, _ = self._header_of(words)
-            rows = {name: words[begin : begin + _ROWS[name] * count] for name, begin in self._begins.items()}
+            self._ensure()
+            words = self._words()
+            count, begins = self._header_of(words)[0], [_BEGIN + self.room * before for before in _BEFORE]
+            rows = {
+                name: words[begin : begin + width * count].copy()
+                for begin, (name, width) in zip(begins, _WORDS.items(), strict=True)
+            }
             self._points = FramePoints(
                 rows["points"].reshape(-1, 3), rows["normals"].reshape(-1, 3), rows["covariances"].reshape(-1, 6),
                 rows["pixels"].view(np.int32).reshape(-1, 2), rows["weights"],
             )  # fmt: skip
+            self._fetch = None
         return self._points
+
+    def _words(self) -> np.ndarray:
+        """The block on the host."""
+        fetch = self._fetch
+        if fetch is not None:
+            words = fetch.wait().numpy()
+            if fetch.valid:
+                return words
+        return self.block.memory[: words_for(self.room)].cpu().numpy()
+
+    def _ensure(self) -> None:
+        if self._extract is not None:
+            self._extract(self)
 
     def _known_header(self) -> tuple[int, float]:
         if self._header is None:
-            self.set_header(*self._header_of(self._block[: sizeof(PointsHeader) // 4].cpu().numpy()))
+            self._ensure()
+            self.set_header(*self._header_of(self.block.memory[: sizeof(PointsHeader) // 4].cpu().numpy()))
         assert self._header is not None
         return self._header
 

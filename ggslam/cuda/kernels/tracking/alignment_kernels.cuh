@@ -132,10 +132,16 @@ __device__ inline void join_parts(int count, double (&parts)[kAlignWarps][kSumSt
   __syncthreads();
 }
 
+// Textured points in use; 0: there is no photometric part.
+__device__ inline int textured_points(const AlignJob& job) {
+  if (job.textured == nullptr) return job.photometric_points.count;
+  return *job.textured >= job.least_textured ? *job.textured : 0;
+}
+
 // What textured points that are lost cost, and all others: a point that leaves the image costs what a badly fitting one
 // does.
 __device__ inline double grey_cost(const AlignJob& job, const double (&total)[kSumStride]) {
-  const double points = job.photometric_points.count, lost = points - total[kGreyCount];
+  const double points = textured_points(job), lost = points - total[kGreyCount];
   const double huber = static_cast<double>(job.settings.huber);
   return job.settings.photometric_weight / points * (total[kGreyCost] + lost * huber * huber);
 }
@@ -151,7 +157,7 @@ __device__ inline int triangle_place(int i, int j, int n) {
 __device__ inline void set_equations(const AlignJob& job, const double (&total)[kSumStride], const double* grey,
                                      const AlignState& s, NormalEquations& out) {
   const double f = 1 / fmax(total[kWeight], 1e-30);
-  const double g = grey ? static_cast<double>(job.settings.photometric_weight) / job.photometric_points.count : 0;
+  const double g = grey ? static_cast<double>(job.settings.photometric_weight) / textured_points(job) : 0;
   // Weak prior on gain 1 and bias 0, so that an image without contrast leaves them where they are.
   const double prior = grey ? 1e-4 * job.settings.photometric_weight : 0;
   const int thread = static_cast<int>(threadIdx.x);
@@ -208,7 +214,7 @@ __global__ void __launch_bounds__(kAlignThreads, kAlignBlocksPerProcessor)
   } else {
     const int i = (block - point_blocks) * kAlignThreads + thread;
     float sums[kGreySums] = {};
-    if (i < job.photometric_points.count) photometric_terms(job, view.pose, view.gain, view.bias, i, sums);
+    if (i < textured_points(job)) photometric_terms(job, view.pose, view.gain, view.bias, i, sums);
     write_grey_sums(sums, own_sums, room);
   }
   if (!is_last_block(work.arrived, &last)) return;
@@ -220,11 +226,12 @@ __global__ void __launch_bounds__(kAlignThreads, kAlignBlocksPerProcessor)
   if (kGreys) sum_blocks(work.sums, point_blocks, gridDim.x, kGreySums, grey_parts);
   join_parts(kAlignSums, parts);
   if (kGreys) join_parts(kGreySums, grey_parts);
-  set_equations(job, parts[0], kGreys ? grey_parts[0] : nullptr, state, next);
+  const bool greys = kGreys && textured_points(job) > 0;
+  set_equations(job, parts[0], greys ? grey_parts[0] : nullptr, state, next);
   __syncthreads();
   if (thread == 0) {
-    if (kGreys) next.cost += grey_cost(job, grey_parts[0]);
-    advance(state, next, job.settings, kGreys);
+    if (greys) next.cost += grey_cost(job, grey_parts[0]);
+    advance(state, next, job.settings, greys);
   }
   __syncthreads();
   copy_state(state, *work.state);
@@ -242,7 +249,7 @@ __device__ inline void write_results(const AlignJob& job, const AlignState& s, c
   out[kOverlap] = total[kInliers] / max(1, header.count);
   out[kRmse] = sqrt(total[kSquared] / fmax(1.0, total[kInliers]));
   out[kPhotometricResidual] = grey ? grey[kGreyAbsolute] / fmax(1.0, grey[kGreyCount]) : 0;
-  out[kPhotometricShare] = grey ? grey[kGreyCount] / job.photometric_points.count : 0;
+  out[kPhotometricShare] = grey ? grey[kGreyCount] / textured_points(job) : 0;
   out[kCoarseIterations] = s.coarse_iterations, out[kFineIterations] = s.fine_iterations;
   out[kConverged] = s.converged;
   out[kUsable] = total[kReportMatches] >= job.settings.min_matches;
@@ -279,7 +286,7 @@ __global__ void __launch_bounds__(kAlignThreads, kAlignBlocksPerProcessor)
   } else {
     const int i = (block - point_blocks) * kAlignThreads + thread;
     float sums[kGreySums] = {};
-    if (i < job.photometric_points.count) photometric_terms(job, view.pose, view.gain, view.bias, i, sums);
+    if (i < textured_points(job)) photometric_terms(job, view.pose, view.gain, view.bias, i, sums);
     write_grey_sums(sums, own_sums, room);
   }
   if (!is_last_block(work.arrived, &last)) return;
@@ -288,8 +295,10 @@ __global__ void __launch_bounds__(kAlignThreads, kAlignBlocksPerProcessor)
   join_parts(kReportSums, parts);
   if (kGreys) join_parts(kGreySums, grey_parts);
   if (thread != 0) return;
-  write_results(job, state, parts[0], kGreys ? grey_parts[0] : nullptr);
-  if (kGreys) job.results[kCost] += grey_cost(job, grey_parts[0]);
+  const bool greys = kGreys && textured_points(job) > 0;
+  write_results(job, state, parts[0], greys ? grey_parts[0] : nullptr);
+  job.results[kTextured] = kGreys ? (job.textured ? *job.textured : job.photometric_points.count) : 0;
+  if (greys) job.results[kCost] += grey_cost(job, grey_parts[0]);
 }
 
 }  // namespace ggslam::cuda

@@ -8,11 +8,11 @@
 #include "common/platform.cuh"
 #include "abi/cuda/tracking.hpp"
 #include "native/formulas/depth_window.hpp"
+#include "tracking/block_median.cuh"
 
 namespace ggslam::cuda {
 
 constexpr int kPointThreads = 128;
-constexpr int kMedianThreads = 1024;
 
 struct GridPoint {
   int u, v;
@@ -38,19 +38,6 @@ __global__ void __launch_bounds__(kPointThreads) find_points_kernel(DepthPointsJ
   const bool good = grid_point(job, cell, &point) && window_scatter(job.depth, job.settings, point.u, point.v, point.z, scatter);
   const unsigned bits = __ballot_sync(kAllLanes, good);
   if (threadIdx.x % kWarp == 0) static_cast<std::uint32_t*>(job.workspace)[cell / kWarp] = bits;
-}
-
-// Sum of `value` over the block; `room` is shared memory.
-template <int kThreads>
-__device__ inline unsigned sum_over_block(unsigned value, unsigned (&room)[kThreads / kWarp]) {
-  const unsigned of_warp = __reduce_add_sync(kAllLanes, value);
-  if (threadIdx.x % kWarp == 0) room[threadIdx.x / kWarp] = of_warp;
-  __syncthreads();
-  unsigned sum = 0;
-#pragma unroll
-  for (int w = 0; w < kThreads / kWarp; ++w) sum += room[w];
-  __syncthreads();
-  return sum;
 }
 
 __device__ inline void write_point(const DepthPointsJob& job, const GridPoint& at, std::int64_t n) {
@@ -80,40 +67,18 @@ __global__ void __launch_bounds__(kPointThreads) write_points_kernel(DepthPoints
   write_point(job, point, n);
 }
 
-// Number of points and their median depth, the mean of the two middle ones if they are even in number. A block's work:
-// the bits of the result are found one by one, for positive floats are in the order of their bits.
+// Number of points and their median depth, by one block.
 __global__ void __launch_bounds__(kMedianThreads) median_depth_kernel(DepthPointsJob job) {
   GGSLAM_SHARED unsigned room[kMedianThreads / kWarp];
-  const int cells = job.columns * job.rows, thread = static_cast<int>(threadIdx.x);
+  const int cells = job.columns * job.rows;
   const std::uint32_t* words = static_cast<const std::uint32_t*>(job.workspace);
   unsigned found = 0;
-  for (int w = thread; w < (cells + kWarp - 1) / kWarp; w += kMedianThreads) found += __popc(words[w]);
+  for (int w = static_cast<int>(threadIdx.x); w < (cells + kWarp - 1) / kWarp; w += kMedianThreads)
+    found += __popc(words[w]);
   const int count = static_cast<int>(sum_over_block<kMedianThreads>(found, room));
-  const auto bits_of = [&](int i) { return __float_as_uint(job.out.points[3 * static_cast<std::int64_t>(i) + 2]); };
-  const unsigned rank = static_cast<unsigned>(max(count - 1, 0) / 2);
-  std::uint32_t lower = 0;  // the largest value that at most `rank` points are below
-  for (int bit = 30; bit >= 0; --bit) {
-    const std::uint32_t candidate = lower | std::uint32_t{1} << bit;
-    unsigned below = 0;
-    for (int i = thread; i < count; i += kMedianThreads) below += bits_of(i) < candidate;
-    if (sum_over_block<kMedianThreads>(below, room) <= rank) lower = candidate;
-  }
-  // Its upper neighbour in order: the same value if it is there often enough, else the least of the larger ones.
-  unsigned up_to = 0;
-  std::uint32_t above = 0x7f7fffffu;
-  for (int i = thread; i < count; i += kMedianThreads) {
-    const std::uint32_t value = bits_of(i);
-    up_to += value <= lower;
-    if (value > lower) above = min(above, value);
-  }
-  const bool repeated = sum_over_block<kMedianThreads>(up_to, room) > static_cast<unsigned>(count / 2);
-  const int least = -__reduce_max_sync(kAllLanes, -static_cast<int>(above));
-  if (thread % kWarp == 0) room[thread / kWarp] = static_cast<unsigned>(least);
-  __syncthreads();
-  if (thread != 0) return;
-  for (int w = 0; w < kMedianThreads / kWarp; ++w) above = min(above, room[w]);
-  const float low = __uint_as_float(lower), high = repeated || count % 2 ? low : __uint_as_float(above);
-  *job.out.header = {count, count ? 0.5f * (low + high) : 0.0f};
+  const float median = block_median(
+      count, count, [&](int i) { return __float_as_uint(job.out.points[3 * static_cast<std::int64_t>(i) + 2]); }, room);
+  if (threadIdx.x == 0) *job.out.header = {count, median};
 }
 
 }  // namespace ggslam::cuda

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images of frames on their way to the device, through page-locked memory that is made once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from ggslam.cuda.transfers import Marker
+
+_TYPES: dict[Any, torch.dtype] = {np.float32: torch.float32, np.uint8: torch.uint8}
+
+
+class FrameUpload:
+    """The place of an image on the device, frame after frame.
+
+    Args:
+        shape: of the images.
+        dtype: of their numbers, float32 or uint8.
+        device: where to.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: type[np.generic], device: torch.device) -> None:
+        self._staged = torch.empty(shape, dtype=_TYPES[dtype], pin_memory=device.type == "cuda")
+        self.staged = self._staged.numpy()
+        """The image that was sent last, on the host."""
+        self._memory = torch.empty(shape, dtype=_TYPES[dtype], device=device)
+        self.address = self._memory.data_ptr()
+        """On the device."""
+        self._sent = Marker(device)
+        self._image: np.ndarray | None = None
+
+    def send(self, image: np.ndarray) -> None:
+        """Starts to send an image; the host waits only if the last one is still on its way."""
+        self._sent.wait_if_ahead()
+        np.copyto(self.staged, image)
+        self._memory.copy_(self._staged, non_blocking=True)
+        self._sent.set()
+        self._image = image
+
+    def have(self, image: np.ndarray) -> None:
+        """The same, unless this very array was sent last."""
+        if self._image is not image:
+            self.send(image)
