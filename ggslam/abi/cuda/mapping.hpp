@@ -10,6 +10,15 @@
 
 namespace ggslam::cuda {
 
+// What a view is compared with, as in ImageLossJob.
+struct TargetImages {
+  const std::uint8_t* color;
+  const void* depth;
+  const std::uint8_t* valid;
+  float depth_scale;
+  std::int32_t depth_is_float;
+};
+
 // One evaluation, all pointers lead to device memory.
 struct ImageLossJob {
   // Rendered: colour [3, H, W], accumulated depth [H, W] in metres, alpha [H, W].
@@ -18,6 +27,7 @@ struct ImageLossJob {
   const std::uint8_t* target_color;
   const void* target_depth;
   const std::uint8_t* target_valid;  // [H, W], 0 where the target shows nothing: its colour does not count; may be null
+  const TargetImages* target;  // on the device, read when it is compared, in place of what is given here; may be null
   const float* exposure;  // [3][2], gain and offset of R, G, B; null: 1 and 0
   // Gradients of the loss, shaped like the rendered images.
   float *d_image, *d_depth, *d_alpha;
@@ -148,12 +158,20 @@ struct LossTotals {
   double iterations;  // how many there were
 };
 
+// A keyframe and how far it goes, as in KeyframeStepJob.
+struct KeyframeChoice {
+  KeyframeState* state;
+  double pose_rate;
+  std::int32_t step_exposure;
+};
+
 // Pointers lead to device memory.
 struct KeyframeStepJob {
   KeyframeState* state;
   const double *twist, *results;  // [6], gradient of the pose; [kLossResults] of the image loss
   const std::int32_t* skipped;    // [1], not 0: nothing is to be done; null: 0
   LossTotals* totals;
+  const KeyframeChoice* choice;   // on the device, read when the step is made, in place of what is given here; may be null
   void* stream;
   double pose_rate;  // 0: the pose stays
   double exposure_rate, exposure_regularization;

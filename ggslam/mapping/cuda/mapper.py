@@ -8,6 +8,7 @@ poses are read. The losses it reports are those that have arrived without waitin
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
@@ -22,6 +23,7 @@ from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
+from ggslam.mapping.cuda.training import CudaTraining
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
@@ -64,7 +66,8 @@ class CudaMapper(Mapper):
         self._overflows = HostMirror(self._rasterizer.overflows)
         self._pace = Pace(self.device)
         self._repeated = 0
-        self._valid_on_device: tuple[np.ndarray, torch.Tensor] | None = None
+        self._training = CudaTraining(self._rasterizer, self._loss, self._states)
+        self._gathers = False  # steps that are started together
 
     @property
     def losses(self) -> LossSums:
@@ -96,7 +99,12 @@ class CudaMapper(Mapper):
         move_with_keyframes(self.map, T_new_old)
 
     def run(self, iterations: int) -> None:
-        super().run(iterations + self._count_missed())
+        self._gathers = True
+        try:
+            super().run(iterations + self._count_missed())
+        finally:
+            self._gathers = False
+            self._start_steps()
         self._totals.send()
         self._overflows.send()
         self._pace.piece_ends()
@@ -198,12 +206,49 @@ class CudaMapper(Mapper):
         assert isinstance(keyframe, CudaKeyframe)
         images, s = keyframe.device_images, self.settings
         exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None
-        valid = self.valid_of(keyframe)
-        if valid is not None and (self._valid_on_device is None or self._valid_on_device[0] is not valid):
-            self._valid_on_device = (valid, torch.from_numpy(valid).to(self.device))
-        shown = None if valid is None or self._valid_on_device is None else self._valid_on_device[1]
+        shown = self._images.usable_of(keyframe, self._valid.get(keyframe.camera_number), self.valid_of)
         target = LossTarget(images.color, images.depth, keyframe.depth_unit, exposure, shown)
         return self._loss.evaluate(view, target, s.loss)
+
+    def _step(
+        self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
+    ) -> None:
+        training, plain = self._training, grid.is_whole and self.extra_loss is None and not learns
+        if not plain or not training.is_ready:
+            self._start_steps()
+            super()._step(keyframe, factors, grid, learns, settles)
+            return
+        if not training.fits(keyframe.camera, self.settings):
+            self._start_steps()
+        images = self._images.of(keyframe)
+        shown = self._images.usable_of(keyframe, self._valid.get(keyframe.camera_number), self.valid_of)
+        rate_factor, pose_factor = factors
+        optimizer = self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles)
+        fixed = keyframe.index == self._all_numbers[0] or (keyframe.instant is not None and self.is_world(keyframe))
+        pose_rate = 0.0 if fixed else pose_factor * self._pose_rate
+        training.add(
+            keyframe.index, keyframe.camera, images, keyframe.depth_unit, shown, optimizer, pose_rate, self.settings
+        )
+        self.times.steps += 1
+        keyframe.iterations += 1
+
+    def _start_steps(self) -> None:
+        """Starts the steps that were gathered."""
+        if self._training.count:
+            start = time.perf_counter()
+            self._training.start(self.map)
+            self.times.backward += time.perf_counter() - start
+
+    def _count_iteration(self) -> None:
+        super()._count_iteration()
+        if not self._gathers:
+            self._start_steps()
+
+    def _bound_values(self) -> None:
+        if self._training.count:
+            self._training.bound_last()
+        else:
+            super()._bound_values()
 
     def _finish_step(self, keyframe: Keyframe, twist: torch.Tensor, loss: CudaLossResult, pose_rate: float) -> None:
         exposure = self.settings.exposure

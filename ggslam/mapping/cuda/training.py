@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training steps on an NVIDIA GPU, many by one call of the library.
+
+What all steps have in common is filled in when something that it names has moved; of a step itself there are only its
+keyframe's row, its images and its rates. The steps are those that `CudaRasterizer`, `CudaImageLoss` and
+`KeyframeStates` make one by one, by the same kernels: forward, loss, backward with the optimizer, the keyframe's step.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import torch
+
+from ggslam.abi.arrays import address
+from ggslam.abi.core import GaussianGradients
+from ggslam.abi.cuda import KeyframeStepJob, TrainingJob, TrainingStep
+from ggslam.mapping.cuda.keyframe import CudaKeyframeImages
+from ggslam.mapping.cuda.keyframe_states import KeyframeStates
+from ggslam.mapping.cuda.losses import CudaImageLoss
+from ggslam.mapping.settings import MapperSettings
+from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
+from ggslam.rendering.arguments import image_gradients
+from ggslam.rendering.cuda.adam import AdamSteps
+from ggslam.rendering.cuda.finished import MapState
+from ggslam.rendering.cuda.rasterizer import CudaRasterizer
+from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import SH_C0, GaussianMap
+
+_MOST_STEPS: Final = 64
+"""Steps that are gathered for one call."""
+
+
+@dataclass(frozen=True)
+class _Filled:
+    """What the job was filled from: as long as it is equal, so is the job."""
+
+    map: MapState
+    camera: Camera
+    room: int
+    memory: int
+    optimizer: tuple[object, ...]
+
+
+class CudaTraining:
+    """Gathers steps and starts them.
+
+    Args:
+        rasterizer: to render with, one that does not wait.
+        loss: evaluates the images.
+        states: of the keyframes.
+    """
+
+    def __init__(self, rasterizer: CudaRasterizer, loss: CudaImageLoss, states: KeyframeStates) -> None:
+        self._rasterizer, self._loss, self._states = rasterizer, loss, states
+        self._library, self._device = rasterizer.library, rasterizer.device
+        self._job = TrainingJob()
+        self._steps: Any = (TrainingStep * _MOST_STEPS)()
+        self._images: list[object] = []  # of the steps: they stay until the steps are started
+        self._camera: Camera | None = None
+        self._settings: MapperSettings | None = None
+        self._optimizer: AdamSettings | None = None  # of the last step
+        self._rates: Any = (ctypes.c_float * len(ADAM_GROUPS))()
+        self._adam_steps = AdamSteps()
+        self._recent = ctypes.c_int64(0)
+        self._filled: _Filled | None = None
+        self._named: tuple[object, ...] = ()  # what the job has addresses of
+        size = self._library.functions.ggslam_cuda_training_bytes()
+        self._desk = torch.zeros(size, dtype=torch.uint8, device=self._device)
+        self._twist = torch.zeros(6, dtype=torch.float64, device=self._device)
+        self.fillings = 0
+        """How often the job was filled."""
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it is known about how much room a rendering needs: the first one has to be waited for."""
+        if self._recent.value == 0:
+            self._recent.value = self._rasterizer.counter.recent_pairs()
+        return self._recent.value > 0
+
+    @property
+    def count(self) -> int:
+        """Of the steps that were gathered and not started."""
+        return len(self._images)
+
+    def fits(self, camera: Camera, settings: MapperSettings) -> bool:
+        """Whether a step with this camera and these settings may join those that were gathered."""
+        same = settings is self._settings and (camera is self._camera or camera == self._camera)
+        return self.count == 0 or (same and self.count < _MOST_STEPS)
+
+    def add(
+        self, row: int, camera: Camera, images: CudaKeyframeImages, depth_unit: float, shown: torch.Tensor | None,
+        optimizer: AdamSettings, pose_rate: float, settings: MapperSettings,
+    ) -> None:  # fmt: skip
+        """A step joins those that were gathered, which it `fits`.
+
+        Args:
+            row: of the keyframe among the states; none is appended until the step is started.
+            images: of the keyframe.
+            depth_unit: of its depth, metres.
+            shown: bool [H, W] on the device, where its colours count; None: everywhere.
+            optimizer: of the map.
+            pose_rate: size of the pose's step in metres and radians; 0: the pose stays.
+            settings: of the mapper.
+        """
+        if settings is not self._settings:
+            self._settings, self._filled = settings, None
+        step = self._steps[self.count]
+        target, keyframe = step.images, step.keyframe
+        target.color, target.depth = images.color.data_ptr(), images.depth.data_ptr()
+        target.valid = None if shown is None else shown.data_ptr()
+        target.depth_scale, target.depth_is_float = depth_unit, 0
+        keyframe.state, keyframe.pose_rate = self._states.address(row), pose_rate
+        keyframe.step_exposure = settings.exposure.enabled and row > 0
+        if optimizer is not self._optimizer:
+            self._optimizer = optimizer
+            self._rates[:] = [float(optimizer.learning_rates.get(name, 0.0)) for name in ADAM_GROUPS]
+        step.rates, step.bounded = self._rates, 0
+        self._camera = camera
+        self._images.append((images, shown))
+
+    def bound_last(self) -> None:
+        """After the last step that was gathered, sizes and, of degree 0, colours are brought within their bounds."""
+        self._steps[self.count - 1].bounded = 1
+
+    def start(self, gaussians: GaussianMap) -> None:
+        """Starts the steps that were gathered, on torch's current stream."""
+        count = self.count
+        if count == 0:
+            return
+        self._fill(gaussians)
+        self._job.rendering.stream = self._states.begin_steps()
+        self._rasterizer.forget()
+        counter, recent = self._rasterizer.counter.handle, ctypes.byref(self._recent)
+        self._library.call("train", ctypes.byref(self._job), self._steps, count, counter, recent)
+        self._images.clear()
+
+    # --- the job -----------------------------------------------------------------------------------------------------
+
+    def _fill(self, gaussians: GaussianMap) -> None:
+        """Fills the job if it is not as it should be."""
+        camera, optimizer, rasterizer = self._camera, self._optimizer, self._rasterizer
+        assert camera is not None and optimizer is not None
+        state = MapState.of(gaussians)
+        if self._filled is None or self._filled.map != state:  # there may have been other renderings since
+            self._recent.value = rasterizer.counter.recent_pairs()
+        room = rasterizer.counter.room_for(self._recent.value) or rasterizer.counter.spare_pairs
+        allocations = rasterizer.memory.allocations + self._loss.memory.allocations
+        wanted = _Filled(state, camera, room, allocations, _shape_of(optimizer))
+        if wanted == self._filled:
+            return
+        self._fill_in(gaussians, camera, room, optimizer)
+        allocations = rasterizer.memory.allocations + self._loss.memory.allocations
+        self._filled = _Filled(state, camera, room, allocations, wanted.optimizer)
+        self.fillings += 1
+
+    def _fill_in(self, gaussians: GaussianMap, camera: Camera, room: int, optimizer: AdamSettings) -> None:
+        job, rasterizer, settings, memory = self._job, self._rasterizer, self._settings, self._rasterizer.memory
+        assert settings is not None
+        rendering = rasterizer.plan(gaussians, camera, room)
+        job.rendering = rendering.native
+        job.loss = self._loss.plan(rendering.buffers, (camera.height, camera.width), settings.loss)
+        job.loss.exposure = self._desk.data_ptr() if settings.exposure.enabled else None
+        result, rows = self._loss.result, memory.block("gradients", rendering.gradient_bytes)
+        gradients = (result.d_image, result.d_depth, result.d_alpha, None)
+        job.image_gradients = image_gradients(rendering.buffers, gradients, True, self._device)
+        touched = memory.block("touched", max(1, len(gaussians)))
+        job.gradients = GaussianGradients(twist=address(self._twist), touched=address(touched))
+        job.adam = self._adam_steps.make(gaussians, optimizer, self._device)
+        job.keyframe = KeyframeStepJob(
+            twist=address(self._twist), results=address(result.results), skipped=address(rasterizer.last_overflowed),
+            totals=address(self._states.totals), exposure_rate=settings.exposure.rate,
+            exposure_regularization=settings.exposure.regularization,
+        )  # fmt: skip
+        job.row_memory, job.desk = address(rows), address(self._desk)
+        job.largest_log_scale = math.log(settings.pruning.max_scale_m)
+        job.darkest, job.brightest = -0.5 / SH_C0, 0.5 / SH_C0
+        job.bounds_colors = gaussians.sh_degree == 0
+        self._named = (rendering, result, rows, touched, self._loss.memory.block("loss", 0))
+
+
+def _shape_of(optimizer: AdamSettings) -> tuple[object, ...]:
+    """What the job has of an optimizer: all but its rates."""
+    o = optimizer
+    times = (o.decay, o.decay_floor, o.decayed_groups, o.fall_updates, o.fall_floor, o.falling_groups)
+    return (o.beta1, o.beta2, o.epsilon, *times)
