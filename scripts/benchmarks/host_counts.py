@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Counts what the host does in a run on a pretended GPU, for bench_host.py. `tests` must be on the search path: it has
+`device_watch`, by which is counted and whose own work is left out."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+from device_watch import DeviceTensor, DeviceWatch
+from torch.utils._pytree import tree_flatten
+
+TOOLS = ("/device_watch/", "/torch/utils/_python_dispatch.py", "/torch/overrides.py", "host_counts.py")
+"""Code that only watches: neither it nor what it calls is counted, but for a call of what it stands in for."""
+STANDS_IN = ("stand_ins.py", "watch.py")
+NO_OPERATIONS = {"device", "is_pinned"}
+
+
+class CallCounter:
+    """Counts calls of Python and of C functions in all threads that are started within, and in this one."""
+
+    def __init__(self, found: Counter[str]) -> None:
+        self._found, self._inside = found, threading.local()
+
+    def profile(self, frame: FrameType, event: str, argument: object) -> None:
+        """What `sys.setprofile` asks for."""
+        depth: int = getattr(self._inside, "depth", 0)
+        if event == "call":
+            path = frame.f_code.co_filename
+            if depth or any(tool in path for tool in TOOLS):
+                self._inside.depth = depth + 1
+                if not depth and path.endswith(STANDS_IN) and not frame.f_code.co_name.startswith("__torch"):
+                    self._found["Python calls"] += 1
+                return
+            self._found["Python calls"] += 1
+        elif event == "return":
+            self._inside.depth = max(0, depth - 1)
+        elif event == "c_call" and not depth:
+            self._found["C calls"] += 1
+
+    @contextmanager
+    def counting(self) -> Iterator[None]:
+        """Within, calls are counted."""
+        threading.setprofile(self.profile)
+        sys.setprofile(self.profile)
+        try:
+            yield
+        finally:
+            sys.setprofile(None)
+            threading.setprofile(None)  # type: ignore[arg-type]
+
+
+class TimedFunctions:
+    """The functions of a library of kernels; notes how often they are called and how long they take.
+
+    Args:
+        functions: as `CudaLibrary.functions`.
+        found: where "library calls" are counted.
+    """
+
+    def __init__(self, functions: Any, found: Counter[str]) -> None:
+        self._functions, self._found = functions, found
+        self._main = threading.get_ident()
+        self.wall = self.cpu = 0.0
+        """Seconds within calls of the thread that made this: by the clock, and of its processor."""
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._functions, name)
+
+        def timed(*arguments: Any) -> Any:
+            wall, cpu = time.perf_counter(), time.thread_time()
+            result = function(*arguments)
+            if threading.get_ident() == self._main:
+                self.wall += time.perf_counter() - wall
+                self.cpu += time.thread_time() - cpu
+            self._found["library calls"] += 1
+            return result
+
+        if name != "ggslam_cuda_error_text":
+            self.__dict__[name] = timed
+        return timed
+
+
+def count_operations(watch: DeviceWatch, found: Counter[str]) -> None:
+    """From now on the watch counts operations of torch, tensors they allocate on the device, and page-locked ones."""
+    dispatch = watch.dispatch
+
+    def counted(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        name = func.overloadpacket.__name__
+        result = dispatch(func, args, kwargs)
+        if name in NO_OPERATIONS:
+            return result
+        found["torch operations"] += 1
+        found["pinned allocations"] += bool(kwargs.get("pin_memory")) or name == "_pin_memory"
+        given = {_place(value) for value in tree_flatten((args, kwargs))[0] if isinstance(value, DeviceTensor)}
+        made = [value for value in tree_flatten(result)[0] if isinstance(value, DeviceTensor)]
+        found["allocations"] += sum(_place(value) not in given for value in made)
+        return result
+
+    watch.dispatch = counted  # type: ignore[method-assign]
+
+
+def _place(tensor: DeviceTensor) -> int:
+    return tensor.host.untyped_storage().data_ptr()
+
+
+def take_records(watch: DeviceWatch, found: Counter[str]) -> Counter[str]:
+    """What was counted since the last time, records of the watch with it; all begins anew."""
+    found["waits"] = len(watch.waits)
+    found["downloads"], found["uploads"] = len(watch.downloads), len(watch.uploads)
+    found["blocking uploads"] = sum(upload.blocking for upload in watch.uploads)
+    found["bytes up"] = sum(upload.bytes for upload in watch.uploads)
+    found["bytes down"] = sum(download.bytes for download in watch.downloads)
+    taken = Counter(found)
+    found.clear()
+    watch.forget()
+    return taken

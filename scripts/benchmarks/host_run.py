@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One run of bench_host.py: SLAM over a recording on a pretended GPU. Prints figures of each kind of frame as JSON. The
+search path says which checkout is measured."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import statistics
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cuda_emulation import emulated_library
+from device_watch import DeviceWatch
+from host_counts import CallCounter, TimedFunctions, count_operations, take_records
+
+from ggslam.cuda.library import CudaLibrary
+from ggslam.scene.frame import Frame
+from ggslam.sequences import open_sequence
+from ggslam.slam.config import load_config
+from ggslam.slam.slam import Slam
+from ggslam.tracking.residual_noise import ResidualNoise
+
+COUNTS = (
+    "Python calls", "C calls", "torch operations", "allocations", "pinned allocations", "library calls", "waits",
+    "downloads", "uploads", "blocking uploads", "bytes up", "bytes down",
+)  # fmt: skip
+
+
+@dataclass
+class Step:
+    """Figures of a frame of one kind."""
+
+    kind: str
+    figures: dict[str, float]
+
+
+class Looks:
+    """Knows of the frame at hand whether the tracker looked at its residuals."""
+
+    def __init__(self) -> None:
+        self.looked = False
+        due = ResidualNoise.due
+
+        def noted(residuals: ResidualNoise) -> bool:
+            self.looked = due(residuals)
+            return self.looked
+
+        ResidualNoise.due = noted  # type: ignore[method-assign]
+
+    def kind(self, is_keyframe: bool) -> str:
+        """Of the frame."""
+        kind = "keyframe" if is_keyframe else "residuals" if self.looked else "ordinary"
+        self.looked = False
+        return kind
+
+
+def read(options: argparse.Namespace) -> list[Frame]:
+    """The first frames of the recording, decoded."""
+    sequence = open_sequence(options.recording, stop=options.frames)
+    return [replace(frame, mask=frame.load_mask(), mask_loader=None) for frame in sequence.stream(masks=True)]
+
+
+def settings(options: argparse.Namespace, *more: str) -> list[str]:
+    """Of the run."""
+    every = ["keyframes.max_gap=1", "mapping.iterations_per_frame=1"] if options.part == "growth" else []
+    return ["evaluation.held_out_every=0", *every, *options.set, *more]
+
+
+def counted_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
+    """Under the watch."""
+    looks, steps, found = Looks(), [], Counter[str]()
+    with DeviceWatch() as watch:
+        watch.library.functions = TimedFunctions(watch.library.functions, found)
+        count_operations(watch, found)
+        calls = CallCounter(found)
+        config = load_config(None, settings(options, "device=cuda"))
+        slam = Slam(frames[0].camera, config, has_masks=frames[0].mask is not None)
+        for frame in frames:
+            take_records(watch, found)
+            with calls.counting():
+                report = slam.step(frame)
+            taken = take_records(watch, found)
+            steps.append(Step(looks.kind(report.is_keyframe), {name: float(taken[name]) for name in COUNTS}))
+        slam.close()
+    return steps
+
+
+def timed_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
+    """Without the watch, tensors on the CPU."""
+    looks, steps = Looks(), []
+    library = CudaLibrary(Path(emulated_library().functions._name), device_type="cpu")
+    functions = TimedFunctions(library.functions, Counter())
+    library.functions = functions
+    config = load_config(None, settings(options))
+    slam = Slam(frames[0].camera, config, has_masks=frames[0].mask is not None, library=library)
+    gc.collect()
+    gc.freeze()
+    for frame in frames:
+        functions.wall = functions.cpu = 0.0
+        wall, cpu = time.perf_counter(), time.thread_time()
+        report = slam.step(frame)
+        wall, cpu = time.perf_counter() - wall - functions.wall, time.thread_time() - cpu - functions.cpu
+        figures = {"host ms": 1e3 * wall, "host ms of its processor": 1e3 * cpu, "kernels ms": 1e3 * functions.wall}
+        steps.append(Step(looks.kind(report.is_keyframe), figures))
+    slam.close()
+    return steps
+
+
+def medians(steps: list[Step]) -> dict[str, float]:
+    """Of each figure, and how many frames there are."""
+    found = {name: statistics.median(step.figures[name] for step in steps) for name in steps[0].figures}
+    return {"frames": len(steps), **found}
+
+
+def kinds_of(steps: list[Step]) -> dict[str, dict[str, float]]:
+    """Medians by kind."""
+    kinds = {kind: [step for step in steps if step.kind == kind] for kind in ("ordinary", "residuals", "keyframe")}
+    return {kind: medians(of_kind) for kind, of_kind in kinds.items() if of_kind}
+
+
+def growth_of(counts: list[Step], times: list[Step], window: int) -> dict[str, dict[str, float]]:
+    """Medians about keyframe 20 and about the last one."""
+    joined = [
+        Step(count.kind, {**count.figures, **clock.figures})
+        for count, clock in zip(counts, times, strict=True)
+        if count.kind == clock.kind == "keyframe"
+    ]
+    early, late = joined[20 - window : 20 + window], joined[-2 * window :]
+    return {"keyframe 20": medians(early), f"keyframe {len(joined) - window}": medians(late)}
+
+
+def main() -> None:
+    """Prints one line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=["counts", "time", "growth"])
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--frames", type=int, required=True)
+    parser.add_argument("--skip", type=int, required=True)
+    parser.add_argument("--window", type=int, required=True)
+    parser.add_argument("--set", nargs="*", default=[])
+    options = parser.parse_args()
+    frames = read(options)
+    found: dict[str, Any]
+    if options.part == "growth":
+        found = growth_of(counted_run(frames, options), timed_run(frames, options), options.window)
+    else:
+        measure = counted_run if options.part == "counts" else timed_run
+        found = kinds_of(measure(frames, options)[options.skip :])
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
