@@ -16,12 +16,16 @@ from cuda_emulation import emulated_library
 from device_watch import DeviceTensor, DeviceWatch
 
 from ggslam.cuda.library import CudaLibrary
+from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.keyframe_states import KeyframeStateTuning
 from ggslam.mapping.cuda.mapper import CudaMapper
 from ggslam.mapping.cuda.training import CudaTraining
+from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
+from ggslam.mapping.labelling import KeyframeLabels
 from ggslam.mapping.settings import MapperSettings
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
 from ggslam.system.tuning import overridden
@@ -29,23 +33,24 @@ from ggslam.system.tuning import overridden
 
 @pytest.fixture(scope="module")
 def frames(room: Path) -> list[Frame]:
-    return list(open_sequence(room, scale=0.22, stride=4).stream())[:4]
+    return list(open_sequence(room, scale=0.22, stride=4).stream(masks=True))[:4]
 
 
-def make_mapper(library: CudaLibrary, **settings: Any) -> CudaMapper:
-    exposed = replace(MapperSettings().exposure, enabled=True)
-    mapper = CudaMapper(
-        GaussianMap(device=library.whole_device(None)), replace(MapperSettings(), exposure=exposed, **settings), library
-    )
+def make_mapper(library: CudaLibrary, identity: IdentitySettings | None = None) -> CudaMapper:
+    exposed, device = replace(MapperSettings().exposure, enabled=True), library.whole_device(None)
+    learner = None if identity is None else CudaIdentityLearner(identity, 1, device, library)
+    gaussians = GaussianMap(feature_channels=0 if identity is None else IDENTITY_CHANNELS, device=device)
+    mapper = CudaMapper(gaussians, replace(MapperSettings(), exposure=exposed), library, identity=learner)
     mapper.pixel_m = 0.01
     return mapper
 
 
-def add_keyframe(mapper: CudaMapper, frame: Frame, number: int = 0) -> None:
+def add_keyframe(mapper: CudaMapper, frame: Frame, number: int = 0, **labels: Any) -> None:
     """Where it is, but for a little that training takes back."""
     assert frame.T_world_camera is not None
     shaken = se3_exp(1e-3 * np.random.default_rng(number).normal(size=6))
-    mapper.add_keyframe(frame, frame.T_world_camera @ inverse(shaken))
+    found = KeyframeLabels(frame.mask, **labels)
+    mapper.add_keyframe(frame, frame.T_world_camera @ inverse(shaken), lambda keyframe, show: found)
 
 
 @contextmanager
@@ -131,6 +136,30 @@ def test_where_cameras_show_nothing_and_what_moved(frames: list[Frame]) -> None:
     both_ways(work)
 
 
+LEARNING = IdentitySettings(every=2, pixels=64, neighbours=NeighbourSettings(samples=20, every=2))
+
+
+@pytest.mark.parametrize("schedule", ["sampled", "votes"])
+def test_objects_are_learned_in_the_same_call(frames: list[Frame], schedule: Any) -> None:
+    """Identity steps among the others, with parts of objects and classes that appear."""
+
+    def work() -> CudaMapper:
+        mapper = make_mapper(emulated_library(), replace(LEARNING, schedule=schedule))
+        for number, frame in enumerate(frames[:3]):
+            parts = [tuple(np.unique(frame.mask)[1:3])] if number == 2 and frame.mask is not None else []
+            add_keyframe(mapper, frame, number, splits=parts)
+            mapper.run(5)
+        mapper.finish_identity()
+        return mapper
+
+    found, expected = both_ways(work)
+    assert found.identity is not None and expected.identity is not None
+    ours, theirs = found.identity.classifier, expected.identity.classifier
+    assert np.array_equal(ours.weight, theirs.weight) and np.array_equal(ours.bias, theirs.bias)
+    assert found.identity.times.count == expected.identity.times.count > 6
+    assert found.map.vote_weights.max() > 0.2 and found.map.features.any()
+
+
 def test_steps_without_room_change_nothing_and_are_counted(frames: list[Frame]) -> None:
     mapper = make_mapper(emulated_library())
     add_keyframe(mapper, frames[0])
@@ -150,7 +179,7 @@ def test_steps_without_room_change_nothing_and_are_counted(frames: list[Frame]) 
 
 def test_nothing_is_waited_for_copied_or_allocated(frames: list[Frame]) -> None:
     with DeviceWatch() as watch:
-        mapper = make_mapper(watch.library)
+        mapper = make_mapper(watch.library, LEARNING)
         for number, frame in enumerate(frames[:2]):
             add_keyframe(mapper, frame, number)
             mapper.run(4)
@@ -167,8 +196,9 @@ def test_nothing_is_waited_for_copied_or_allocated(frames: list[Frame]) -> None:
         watch.forget()
         mapper.run(4)
         assert [call.operation for call in watch.calls] == ["train"]
-        assert operations == 2 * ["copy_"]  # numbers that go to the host
+        assert [name for name in operations if name != "device"] == 2 * ["copy_"]  # numbers that go to the host
         assert not watch.waits and not watch.uploads
+        assert mapper.identity is not None and mapper.identity.times.count > 4
         watch.forget()
         mapper.refine(3)
         assert [call.operation for call in watch.calls] == 3 * ["train"]

@@ -69,16 +69,13 @@ struct InsertionJob {
 // All pointers lead to device memory.
 struct PixelPoolJob {
   const std::uint16_t* mask;   // [H, W], 0 = unlabelled
-  const std::int32_t* alias;   // [kObjectIds], what ids have become
-  std::int32_t* counts;        // [2, kObjectIds], pixels of each object; then only those at boundaries
-  double* per_pixel;           // [2, kObjectIds], odds of one pixel of each object, by either way of drawing
-  std::int64_t* odds;          // [H, W], of each pixel
-  const std::int64_t* sums;    // [H, W], running sum of the odds
-  const double* random;        // [drawn], in [0, 1)
+  const std::int32_t* alias;   // [65536], what ids have become
   std::int32_t* pixels;        // [drawn], flat indices
-  float* vote_weights;         // [drawn], the inverse of their odds; 0 where nothing is labelled
+  float* vote_weights;         // [drawn], the inverse of their odds, mean 1; 0 where nothing is labelled
+  void* workspace;
   void* stream;
   double balance, boundary;    // see IdentitySettings
+  std::uint64_t seed, draw;    // which random numbers: those of a draw's number are its own
   std::int32_t device, height, width, drawn;
 };
 
@@ -204,10 +201,10 @@ GGSLAM_EXPORT int ggslam_cuda_insertion_select(const ggslam::cuda::InsertionJob*
 // Writes the `count` Gaussians chosen by the call before it with the same job.
 GGSLAM_EXPORT int ggslam_cuda_insertion_build(const ggslam::cuda::InsertionJob* job);
 
-// Fills `odds`. Asks for mask and alias and works in counts and per_pixel.
-GGSLAM_EXPORT int ggslam_cuda_pixel_odds(const ggslam::cuda::PixelPoolJob* job);
+// Bytes of memory that a draw takes. Asks for height and width.
+GGSLAM_EXPORT std::int64_t ggslam_cuda_pixel_pool_bytes(const ggslam::cuda::PixelPoolJob* job);
 
-// Fills `pixels` and `vote_weights`. Asks for odds, sums and random.
+// Fills `pixels` and `vote_weights`.
 GGSLAM_EXPORT int ggslam_cuda_draw_pixels(const ggslam::cuda::PixelPoolJob* job);
 
 // Bytes of memory that a search takes. Asks for point_count, row_count and k.

@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "abi/cuda/identity.hpp"
 #include "abi/cuda/mapping.hpp"
 #include "abi/cuda/rendering.hpp"
 #include "abi/export.hpp"
@@ -35,6 +36,7 @@ struct TrainingStep {
   KeyframeChoice keyframe;
   float rates[kAdamGroups];
   std::int32_t bounded;  // 1: sizes, and perhaps colours, are brought within their bounds after it
+  std::int32_t lesson;   // number of the step of identity learning on the same rendering; -1: there is none
 };
 
 }  // namespace ggslam::cuda
@@ -43,7 +45,10 @@ struct TrainingStep {
 GGSLAM_EXPORT std::int64_t ggslam_cuda_training_bytes();
 
 // Makes `count` steps one after the other: forward, loss, backward with the optimizer, the keyframe's step. A step whose
-// rendering finds no room changes nothing and is counted, see Rendering. counter: receives the largest number of pairs;
+// rendering finds no room changes nothing and is counted, see Rendering. identity, lessons: of those steps that have one
+// of identity learning, else null. counter: receives the largest number of pairs;
 // recent_pairs: on the host, receives what ggslam_cuda_recent_pairs says.
 GGSLAM_EXPORT int ggslam_cuda_train(const ggslam::cuda::TrainingJob* job, const ggslam::cuda::TrainingStep* steps,
-                                    int count, void* counter, std::int64_t* recent_pairs);
+                                    int count, const ggslam::cuda::IdentityJob* identity,
+                                    const ggslam::cuda::IdentityStep* lessons, void* counter,
+                                    std::int64_t* recent_pairs);

@@ -57,6 +57,11 @@ class CudaClassTable:
         return self._rows[: self.count]
 
     @property
+    def training_arrays(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Rows and their two moments, float32 [at least count, F + 1], and the number of steps so far, int32 [1]."""
+        return self._rows, *self._moments, self._steps
+
+    @property
     def weight(self) -> torch.Tensor:
         """float32 [count, F]; a view."""
         return self.rows[:, :-1]

@@ -213,7 +213,8 @@ class CudaMapper(Mapper):
     def _step(
         self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
     ) -> None:
-        training, plain = self._training, grid.is_whole and self.extra_loss is None and not learns
+        training, lessons = self._training, self.identity.lessons if learns and self.identity is not None else None
+        plain = grid.is_whole and self.extra_loss is None and (lessons is None or lessons.takes(self.map, keyframe))
         if not plain or not training.is_ready:
             self._start_steps()
             super()._step(keyframe, factors, grid, learns, settles)
@@ -229,6 +230,9 @@ class CudaMapper(Mapper):
         training.add(
             keyframe.index, keyframe.camera, images, keyframe.depth_unit, shown, optimizer, pose_rate, self.settings
         )
+        if lessons is not None:
+            assert isinstance(keyframe, CudaKeyframe)
+            training.teach_last(lessons, self.map, keyframe)
         self.times.steps += 1
         keyframe.iterations += 1
 

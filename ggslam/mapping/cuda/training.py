@@ -17,9 +17,10 @@ import torch
 
 from ggslam.abi.arrays import address
 from ggslam.abi.core import GaussianGradients
-from ggslam.abi.cuda import KeyframeStepJob, TrainingJob, TrainingStep
-from ggslam.mapping.cuda.keyframe import CudaKeyframeImages
+from ggslam.abi.cuda import IdentityJob, IdentityStep, KeyframeStepJob, TrainingJob, TrainingStep
+from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
+from ggslam.mapping.cuda.lessons import CudaLessons
 from ggslam.mapping.cuda.losses import CudaImageLoss
 from ggslam.mapping.settings import MapperSettings
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
@@ -59,6 +60,9 @@ class CudaTraining:
         self._library, self._device = rasterizer.library, rasterizer.device
         self._job = TrainingJob()
         self._steps: Any = (TrainingStep * _MOST_STEPS)()
+        self._lessons: Any = (IdentityStep * _MOST_STEPS)()
+        self._count = self._lesson_count = 0
+        self._identity: IdentityJob | None = None
         self._images: list[object] = []  # of the steps: they stay until the steps are started
         self._camera: Camera | None = None
         self._settings: MapperSettings | None = None
@@ -84,7 +88,7 @@ class CudaTraining:
     @property
     def count(self) -> int:
         """Of the steps that were gathered and not started."""
-        return len(self._images)
+        return self._count
 
     def fits(self, camera: Camera, settings: MapperSettings) -> bool:
         """Whether a step with this camera and these settings may join those that were gathered."""
@@ -118,9 +122,19 @@ class CudaTraining:
         if optimizer is not self._optimizer:
             self._optimizer = optimizer
             self._rates[:] = [float(optimizer.learning_rates.get(name, 0.0)) for name in ADAM_GROUPS]
-        step.rates, step.bounded = self._rates, 0
+        step.rates, step.bounded, step.lesson = self._rates, 0, -1
         self._camera = camera
-        self._images.append((images, shown))
+        self._images += (images, shown)
+        self._count += 1
+
+    def teach_last(self, lessons: CudaLessons, gaussians: GaussianMap, keyframe: CudaKeyframe) -> None:
+        """On the rendering of the last step that was gathered, a step of identity learning is made, too."""
+        camera, number = keyframe.camera, self._lesson_count
+        size = (camera.height, camera.width)
+        self._identity = lessons.fill(self._lessons[number], gaussians, keyframe, size, 1.0)
+        self._steps[self.count - 1].lesson = number
+        self._images.append(keyframe.device_mask)
+        self._lesson_count += 1
 
     def bound_last(self) -> None:
         """After the last step that was gathered, sizes and, of degree 0, colours are brought within their bounds."""
@@ -134,8 +148,11 @@ class CudaTraining:
         self._fill(gaussians)
         self._job.rendering.stream = self._states.begin_steps()
         self._rasterizer.forget()
+        identity = ctypes.byref(self._identity) if self._identity is not None and self._lesson_count else None
         counter, recent = self._rasterizer.counter.handle, ctypes.byref(self._recent)
-        self._library.call("train", ctypes.byref(self._job), self._steps, count, counter, recent)
+        steps, lessons = self._steps, self._lessons
+        self._count = self._lesson_count = 0
+        self._library.call("train", ctypes.byref(self._job), steps, count, identity, lessons, counter, recent)
         self._images.clear()
 
     # --- the job -----------------------------------------------------------------------------------------------------

@@ -250,7 +250,7 @@ class CudaRasterizer:
     def statistics(self) -> dict[str, int]:
         """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile. Waits for the device if
         the rendering did not."""
-        visible, pairs = self._require_last().totals()
+        visible, pairs = self.last_rendering.totals()
         return {"visible": visible, "pairs": pairs}
 
     def pixel_terms(self, pixels: torch.Tensor, capacity: int = 48, min_weight: float = 1e-3) -> CudaPixelTerms:
@@ -265,7 +265,7 @@ class CudaRasterizer:
         Raises:
             RenderError: nothing was rendered, pixels of another shape, type or device.
         """
-        last = self._require_last()
+        last = self.last_rendering
         if pixels.device != self.device:
             raise RenderError(f"pixels: expected a tensor on {self.device}, found one on {pixels.device}")
         return CudaPixelTerms.of_rendering(last.native, pixels, capacity, min_weight, self.library)
@@ -283,7 +283,7 @@ class CudaRasterizer:
     ) -> CudaGradients:
         """Gradients of a loss through the last `forward`; arguments and errors as `CpuRasterizer.backward`."""
         grads = (grad_image, grad_depth, grad_alpha, grad_features)
-        return self.differentiate(self._require_last(), grads, self.memory, detach_features=detach_features)
+        return self.differentiate(self.last_rendering, grads, self.memory, detach_features=detach_features)
 
     def pose_gradient(
         self,
@@ -293,7 +293,7 @@ class CudaRasterizer:
         grad_features: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Only the `twist` of `backward`; the gradients of the Gaussians are not written."""
-        last = self._require_last()
+        last = self.last_rendering
         grads = (grad_image, grad_depth, grad_alpha, grad_features)
         twist, touched = self._twist_and_touched(last)
         out = structures.GaussianGradients(twist=address(twist), touched=address(touched))
@@ -313,7 +313,7 @@ class CudaRasterizer:
     ) -> CudaStepResult:
         """`backward` and one Adam step in one pass, nothing of which the host waits for; arguments, effect and errors
         as `CpuRasterizer.backward_step`, the map being on the rasterizer's device."""
-        last = self._require_last()
+        last = self.last_rendering
         if last.source != MapState.of(map):
             for name in PARAMETERS:
                 if (address(getattr(map, name)) or None) != getattr(last.native.gaussians, name):
@@ -378,7 +378,9 @@ class CudaRasterizer:
             return GaussianTensors(*(getattr(gaussians, name) for name in PARAMETERS))
         return checked_parameters(gaussians, self.device)
 
-    def _require_last(self) -> FinishedRendering:
+    @property
+    def last_rendering(self) -> FinishedRendering:
+        """Of the last `forward`; raises RenderError if there is none."""
         if self._last is None:
             raise RenderError("there is no rendering to differentiate: call forward first (and again after every step)")
         return self._last

@@ -39,14 +39,21 @@ void bound_values(const TrainingJob& job) {
            job.adam.sh.parameters, colors, job.darkest, job.brightest);
 }
 
-// The step that is next on the desk. All that is started is the same for every step, but for `bounded`, and nothing of it
-// waits, allocates or copies to the host: it could be recorded as a graph.
-int make_step(const TrainingJob& job, bool bounded) {
+// A step of identity learning on a training step's rendering.
+struct Lesson {
+  const IdentityJob* job;
+  const IdentityStep* step;
+};
+
+// The step that is next on the desk. All that is started is the same for every step, but for `bounded` and the lesson,
+// and nothing of it waits, allocates or copies to the host: it could be recorded as a graph.
+int make_step(const TrainingJob& job, bool bounded, const Lesson& lesson) {
   const CaptureRegion region;
   launch(begin_step_kernel, 1, kWarp, stream_of(job), desk_of(job));
   int status = ggslam_cuda_project(&job.rendering, nullptr);
   if (status == 0) status = ggslam_cuda_composite(&job.rendering);
   if (status == 0) status = ggslam_cuda_image_loss(&job.loss);
+  if (status == 0 && lesson.step != nullptr) status = ggslam_cuda_learn(lesson.job, lesson.step, &job.rendering);
   if (status == 0)
     status = ggslam_cuda_backward(&job.rendering, &job.image_gradients, &job.gradients, &job.adam, job.row_memory);
   if (status == 0) status = ggslam_cuda_keyframe_step(&job.keyframe);
@@ -69,7 +76,8 @@ using namespace ggslam::cuda;
 
 GGSLAM_EXPORT std::int64_t ggslam_cuda_training_bytes() { return sizeof(TrainingDesk); }
 
-GGSLAM_EXPORT int ggslam_cuda_train(const TrainingJob* given, const TrainingStep* steps, int count, void* counter,
+GGSLAM_EXPORT int ggslam_cuda_train(const TrainingJob* given, const TrainingStep* steps, int count,
+                                    const IdentityJob* identity, const IdentityStep* lessons, void* counter,
                                     std::int64_t* recent_pairs) {
   const TrainingJob job = at_desk(*given);
   return on_device(job.rendering.device, [&] {
@@ -77,7 +85,8 @@ GGSLAM_EXPORT int ggslam_cuda_train(const TrainingJob* given, const TrainingStep
     for (int i = 0; i < count && status == 0; ++i) {
       if (i % kMostWaitingSteps == 0)
         lay_down_steps(job, steps + i, std::min(count - i, kMostWaitingSteps), i == 0);
-      status = make_step(job, steps[i].bounded != 0);
+      const Lesson lesson{identity, steps[i].lesson >= 0 ? lessons + steps[i].lesson : nullptr};
+      status = make_step(job, steps[i].bounded != 0, lesson);
     }
     if (count > 0) count_pairs(counter, desk_of(job)->totals, stream_of(job));
     *recent_pairs = ggslam_cuda_recent_pairs(counter);
