@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary, library_and_device
+from ggslam.cuda.transfers import upload
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.lessons import CudaLessons
@@ -112,8 +113,8 @@ class CudaIdentityLearner(IdentityLearner):
     def _ids_changed(self) -> None:
         super()._ids_changed()
         self._has_parts = bool(self._whole_of.any())
-        self.device_alias.copy_(torch.from_numpy(self._alias.astype(np.int32)))
-        self.device_whole_of.copy_(torch.from_numpy(self._whole_of.astype(np.int32)))
+        self.device_alias.copy_(upload(self._alias.astype(np.int32), self.device))
+        self.device_whole_of.copy_(upload(self._whole_of.astype(np.int32), self.device))
 
     def _merge_votes(self, gaussians: GaussianMap) -> None:
         merge_votes(gaussians, self.device_alias)
@@ -142,8 +143,8 @@ class CudaIdentityLearner(IdentityLearner):
             .reshape(mask.shape)[:: IdentityTuning.split_stride, :: IdentityTuning.split_stride]
             .reshape(-1)
         )
-        seen = torch.from_numpy(grid).to(self.device)
-        seen_as = torch.from_numpy(self.current(mask.reshape(-1)[grid]).astype(np.int32)).to(self.device)
+        seen = upload(grid, self.device)
+        seen_as = upload(self.current(mask.reshape(-1)[grid]).astype(np.int32), self.device)
         everywhere, *here = (torch.zeros(len(gaussians), device=self.device) for _ in range(1 + len(splits)))
         for begin in range(0, len(seen), CudaIdentityTuning.split_pixels):
             pixels = seen[begin : begin + CudaIdentityTuning.split_pixels].contiguous()

@@ -121,7 +121,8 @@ class ImageStore:
             images = CudaKeyframeImages(upload(keyframe.color, self._device), upload(keyframe.depth, self._device))
             self.nbytes += images.nbytes
         self._images[keyframe.index] = images  # the one used last stands last
-        self._make_room()
+        if self.nbytes > self._limit:
+            self._make_room()
         return images
 
     def mask_of(self, keyframe: Keyframe) -> torch.Tensor | None:

@@ -71,7 +71,9 @@ class KeyframeStates:
         self._count = 0
         self._stream: torch.cuda.Stream | None = None  # that rows were written on last
         self._use(self._new_table(KeyframeStateTuning.initial_rows))
-        self.totals = torch.zeros(6, dtype=torch.float64, device=self.device)
+        self.report = torch.zeros(7, dtype=torch.float64, device=self.device)
+        """On the device, to be fetched as one: `totals`, then eight bytes that are the caller's."""
+        self.totals = self.report[:6]
         """On the device, float64 [6]: the numbers of `IterationSums` in their order."""
         self.totals[4].fill_(torch.nan)
         self._step_job = KeyframeStepJob(device=self.device.index or 0, totals=self.totals.data_ptr())

@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 import torch
 
 from ggslam.abi.cuda import MOST_NEIGHBOURS, IdentityJob, IdentityStep
+from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
-from ggslam.mapping.identity import IdentityTuning, MaskOnGrid
+from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.pixel_pool import PixelDrawer
+from ggslam.mapping.identity import IdentityTimes, IdentityTuning, MaskOnGrid
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
 from ggslam.rendering.cuda.finished import MapState
@@ -26,9 +29,6 @@ from ggslam.rendering.pixel_terms import FeatureAdamSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.system.tuning import Tuning
-
-if TYPE_CHECKING:
-    from ggslam.mapping.cuda.identity import CudaIdentityLearner
 
 
 class PoolStoreTuning(Tuning):
@@ -72,6 +72,33 @@ class PoolStore:
             self._spare.append(pool)
 
 
+class Learner(Protocol):
+    """What steps are filled in from, see `CudaIdentityLearner`."""
+
+    settings: IdentitySettings
+    times: IdentityTimes
+    table: CudaClassTable
+    library: CudaLibrary
+    device: torch.device
+    device_alias: torch.Tensor
+    device_whole_of: torch.Tensor
+
+    @property
+    def drawer(self) -> PixelDrawer: ...
+
+    def sample_count(self, neighbours: int) -> int: ...
+
+    def pulls(self, gaussians: GaussianMap) -> bool: ...
+
+    def labels_for_parts(self, gaussians: GaussianMap) -> torch.Tensor | None: ...
+
+    def pool(self, number: int) -> PixelPool[torch.Tensor] | None: ...
+
+    def keep_pool(self, number: int, pool: PixelPool[torch.Tensor]) -> PixelPool[torch.Tensor] | None: ...
+
+    def note_losses(self, losses: torch.Tensor, known: torch.Tensor) -> None: ...
+
+
 @dataclass(frozen=True)
 class _Filled:
     """What the job was filled from: as long as it is equal, so is the job."""
@@ -90,7 +117,7 @@ class CudaLessons:
         learner: whose objects, classes and pixels they are of.
     """
 
-    def __init__(self, learner: CudaIdentityLearner) -> None:
+    def __init__(self, learner: Learner) -> None:
         self._learner, self._device = learner, learner.device
         self._job, self._step = IdentityJob(), IdentityStep()
         self._filled: _Filled | None = None

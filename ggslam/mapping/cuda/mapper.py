@@ -62,8 +62,8 @@ class CudaMapper(Mapper):
         self._insertion = CudaInsertion(self.device, library)
         self._states = KeyframeStates(self.device, library)
         self._images = ImageStore(self.device)
-        self._totals = HostMirror(self._states.totals)
-        self._overflows = HostMirror(self._rasterizer.overflows)
+        self._rasterizer.overflows = self._states.report[6:].view(torch.int64)
+        self._report = HostMirror(self._states.report)
         self._pace = Pace(self.device)
         self._repeated = 0
         self._training = CudaTraining(self._rasterizer, self._loss, self._states)
@@ -71,11 +71,11 @@ class CudaMapper(Mapper):
 
     @property
     def losses(self) -> LossSums:
-        return LossSums(*self._totals.newest()[:4].tolist())
+        return LossSums(*self._report.newest()[:4].tolist())
 
     @property
     def last_psnr(self) -> float:
-        return float(self._totals.newest()[4])
+        return float(self._report.newest()[4])
 
     @property
     def image_bytes(self) -> int:
@@ -105,8 +105,7 @@ class CudaMapper(Mapper):
         finally:
             self._gathers = False
             self._start_steps()
-        self._totals.send()
-        self._overflows.send()
+        self._report.send()
         self._pace.piece_ends()
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
@@ -115,7 +114,7 @@ class CudaMapper(Mapper):
         numbers = self._trainable()
         for _ in range(self._count_missed(int(download(self._rasterizer.overflows)[0][0]))):
             self.iterate(self._draw(numbers), self.settings.refine_decay)
-        self._totals.send()
+        self._report.send()
 
     def drop_hidden(self) -> None:
         """Nothing: it has not been tried on a GPU."""
@@ -126,7 +125,7 @@ class CudaMapper(Mapper):
 
     def _count_missed(self, overflows: int | None = None) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
-        overflows = int(self._overflows.newest()[0]) if overflows is None else overflows
+        overflows = int(self._report.newest()[6:].view(np.int64)[0]) if overflows is None else overflows
         missed = max(0, overflows - self._repeated)
         self._repeated += missed
         return missed

@@ -61,7 +61,9 @@ class CudaTraining:
         self._job = TrainingJob()
         self._steps: Any = (TrainingStep * _MOST_STEPS)()
         self._lessons: Any = (IdentityStep * _MOST_STEPS)()
-        self._count = self._lesson_count = 0
+        self.count = 0
+        """Of the steps that were gathered and not started."""
+        self._lesson_count = 0
         self._identity: IdentityJob | None = None
         self._images: list[object] = []  # of the steps: they stay until the steps are started
         self._camera: Camera | None = None
@@ -84,11 +86,6 @@ class CudaTraining:
         if self._recent.value == 0:
             self._recent.value = self._rasterizer.counter.recent_pairs()
         return self._recent.value > 0
-
-    @property
-    def count(self) -> int:
-        """Of the steps that were gathered and not started."""
-        return self._count
 
     def fits(self, camera: Camera, settings: MapperSettings) -> bool:
         """Whether a step with this camera and these settings may join those that were gathered."""
@@ -125,7 +122,7 @@ class CudaTraining:
         step.rates, step.bounded, step.lesson = self._rates, 0, -1
         self._camera = camera
         self._images += (images, shown)
-        self._count += 1
+        self.count += 1
 
     def teach_last(self, lessons: CudaLessons, gaussians: GaussianMap, keyframe: CudaKeyframe) -> None:
         """On the rendering of the last step that was gathered, a step of identity learning is made, too."""
@@ -151,7 +148,7 @@ class CudaTraining:
         identity = ctypes.byref(self._identity) if self._identity is not None and self._lesson_count else None
         counter, recent = self._rasterizer.counter.handle, ctypes.byref(self._recent)
         steps, lessons = self._steps, self._lessons
-        self._count = self._lesson_count = 0
+        self.count = self._lesson_count = 0
         self._library.call("train", ctypes.byref(self._job), steps, count, identity, lessons, counter, recent)
         self._images.clear()
 
