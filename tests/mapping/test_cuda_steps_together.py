@@ -136,6 +136,21 @@ def test_where_cameras_show_nothing_and_what_moved(frames: list[Frame]) -> None:
     both_ways(work)
 
 
+def test_cameras_of_several_sizes(frames: list[Frame], room: Path) -> None:
+    """Steps that follow one another with one camera are one call."""
+    larger = next(iter(open_sequence(room, scale=0.3).stream()))
+
+    def work() -> CudaMapper:
+        mapper = make_mapper(emulated_library())
+        for number, frame in enumerate((frames[0], larger, frames[1])):
+            add_keyframe(mapper, frame, number)
+            mapper.run(4)
+        return mapper
+
+    found, _ = both_ways(work)
+    assert len({keyframe.camera for keyframe in found.keyframes}) == 2 and found._training.fillings > 5
+
+
 LEARNING = IdentitySettings(every=2, pixels=64, neighbours=NeighbourSettings(samples=20, every=2))
 
 

@@ -220,8 +220,9 @@ class CudaMapper(Mapper):
             return
         if not training.fits(keyframe.camera, self.settings):
             self._start_steps()
-        images = self._images.of(keyframe)
-        shown = self._images.usable_of(keyframe, self._valid.get(keyframe.camera_number), self.valid_of)
+        images, valid, shown = self._images.of(keyframe), self._valid.get(keyframe.camera_number), None
+        if valid is not None or keyframe.moving is not None:
+            shown = self._images.usable_of(keyframe, valid, self.valid_of)
         rate_factor, pose_factor = factors
         optimizer = self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles)
         fixed = keyframe.index == self._all_numbers[0] or (keyframe.instant is not None and self.is_world(keyframe))

@@ -83,7 +83,7 @@ class CudaTraining:
     @property
     def is_ready(self) -> bool:
         """Whether it is known about how much room a rendering needs: the first one has to be waited for."""
-        if self._recent.value == 0:
+        if self._recent.value <= 0:
             self._recent.value = self._rasterizer.counter.recent_pairs()
         return self._recent.value > 0
 
