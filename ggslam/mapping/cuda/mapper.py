@@ -23,7 +23,7 @@ from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
-from ggslam.mapping.cuda.training import CudaTraining
+from ggslam.mapping.cuda.training import CudaTraining, StepKind
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
@@ -218,7 +218,8 @@ class CudaMapper(Mapper):
             self._start_steps()
             super()._step(keyframe, factors, grid, learns, settles)
             return
-        if not training.fits(keyframe.camera, self.settings):
+        kind = StepKind(keyframe.camera, self.settings, self.settings.loss, self.settings.exposure.enabled)
+        if not training.fits(kind):
             self._start_steps()
         images, valid, shown = self._images.of(keyframe), self._valid.get(keyframe.camera_number), None
         if valid is not None or keyframe.moving is not None:
@@ -227,9 +228,7 @@ class CudaMapper(Mapper):
         optimizer = self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles)
         fixed = keyframe.index == self._all_numbers[0] or (keyframe.instant is not None and self.is_world(keyframe))
         pose_rate = 0.0 if fixed else pose_factor * self._pose_rate
-        training.add(
-            keyframe.index, keyframe.camera, images, keyframe.depth_unit, shown, optimizer, pose_rate, self.settings
-        )
+        training.add(kind, keyframe.index, images, keyframe.depth_unit, shown, optimizer, pose_rate)
         if lessons is not None:
             assert isinstance(keyframe, CudaKeyframe)
             training.teach_last(lessons, self.map, keyframe)

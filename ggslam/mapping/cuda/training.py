@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import torch
@@ -22,7 +22,7 @@ from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.lessons import CudaLessons
 from ggslam.mapping.cuda.losses import CudaImageLoss
-from ggslam.mapping.settings import MapperSettings
+from ggslam.mapping.settings import LossSettings, MapperSettings
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.arguments import image_gradients
 from ggslam.rendering.cuda.adam import AdamSteps
@@ -35,14 +35,38 @@ _MOST_STEPS: Final = 64
 """Steps that are gathered for one call."""
 
 
+@dataclass(frozen=True, eq=False)
+class StepKind:
+    """What steps of one call have in common.
+
+    Attributes:
+        camera: of the keyframes.
+        settings: of the mapper.
+        loss: of the images.
+        exposed: whether keyframes have exposures of their own, which follow their gradients.
+    """
+
+    camera: Camera
+    settings: MapperSettings
+    loss: LossSettings
+    exposed: bool
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, StepKind):
+            return NotImplemented
+        same = self.settings is other.settings and self.exposed == other.exposed
+        same = same and (self.camera is other.camera or self.camera == other.camera)
+        return same and (self.loss is other.loss or self.loss == other.loss)
+
+
 @dataclass(frozen=True)
 class _Filled:
-    """What the job was filled from: as long as it is equal, so is the job."""
+    """What the job was filled from, but for the kind of steps: as long as it is equal, so is the job."""
 
     map: MapState
-    camera: Camera
     room: int
     memory: int
+    projection: tuple[float, ...]
     optimizer: tuple[object, ...]
 
 
@@ -66,8 +90,7 @@ class CudaTraining:
         self._lesson_count = 0
         self._identity: IdentityJob | None = None
         self._images: list[object] = []  # of the steps: they stay until the steps are started
-        self._camera: Camera | None = None
-        self._settings: MapperSettings | None = None
+        self._kind: StepKind | None = None
         self._optimizer: AdamSettings | None = None  # of the last step
         self._rates: Any = (ctypes.c_float * len(ADAM_GROUPS))()
         self._adam_steps = AdamSteps()
@@ -87,40 +110,38 @@ class CudaTraining:
             self._recent.value = self._rasterizer.counter.recent_pairs()
         return self._recent.value > 0
 
-    def fits(self, camera: Camera, settings: MapperSettings) -> bool:
-        """Whether a step with this camera and these settings may join those that were gathered."""
-        same = settings is self._settings and (camera is self._camera or camera == self._camera)
-        return self.count == 0 or (same and self.count < _MOST_STEPS)
+    def fits(self, like: StepKind) -> bool:
+        """Whether a step of this kind may join those that were gathered."""
+        return self.count == 0 or (self.count < _MOST_STEPS and like == self._kind)
 
     def add(
-        self, row: int, camera: Camera, images: CudaKeyframeImages, depth_unit: float, shown: torch.Tensor | None,
-        optimizer: AdamSettings, pose_rate: float, settings: MapperSettings,
+        self, kind: StepKind, row: int, images: CudaKeyframeImages, depth_unit: float, shown: torch.Tensor | None,
+        optimizer: AdamSettings, pose_rate: float,
     ) -> None:  # fmt: skip
         """A step joins those that were gathered, which it `fits`.
 
         Args:
+            kind: what it has in common with others.
             row: of the keyframe among the states; none is appended until the step is started.
             images: of the keyframe.
             depth_unit: of its depth, metres.
             shown: bool [H, W] on the device, where its colours count; None: everywhere.
             optimizer: of the map.
             pose_rate: size of the pose's step in metres and radians; 0: the pose stays.
-            settings: of the mapper.
         """
-        if settings is not self._settings:
-            self._settings, self._filled = settings, None
+        if kind != self._kind:
+            self._kind, self._filled = kind, None
         step = self._steps[self.count]
         target, keyframe = step.images, step.keyframe
         target.color, target.depth = images.color.data_ptr(), images.depth.data_ptr()
         target.valid = None if shown is None else shown.data_ptr()
         target.depth_scale, target.depth_is_float = depth_unit, 0
         keyframe.state, keyframe.pose_rate = self._states.address(row), pose_rate
-        keyframe.step_exposure = settings.exposure.enabled and row > 0
+        keyframe.step_exposure = kind.exposed and row > 0
         if optimizer is not self._optimizer:
             self._optimizer = optimizer
             self._rates[:] = [float(optimizer.learning_rates.get(name, 0.0)) for name in ADAM_GROUPS]
         step.rates, step.bounded, step.lesson = self._rates, 0, -1
-        self._camera = camera
         self._images += (images, shown)
         self.count += 1
 
@@ -156,28 +177,29 @@ class CudaTraining:
 
     def _fill(self, gaussians: GaussianMap) -> None:
         """Fills the job if it is not as it should be."""
-        camera, optimizer, rasterizer = self._camera, self._optimizer, self._rasterizer
-        assert camera is not None and optimizer is not None
+        kind, optimizer, rasterizer = self._kind, self._optimizer, self._rasterizer
+        assert kind is not None and optimizer is not None
         state = MapState.of(gaussians)
         if self._filled is None or self._filled.map != state:  # there may have been other renderings since
             self._recent.value = rasterizer.counter.recent_pairs()
         room = rasterizer.counter.room_for(self._recent.value) or rasterizer.counter.spare_pairs
         allocations = rasterizer.memory.allocations + self._loss.memory.allocations
-        wanted = _Filled(state, camera, room, allocations, _shape_of(optimizer))
+        projection = (rasterizer.near_plane, rasterizer.low_pass)
+        wanted = _Filled(state, room, allocations, projection, _shape_of(optimizer))
         if wanted == self._filled:
             return
-        self._fill_in(gaussians, camera, room, optimizer)
+        self._fill_in(gaussians, kind, room, optimizer)
         allocations = rasterizer.memory.allocations + self._loss.memory.allocations
-        self._filled = _Filled(state, camera, room, allocations, wanted.optimizer)
+        self._filled = replace(wanted, memory=allocations)
         self.fillings += 1
 
-    def _fill_in(self, gaussians: GaussianMap, camera: Camera, room: int, optimizer: AdamSettings) -> None:
-        job, rasterizer, settings, memory = self._job, self._rasterizer, self._settings, self._rasterizer.memory
-        assert settings is not None
+    def _fill_in(self, gaussians: GaussianMap, kind: StepKind, room: int, optimizer: AdamSettings) -> None:
+        job, rasterizer, settings, camera = self._job, self._rasterizer, kind.settings, kind.camera
+        memory = rasterizer.memory
         rendering = rasterizer.plan(gaussians, camera, room)
         job.rendering = rendering.native
-        job.loss = self._loss.plan(rendering.buffers, (camera.height, camera.width), settings.loss)
-        job.loss.exposure = self._desk.data_ptr() if settings.exposure.enabled else None
+        job.loss = self._loss.plan(rendering.buffers, (camera.height, camera.width), kind.loss)
+        job.loss.exposure = self._desk.data_ptr() if kind.exposed else None
         result, rows = self._loss.result, memory.block("gradients", rendering.gradient_bytes)
         gradients = (result.d_image, result.d_depth, result.d_alpha, None)
         job.image_gradients = image_gradients(rendering.buffers, gradients, True, self._device)
