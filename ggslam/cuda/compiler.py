@@ -113,7 +113,9 @@ def library_path(nvcc: Path, architecture: str) -> Path:
 def compile_command(nvcc: Path, architecture: str, output: Path) -> list[str]:
     """The command that compiles all sources for one architecture."""
     target = f"-gencode=arch=compute_{architecture},code=sm_{architecture}"
-    return [str(nvcc), *_FLAGS, *common_arguments(), target, *map(str, translation_units()), "-o", str(output)]
+    # nvcc takes a comma for the beginning of another definition.
+    common = [word.replace(",", r"\,") if word.startswith("-D") else word for word in common_arguments()]
+    return [str(nvcc), *_FLAGS, *common, target, *map(str, translation_units()), "-o", str(output)]
 
 
 def compiled_library(architecture: str) -> Path:

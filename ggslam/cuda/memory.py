@@ -16,11 +16,14 @@ class GrowingMemory:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._blocks: dict[str, torch.Tensor] = {}
+        self.allocations = 0
+        """Increases when a block moves, so that addresses can be seen to be stale."""
 
     def block(self, name: str, size: int) -> torch.Tensor:
         """uint8 [at least `size`] of that name; its content is undefined."""
         block = self._blocks.get(name)
         if block is None or block.numel() < size:
+            self.allocations += 1
             self._blocks.pop(name, None)  # free before asking for more
             block = self._blocks[name] = torch.empty(size + size // 4, dtype=torch.uint8, device=self._device)
         return block

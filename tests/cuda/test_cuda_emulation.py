@@ -50,6 +50,15 @@ extern "C" void run(int what, float* out, std::int64_t blocks) {
                                part_of_a_warp, part_of_a_block, last_block, nothing};
   launch(kernels[what], blocks, 64, cudaStream_t{}, out);
 }
+
+extern "C" void run_in_graph(int what, float* out) {
+  const CaptureRegion region;
+  launch(right, 1, 64, cudaStream_t{}, out);
+  void* memory = nullptr;
+  if (what == 1) cudaMemcpyAsync(out, out + 32, 4, cudaMemcpyDeviceToHost, cudaStream_t{});
+  if (what == 2) cudaEventSynchronize(cudaEvent_t{});
+  if (what == 3) cudaHostAlloc(&memory, 4, cudaHostAllocDefault);
+}
 """
 NAMES = ("right", "misaligned", "beyond", "unwritten", "part_of_a_warp", "part_of_a_block", "last_block", "nothing")
 RUN = """
@@ -59,6 +68,13 @@ library.ggslam_emulation_order(int(sys.argv[4]))
 aligned = ctypes.addressof(out) + -ctypes.addressof(out) % 16
 library.run(int(sys.argv[2]), ctypes.c_void_p(aligned), ctypes.c_int64(int(sys.argv[3])))
 print(*(ctypes.c_float * 64).from_address(aligned))
+"""
+
+
+RUN_IN_GRAPH = """
+import ctypes, sys
+library, out = ctypes.CDLL(sys.argv[1]), (ctypes.c_float * 64)()
+library.run_in_graph(int(sys.argv[2]), out)
 """
 
 
@@ -93,6 +109,13 @@ def test_a_kernel_that_is_right_runs(library: Path) -> None:
 def test_faults_end_the_process(library: Path, kernel: str, message: str) -> None:
     done = run(library, kernel)
     assert done.returncode != 0 and any(part in done.stderr for part in message.split("|")), done.stderr
+
+
+@pytest.mark.parametrize(("what", "message"), [(0, ""), (1, "a copy to the host"), (2, "a wait"), (3, "an allocation")])
+def test_what_no_graph_holds_ends_the_process(library: Path, what: int, message: str) -> None:
+    words = [sys.executable, "-c", RUN_IN_GRAPH, str(library), str(what)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode == 0) == (what == 0) and message in done.stderr
 
 
 def test_a_grid_that_is_too_large_is_refused(library: Path) -> None:

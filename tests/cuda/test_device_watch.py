@@ -314,4 +314,4 @@ def test_images_of_the_host_are_refused_by_the_kernels(watch: DeviceWatch) -> No
     rasterizer = CudaRasterizer(library=watch.library)
     images = {"image": torch.empty(3, 24, 40)}  # nothing in Python checks what is given here
     with pytest.raises(DeviceMixing, match="image is no address of device memory"):
-        rasterizer.render(make_map(), CAMERA, POSE, rasterizer._memory, images)
+        rasterizer.render(make_map(), CAMERA, POSE, rasterizer.memory, images)

@@ -167,10 +167,12 @@ inline cudaError_t cudaMemsetAsync(void* place, int value, std::size_t bytes, cu
   return cudaSuccess;
 }
 inline cudaError_t cudaMemcpyAsync(void* to, const void* from, std::size_t bytes, cudaMemcpyKind, cudaStream_t) {
+  emulation::refuse_in_graph("a copy to the host");
   std::memcpy(to, from, bytes);
   return cudaSuccess;
 }
 inline cudaError_t cudaHostAlloc(void** place, std::size_t bytes, unsigned) {
+  emulation::refuse_in_graph("an allocation");
   *place = std::malloc(bytes);
   return cudaSuccess;
 }
@@ -182,12 +184,24 @@ inline cudaError_t cudaEventCreateWithFlags(cudaEvent_t* event, unsigned) {
   *event = nullptr;
   return cudaSuccess;
 }
-inline cudaError_t cudaEventRecord(cudaEvent_t, cudaStream_t) { return cudaSuccess; }
-inline cudaError_t cudaEventSynchronize(cudaEvent_t) { return cudaSuccess; }
+inline cudaError_t cudaEventRecord(cudaEvent_t, cudaStream_t) {
+  emulation::refuse_in_graph("an event for the host");
+  return cudaSuccess;
+}
+inline cudaError_t cudaEventSynchronize(cudaEvent_t) {
+  emulation::refuse_in_graph("a wait");
+  return cudaSuccess;
+}
 inline cudaError_t cudaEventDestroy(cudaEvent_t) { return cudaSuccess; }
 inline cudaError_t cudaStreamSynchronize(cudaStream_t) { return cudaSuccess; }
 
 namespace ggslam::cuda {
+
+// What could be recorded as a graph, see common/platform.cuh.
+struct CaptureRegion {
+  CaptureRegion() { emulation::begin_graph(); }
+  ~CaptureRegion() { emulation::end_graph(); }
+};
 
 template <class Kernel, class... Arguments>
 void launch(Kernel kernel, std::int64_t blocks, int threads, cudaStream_t, const Arguments&... arguments) {

@@ -2,6 +2,7 @@
 #include "fibers.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
@@ -9,6 +10,7 @@
 #include <memory>
 #include <mutex>
 #include <numeric>
+#include <thread>
 #include <ucontext.h>
 #include <utility>
 #include <vector>
@@ -192,6 +194,20 @@ void run_block(unsigned number, unsigned blocks, int threads, void (*code)(const
 void fail(const char* what) {
   std::fprintf(stderr, "CUDA emulation: block %u, thread %u: %s\n", blockIdx.x, threadIdx.x, what);
   std::abort();
+}
+
+namespace {
+std::atomic<std::thread::id> in_graph{};
+}
+
+void begin_graph() {
+  if (in_graph.exchange(std::this_thread::get_id()) != std::thread::id()) fail("a graph within a graph");
+}
+
+void end_graph() { in_graph = std::thread::id(); }
+
+void refuse_in_graph(const char* what) {
+  if (in_graph.load() == std::this_thread::get_id()) fail(what);
 }
 
 void run_grid(std::int64_t blocks, int threads, void (*code)(const void*), const void* argument) {

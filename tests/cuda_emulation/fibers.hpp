@@ -15,6 +15,13 @@ enum Operation { kShuffle, kShuffleXor, kBallot, kReduceAdd, kReduceMax, kSync }
 
 [[noreturn]] void fail(const char* what);
 
+// Between these the calling thread starts what could be recorded as a graph. One thread at a time; they do not nest.
+void begin_graph();
+void end_graph();
+
+// Fails if the calling thread is between them: a graph holds nothing of this kind.
+void refuse_in_graph(const char* what);
+
 // Runs blocks of `threads` threads one after another, each thread calling code(argument).
 void run_grid(std::int64_t blocks, int threads, void (*code)(const void*), const void* argument);
 

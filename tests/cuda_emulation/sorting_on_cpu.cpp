@@ -29,4 +29,12 @@ cudaError_t running_sum(void*, std::size_t, const std::uint32_t* numbers, std::u
   return cudaSuccess;
 }
 
+std::size_t long_sum_bytes(std::int64_t) { return 1; }
+
+cudaError_t long_running_sum(void*, std::size_t, const std::int64_t* numbers, std::int64_t* sums, std::int64_t count,
+                             cudaStream_t) {
+  std::partial_sum(numbers, numbers + count, sums);
+  return cudaSuccess;
+}
+
 }  // namespace ggslam::cuda

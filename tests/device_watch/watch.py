@@ -43,9 +43,12 @@ class WatchedLibrary(CudaLibrary):
         watch = self._watch()
         assert watch is not None
         watch.calls.append(Record(name, here()))
-        for argument in arguments:
+        for argument, following in zip(arguments, (*arguments[1:], None), strict=True):
             if isinstance(found := getattr(argument, "_obj", argument), ctypes.Structure):
                 watch.check_addresses(name, found)
+            if isinstance(argument, ctypes.Array) and isinstance(following, int):  # structures, and how many
+                for found in argument[:following]:
+                    watch.check_addresses(name, found)
         if name.startswith("wait") or name.endswith("_wait"):
             watch.record_wait(f"ggslam_cuda_{name}")
         super().call(name, *arguments)

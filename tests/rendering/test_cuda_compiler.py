@@ -144,6 +144,12 @@ def test_gaussians_on_the_cpu_are_not_for_the_cuda_backend() -> None:
     )
 
 
+def test_a_list_in_a_definition_is_one_definition_to_nvcc(tmp_path: Path) -> None:
+    command = compiler.compile_command(tmp_path / "nvcc", "90", tmp_path / "rasterizer.so")
+    lists = [word for word in command if word.startswith("-DGGSLAM_STRUCTURES=")]
+    assert len(lists) == 1 and lists[0].count(",") == lists[0].count(r"\,") > 10
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("architecture", ["80", "90", "100"])
 def test_nvcc_compiles_without_warnings_or_spills(tmp_path: Path, architecture: str) -> None:

@@ -168,7 +168,7 @@ def test_too_little_room_for_pairs_is_made_good(rasterizer: CudaRasterizer) -> N
     gradients = make_image_gradients(CAMERA, 0)
     expected = run(emulated_rasterizer(), many, CAMERA, POSE, gradients)
     rasterizer.forward(few, CAMERA, POSE)
-    rasterizer._counter.expected_pairs = 100  # the next rendering starts with room for so many
+    rasterizer.counter.expected_pairs = 100  # the next rendering starts with room for so many
     found = run(rasterizer, many, CAMERA, POSE, gradients)
     assert all(torch.equal(found[name], expected[name]) for name in expected)
     again = run(rasterizer, many, CAMERA, POSE, gradients)  # now with more room than there are pairs
@@ -198,8 +198,8 @@ class GuardedMemory(GrowingMemory):
 def test_what_was_in_memory_before_does_not_matter(rasterizer: CudaRasterizer, features: int) -> None:
     found = []
     for value in (0, 255):  # 255: NaN, or numbers far out of range
-        rasterizer._memory = memory = GuardedMemory(value)
-        rasterizer._counter.expected_pairs = 2000  # more than there are
+        rasterizer.memory = memory = GuardedMemory(value)
+        rasterizer.counter.expected_pairs = 2000  # more than there are
         scene, gradients = make_scene(300, features), make_image_gradients(CAMERA, features)
         found.append(run(rasterizer, scene, CAMERA, POSE, gradients, median_depth=True))
         assert memory.untouched()

@@ -151,7 +151,7 @@ def test_loss_does_not_depend_on_what_was_in_memory(name: str) -> None:
     found = []
     for value in (0, 255):
         loss = CudaImageLoss(library=emulated_library())
-        loss._memory = memory = GuardedMemory(value)
+        loss.memory = memory = GuardedMemory(value)
         found.append(copies(loss.evaluate(view, moved_target(target, loss.device), LOSSES[name])))
         assert memory.untouched()
     assert all(torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) for a, b in zip(*found, strict=True))

@@ -117,8 +117,8 @@ def test_without_waiting_the_results_are_the_same(cuda_library: CudaLibrary) -> 
 
 def test_only_what_was_never_seen_is_waited_for(cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch) -> None:
     rasterizer, waited = CudaRasterizer(library=cuda_library, waits=False), []
-    wait = rasterizer._counter.wait
-    monkeypatch.setattr(rasterizer._counter, "wait", lambda: waited.append(1) or wait())
+    wait = rasterizer.counter.wait
+    monkeypatch.setattr(rasterizer.counter, "wait", lambda: waited.append(1) or wait())
     scene = moved(make_scene(100), rasterizer.device)
     for pose, expected in ((BEHIND, 1), (POSE, 2), (POSE, 2), (BEHIND, 2), (POSE, 2)):
         rasterizer.forward(scene, CAMERA, pose)
@@ -129,7 +129,7 @@ def test_only_what_was_never_seen_is_waited_for(cuda_library: CudaLibrary, monke
 def tight_rasterizer(library: CudaLibrary) -> CudaRasterizer:
     """One that has seen little, and makes no more room than a quarter above that and up to a whole step."""
     rasterizer = CudaRasterizer(library=library, waits=False)
-    rasterizer._counter.spare_pairs = 0
+    rasterizer.counter.spare_pairs = 0
     return rasterizer
 
 
@@ -197,6 +197,6 @@ def test_room_is_given_back_slowly(cuda_library: CudaLibrary) -> None:
     for _ in range(500):
         rasterizer.forward(few, CAMERA, FAR)
         rasterizer.overflows.cpu()
-        rooms.append(rasterizer._counter.room_without_waiting())
+        rooms.append(rasterizer.counter.room_without_waiting())
     assert min(rooms[:60]) >= 1.25 * pairs - 1
     assert rooms[-1] == 4096 and max(a - b for a, b in zip(rooms, rooms[1:], strict=False)) == 4096

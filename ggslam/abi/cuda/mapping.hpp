@@ -10,6 +10,15 @@
 
 namespace ggslam::cuda {
 
+// What a view is compared with, as in ImageLossJob.
+struct TargetImages {
+  const std::uint8_t* color;
+  const void* depth;
+  const std::uint8_t* valid;
+  float depth_scale;
+  std::int32_t depth_is_float;
+};
+
 // One evaluation, all pointers lead to device memory.
 struct ImageLossJob {
   // Rendered: colour [3, H, W], accumulated depth [H, W] in metres, alpha [H, W].
@@ -18,6 +27,7 @@ struct ImageLossJob {
   const std::uint8_t* target_color;
   const void* target_depth;
   const std::uint8_t* target_valid;  // [H, W], 0 where the target shows nothing: its colour does not count; may be null
+  const TargetImages* target;  // on the device, read when it is compared, in place of what is given here; may be null
   const float* exposure;  // [3][2], gain and offset of R, G, B; null: 1 and 0
   // Gradients of the loss, shaped like the rendered images.
   float *d_image, *d_depth, *d_alpha;
@@ -59,16 +69,13 @@ struct InsertionJob {
 // All pointers lead to device memory.
 struct PixelPoolJob {
   const std::uint16_t* mask;   // [H, W], 0 = unlabelled
-  const std::int32_t* alias;   // [kObjectIds], what ids have become
-  std::int32_t* counts;        // [2, kObjectIds], pixels of each object; then only those at boundaries
-  double* per_pixel;           // [2, kObjectIds], odds of one pixel of each object, by either way of drawing
-  std::int64_t* odds;          // [H, W], of each pixel
-  const std::int64_t* sums;    // [H, W], running sum of the odds
-  const double* random;        // [drawn], in [0, 1)
+  const std::int32_t* alias;   // [65536], what ids have become
   std::int32_t* pixels;        // [drawn], flat indices
-  float* vote_weights;         // [drawn], the inverse of their odds; 0 where nothing is labelled
+  float* vote_weights;         // [drawn], the inverse of their odds, mean 1; 0 where nothing is labelled
+  void* workspace;
   void* stream;
   double balance, boundary;    // see IdentitySettings
+  std::uint64_t seed, draw;    // which random numbers: those of a draw's number are its own
   std::int32_t device, height, width, drawn;
 };
 
@@ -148,12 +155,20 @@ struct LossTotals {
   double iterations;  // how many there were
 };
 
+// A keyframe and how far it goes, as in KeyframeStepJob.
+struct KeyframeChoice {
+  KeyframeState* state;
+  double pose_rate;
+  std::int32_t step_exposure;
+};
+
 // Pointers lead to device memory.
 struct KeyframeStepJob {
   KeyframeState* state;
   const double *twist, *results;  // [6], gradient of the pose; [kLossResults] of the image loss
   const std::int32_t* skipped;    // [1], not 0: nothing is to be done; null: 0
   LossTotals* totals;
+  const KeyframeChoice* choice;   // on the device, read when the step is made, in place of what is given here; may be null
   void* stream;
   double pose_rate;  // 0: the pose stays
   double exposure_rate, exposure_regularization;
@@ -186,10 +201,10 @@ GGSLAM_EXPORT int ggslam_cuda_insertion_select(const ggslam::cuda::InsertionJob*
 // Writes the `count` Gaussians chosen by the call before it with the same job.
 GGSLAM_EXPORT int ggslam_cuda_insertion_build(const ggslam::cuda::InsertionJob* job);
 
-// Fills `odds`. Asks for mask and alias and works in counts and per_pixel.
-GGSLAM_EXPORT int ggslam_cuda_pixel_odds(const ggslam::cuda::PixelPoolJob* job);
+// Bytes of memory that a draw takes. Asks for height and width.
+GGSLAM_EXPORT std::int64_t ggslam_cuda_pixel_pool_bytes(const ggslam::cuda::PixelPoolJob* job);
 
-// Fills `pixels` and `vote_weights`. Asks for odds, sums and random.
+// Fills `pixels` and `vote_weights`.
 GGSLAM_EXPORT int ggslam_cuda_draw_pixels(const ggslam::cuda::PixelPoolJob* job);
 
 // Bytes of memory that a search takes. Asks for point_count, row_count and k.

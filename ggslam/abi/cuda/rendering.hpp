@@ -22,6 +22,7 @@ struct Rendering {
   std::int64_t gaussian_sorting_bytes, pair_sorting_bytes;  // scratch for sorting, as set by ggslam_cuda_plan
   std::int32_t* overflowed;  // on the device, [1]: becomes 1 if there was too little room for pairs, else 0
   std::int64_t* overflows;   // on the device, [1]: then becomes one more; may be null
+  std::int64_t* most_pairs;  // on the device, [1]: becomes the number of pairs where that is larger; may be null
   void* stream;
   std::int32_t device;
 };
@@ -37,6 +38,7 @@ enum AdamGroup { kMeans, kQuaternions, kLogScales, kOpacityLogits, kShConstant, 
 struct AdamStep {
   AdamArrays means, quaternions, log_scales, opacity_logits, sh, features;
   std::int32_t* updates;  // [N], of each Gaussian so far
+  const float* current_rates;  // on the device, [kAdamGroups], read when the step is made, in place of `rates`; may be null
   float rates[kAdamGroups];
   std::int32_t decayed_groups;  // bit g: the rate of group g decays
   std::int32_t falling_groups;  // bit g: it falls instead
@@ -74,13 +76,14 @@ GGSLAM_EXPORT void ggslam_cuda_counter_destroy(void* counter);
 // Sets the rendering's sizes of sorting scratch and tells how much memory its blocks need, for its pair_capacity.
 GGSLAM_EXPORT int ggslam_cuda_plan(ggslam::cuda::Rendering* r, ggslam::cuda::Sizes* sizes);
 
-// Projects, counts and sorts by depth. The totals will be in the counter; needs the Gaussians' workspace only.
+// Projects, counts and sorts by depth. The totals will be in the counter, if one is given; needs the Gaussians' workspace
+// only.
 GGSLAM_EXPORT int ggslam_cuda_project(const ggslam::cuda::Rendering* r, void* counter);
 
 // Waits for the counter's last projection; totals: visible Gaussians, pairs of a Gaussian and a tile.
 GGSLAM_EXPORT int ggslam_cuda_wait(const void* counter, std::int64_t* totals);
 
-// The largest number of pairs of the last kRecent projections. Does not wait: in the place of one that is still to come
+// The largest number of pairs of the last kRecent projections, all those of one call of training being one of them. Does not wait: in the place of one that is still to come
 // stands the number of an older one. Each number is written as a whole.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_recent_pairs(const void* counter);
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ggslam.cuda.streams import let_go
+from ggslam.cuda.transfers import upload
 from ggslam.mapping.class_numbers import ClassNumbers, ClassTuning, new_rows
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.identity import IDS
@@ -57,6 +58,11 @@ class CudaClassTable:
         return self._rows[: self.count]
 
     @property
+    def training_arrays(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Rows and their two moments, float32 [at least count, F + 1], and the number of steps so far, int32 [1]."""
+        return self._rows, *self._moments, self._steps
+
+    @property
     def weight(self) -> torch.Tensor:
         """float32 [count, F]; a view."""
         return self.rows[:, :-1]
@@ -74,8 +80,7 @@ class CudaClassTable:
     # --- ids that appear and go ---------------------------------------------------------------------------------------
 
     def add(self, object_ids: np.ndarray) -> None:
-        """Makes a class of each id (uint16, distinct) that is not 0 and has none yet. May wait for the device if there
-        are such."""
+        """Makes a class of each id (uint16, distinct) that is not 0 and has none yet."""
         new = self._numbers.add(object_ids)
         if new.stop > len(self._rows):
             extra = max(new.stop, 2 * len(self._rows)) - len(self._rows)
@@ -86,8 +91,10 @@ class CudaClassTable:
             )  # fmt: skip
         weights = new_rows(self._rng, new.stop - new.start, self._channels)
         if len(weights):
-            self._rows[new] = torch.from_numpy(np.pad(weights, ((0, 0), (0, 1)))).to(self._device)
-            self._tell_numbers()
+            self._rows[new] = upload(np.pad(weights, ((0, 0), (0, 1))), self._device)
+            ids = upload(self._numbers.ids[new].astype(np.int32), self._device)
+            self.class_of[ids.long()] = torch.arange(new.start, new.stop, dtype=torch.int32, device=self._device)
+            self.ids = torch.cat([self.ids, ids])
 
     def resume(self, classifier: IdentityClassifier) -> None:
         """Takes over the classes of a classifier, with fresh moments."""
@@ -108,8 +115,8 @@ class CudaClassTable:
         self._tell_numbers()
 
     def _tell_numbers(self) -> None:
-        self.ids = torch.from_numpy(self._numbers.ids.astype(np.int32)).to(self._device)
-        self.class_of.copy_(torch.from_numpy(self._numbers.table))
+        self.ids = upload(self._numbers.ids.astype(np.int32), self._device)
+        self.class_of.copy_(upload(self._numbers.table, self._device))
 
     # --- vectors ------------------------------------------------------------------------------------------------------
 

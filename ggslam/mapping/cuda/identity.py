@@ -9,15 +9,18 @@ classes, and neighbours are those of the map as it is.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary, library_and_device
+from ggslam.cuda.transfers import upload
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.lessons import CudaLessons
 from ggslam.mapping.cuda.neighbours import cuda_neighbours
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
 from ggslam.mapping.identity import IDS, IdentityLearner, IdentityTuning, MaskedKeyframe
@@ -74,7 +77,7 @@ class CudaIdentityLearner(IdentityLearner):
         NativeCoreError: the compiled kernels do not fit this code.
     """
 
-    kept_pools = CudaIdentityTuning.kept_pools
+    kept_pools: ClassVar[int] = CudaIdentityTuning.kept_pools
 
     def __init__(
         self,
@@ -92,9 +95,10 @@ class CudaIdentityLearner(IdentityLearner):
         self._drawer = PixelDrawer(self.device, self.library, drawn_from)
         self._neighbours = neighbours or cuda_neighbours
         self._has_parts = False
-        self._device_alias = torch.arange(IDS, dtype=torch.int32, device=self.device)
-        self._device_whole_of = torch.zeros(IDS, dtype=torch.int32, device=self.device)
+        self.device_alias = torch.arange(IDS, dtype=torch.int32, device=self.device)
+        self.device_whole_of = torch.zeros(IDS, dtype=torch.int32, device=self.device)
         self._last: tuple[torch.Tensor, torch.Tensor] | None = None  # losses of the last step's pixels, their number
+        self.lessons = CudaLessons(self)
 
     @property
     def last_loss(self) -> float:
@@ -109,14 +113,14 @@ class CudaIdentityLearner(IdentityLearner):
     def _ids_changed(self) -> None:
         super()._ids_changed()
         self._has_parts = bool(self._whole_of.any())
-        self._device_alias.copy_(torch.from_numpy(self._alias.astype(np.int32)))
-        self._device_whole_of.copy_(torch.from_numpy(self._whole_of.astype(np.int32)))
+        self.device_alias.copy_(upload(self._alias.astype(np.int32), self.device))
+        self.device_whole_of.copy_(upload(self._whole_of.astype(np.int32), self.device))
 
     def _merge_votes(self, gaussians: GaussianMap) -> None:
-        merge_votes(gaussians, self._device_alias)
+        merge_votes(gaussians, self.device_alias)
 
     def _follow_votes(self, gaussians: GaussianMap, before: torch.Tensor) -> None:
-        other = self._device_alias[before.long()] != before
+        other = self.device_alias[before.long()] != before
         codes = self.table.codes(vote_labels(gaussians))
         gaussians.features.copy_(torch.where(other[:, None], codes, gaussians.features))
 
@@ -125,7 +129,7 @@ class CudaIdentityLearner(IdentityLearner):
         member, were = self.table.members(gaussians.features, np.array(dropped), voted)
         for object_id in dropped:
             self.table.remove(object_id)
-        codes = self.table.codes(torch.where(voted > 0, voted, self._device_alias[were.long()]))
+        codes = self.table.codes(torch.where(voted > 0, voted, self.device_alias[were.long()]))
         gaussians.features.copy_(torch.where(member[:, None], codes, gaussians.features))
 
     def split(
@@ -139,8 +143,8 @@ class CudaIdentityLearner(IdentityLearner):
             .reshape(mask.shape)[:: IdentityTuning.split_stride, :: IdentityTuning.split_stride]
             .reshape(-1)
         )
-        seen = torch.from_numpy(grid).to(self.device)
-        seen_as = torch.from_numpy(self.current(mask.reshape(-1)[grid]).astype(np.int32)).to(self.device)
+        seen = upload(grid, self.device)
+        seen_as = upload(self.current(mask.reshape(-1)[grid]).astype(np.int32), self.device)
         everywhere, *here = (torch.zeros(len(gaussians), device=self.device) for _ in range(1 + len(splits)))
         for begin in range(0, len(seen), CudaIdentityTuning.split_pixels):
             pixels = seen[begin : begin + CudaIdentityTuning.split_pixels].contiguous()
@@ -165,16 +169,16 @@ class CudaIdentityLearner(IdentityLearner):
         if not self._has_parts:
             return labels
         shown, _ = terms.labels(self._shown_labels(gaussians))
-        return torch.where((self._device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
+        return torch.where((self.device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
 
     def labels_at(self, keyframe: CudaMaskedKeyframe, pixels: torch.Tensor) -> torch.Tensor:
         """Objects at pixels (integers [M], flat indices) of a keyframe, int32 [M], for `begin`; 0 = unknown."""
         if keyframe.device_mask is None:
             return torch.zeros(len(pixels), dtype=torch.int32, device=self.device)
-        return self._kernels.labels(keyframe.device_mask, pixels.to(torch.int32), self._device_alias)
+        return self._kernels.labels(keyframe.device_mask, pixels.to(torch.int32), self.device_alias)
 
     def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
-        ids = self._device_alias[labels.long()]
+        ids = self.device_alias[labels.long()]
         gaussians.vote_ids[rows, 0] = ids
         gaussians.vote_weights[rows, 0] = IdentityTuning.birth_vote * (ids > 0)
         if self.settings.initialisation == "votes":
@@ -184,13 +188,28 @@ class CudaIdentityLearner(IdentityLearner):
             random = torch.rand(shape, generator=self._drawer.generator, device=self.device)
             gaussians.features[rows] = (random - 0.5) / SH_C0
 
+    def observe(self, mask: np.ndarray) -> None:
+        super().observe(mask)
+        if self.settings.schedule in ("sampled", "votes"):
+            self.lessons.pools.make_room()
+
     # --- steps --------------------------------------------------------------------------------------------------------
+
+    def step(
+        self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers, rate_factor: float = 1.0
+    ) -> torch.Tensor | None:
+        if not isinstance(rasterizer, CudaRasterizer) or not self.lessons.takes(gaussians, keyframe):
+            return super().step(gaussians, rasterizer, keyframe, view, rate_factor)
+        start = time.perf_counter()
+        self.lessons.run(gaussians, rasterizer, keyframe, rate_factor)
+        self.times.steps += time.perf_counter() - start
+        return None
 
     def _learn_at_pixels(
         self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: CudaMaskedKeyframe, pixels: torch.Tensor,
         vote_weights: torch.Tensor, rate_factor: float,
     ) -> None:  # fmt: skip
-        labels = self._kernels.labels(_mask_of(keyframe), pixels, self._device_alias)
+        labels = self._kernels.labels(_mask_of(keyframe), pixels, self.device_alias)
         terms = rasterizer.pixel_terms(pixels, IdentityTuning.max_terms, IdentityTuning.min_weight)
         labels = self._as_mapped(gaussians, terms, labels)
         if self.settings.schedule == "sampled" and self.table.count:
@@ -199,7 +218,7 @@ class CudaIdentityLearner(IdentityLearner):
             terms.vote(gaussians, labels, vote_weights)
 
     def _new_pool(self, keyframe: CudaMaskedKeyframe, wanted: int) -> PixelPool[torch.Tensor]:
-        return self._drawer.draw(_mask_of(keyframe), self._device_alias, wanted, self.settings)
+        return self._drawer.draw(_mask_of(keyframe), self.device_alias, wanted, self.settings)
 
     def _train(
         self, gaussians: GaussianMap, terms: CudaPixelTerms, labels: torch.Tensor, vote_weights: torch.Tensor,
@@ -228,7 +247,7 @@ class CudaIdentityLearner(IdentityLearner):
         assert view.features is not None
         pixels = torch.arange(size, dtype=torch.int32, device=self.device)
         classes, known = self._kernels.classes(
-            self._kernels.labels(mask, pixels, self._device_alias), self.table.class_of
+            self._kernels.labels(mask, pixels, self.device_alias), self.table.class_of
         )
         features, out = view.features.view(IDENTITY_CHANNELS, size), torch.empty_like(view.features)
         losses, rows = torch.empty(size, device=self.device), torch.zeros_like(self.table.rows)
@@ -252,13 +271,47 @@ class CudaIdentityLearner(IdentityLearner):
         """Rows int64 [R] of the 3-D loss and their gradients float32 [R, F]; a row may appear more than once."""
         s, classes, size = self.settings.neighbours, self.table.count, len(gaussians)
         k = min(s.neighbours, size - 1)
-        samples = min(s.samples, max(16, CudaIdentityTuning.logits_at_once // 10 // ((k + 1) * classes)))
+        samples = self.sample_count(k)
         rows = torch.randint(size, (samples,), generator=self._drawer.generator, device=self.device)
         near = self._neighbours(gaussians.means, rows, k, self.library)
         pulled = torch.cat([rows, near.reshape(-1)])
         logits = self.table.logits(gaussians.features[pulled])
         gradients = self._kernels.neighbour_loss(logits, samples, s.weight * s.value / classes)
         return pulled, torch.mm(gradients, self.table.weight)
+
+    # --- what `CudaLessons` fills in ----------------------------------------------------------------------------------
+
+    @property
+    def drawer(self) -> PixelDrawer:
+        """Of pixels."""
+        return self._drawer
+
+    def sample_count(self, neighbours: int) -> int:
+        """Gaussians that the 3-D loss draws, each with so many neighbours."""
+        at_once = CudaIdentityTuning.logits_at_once // 10 // ((neighbours + 1) * self.table.count)
+        return min(self.settings.neighbours.samples, max(16, at_once))
+
+    def pulls(self, gaussians: GaussianMap) -> bool:
+        """Whether the next step has the 3-D loss."""
+        return self._pulls(gaussians)
+
+    def labels_for_parts(self, gaussians: GaussianMap) -> torch.Tensor | None:
+        """The map's labels by votes as of the newest keyframe, int32 [N]; None while no object has parts."""
+        return self._shown_labels(gaussians) if self._has_parts else None
+
+    def pool(self, number: int) -> PixelPool[torch.Tensor] | None:
+        """Pixels that were drawn ahead of a keyframe."""
+        return self._pools.get(number)
+
+    def keep_pool(self, number: int, pool: PixelPool[torch.Tensor]) -> PixelPool[torch.Tensor] | None:
+        """Keeps the pixels of a keyframe; returns those of another that there is no room for any more."""
+        self._pools.pop(number, None)
+        self._pools[number] = pool
+        return self._pools.pop(next(iter(self._pools))) if len(self._pools) > self.kept_pools else None
+
+    def note_losses(self, losses: torch.Tensor, known: torch.Tensor) -> None:
+        """Where a step leaves its losses (float32 [P]) and how many pixels have one (int32 [1])."""
+        self._last = losses, known
 
     def _learned_labels(self, gaussians: GaussianMap) -> torch.Tensor:
         return self.table.labels(gaussians.features, self.settings.min_confidence)

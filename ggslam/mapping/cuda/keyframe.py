@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -31,17 +32,21 @@ class CudaKeyframeImages:
         depth: uint16 [H, W], see `Keyframe`.
         mask: uint16 [H, W], uploaded when first asked for.
         mask_of: the array that it was uploaded from.
+        shown: bool [H, W], where colours count, uploaded when first asked for; None: everywhere.
+        shown_of: what it was made from.
     """
 
     color: torch.Tensor
     depth: torch.Tensor
     mask: torch.Tensor | None = None
     mask_of: np.ndarray | None = None
+    shown: torch.Tensor | None = None
+    shown_of: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
 
     @property
     def nbytes(self) -> int:
         """Memory that they take."""
-        return sum(image.nbytes for image in (self.color, self.depth, self.mask) if image is not None)
+        return sum(image.nbytes for image in (self.color, self.depth, self.mask, self.shown) if image is not None)
 
 
 class CudaKeyframe(Keyframe):
@@ -116,7 +121,8 @@ class ImageStore:
             images = CudaKeyframeImages(upload(keyframe.color, self._device), upload(keyframe.depth, self._device))
             self.nbytes += images.nbytes
         self._images[keyframe.index] = images  # the one used last stands last
-        self._make_room()
+        if self.nbytes > self._limit:
+            self._make_room()
         return images
 
     def mask_of(self, keyframe: Keyframe) -> torch.Tensor | None:
@@ -131,6 +137,28 @@ class ImageStore:
             self.nbytes += images.nbytes
             self._make_room()
         return images.mask
+
+    def usable_of(
+        self, keyframe: Keyframe, valid: np.ndarray | None, find: Callable[[Keyframe], np.ndarray | None]
+    ) -> torch.Tensor | None:
+        """Where a keyframe's colours count, bool [H, W]; None: everywhere.
+
+        Args:
+            valid: where images of its camera show something; None: everywhere.
+            find: tells it on the host; asked only if `valid` or what moved is another one than the last time.
+        """
+        moving = keyframe.moving
+        if valid is None and moving is None:
+            return None
+        images = self.of(keyframe)
+        if images.shown_of[0] is not valid or images.shown_of[1] is not moving:
+            self.nbytes -= images.nbytes
+            shown = find(keyframe)
+            images.shown = None if shown is None else upload(shown, self._device)
+            images.shown_of = (valid, moving)
+            self.nbytes += images.nbytes
+            self._make_room()
+        return images.shown
 
     def _make_room(self) -> None:
         while self.nbytes > self._limit and len(self._images) > 1:

@@ -71,7 +71,9 @@ class KeyframeStates:
         self._count = 0
         self._stream: torch.cuda.Stream | None = None  # that rows were written on last
         self._use(self._new_table(KeyframeStateTuning.initial_rows))
-        self.totals = torch.zeros(6, dtype=torch.float64, device=self.device)
+        self.report = torch.zeros(7, dtype=torch.float64, device=self.device)
+        """On the device, to be fetched as one: `totals`, then eight bytes that are the caller's."""
+        self.totals = self.report[:6]
         """On the device, float64 [6]: the numbers of `IterationSums` in their order."""
         self.totals[4].fill_(torch.nan)
         self._step_job = KeyframeStepJob(device=self.device.index or 0, totals=self.totals.data_ptr())
@@ -140,17 +142,21 @@ class KeyframeStates:
             RenderError: a tensor of another type, shape or device.
         """
         job = self._step_job
-        job.state = self._address(i)
+        job.state = self.address(i)
         job.twist = self._pointer_of("twist", twist, torch.float64, _TWIST)
         job.results = self._pointer_of("loss_results", loss_results, torch.float64, _RESULTS)
         job.skipped = None if skipped is None else self._pointer_of("skipped", skipped, torch.int32, _FLAG)
         job.pose_rate, job.step_exposure = pose_rate, exposure is not None
         if exposure is not None:
             job.exposure_rate, job.exposure_regularization = exposure.rate, exposure.regularization
-        job.stream = self._current_stream()
+        job.stream = self.begin_steps()
         self.library.call("keyframe_step", ctypes.byref(job))
+
+    def begin_steps(self) -> int | None:
+        """Others are about to make steps, with `address` and `totals`; returns the stream for them."""
         self._changes += 1
         self._read_sums = None
+        return self._current_stream()
 
     def write_pose(self, i: int, T_camera_world: np.ndarray) -> None:
         """Sets keyframe i's pose [4, 4]; the moments of its steps stay.
@@ -202,7 +208,8 @@ class KeyframeStates:
             raise IndexError(f"keyframe {i} of {self._count}")
         return i
 
-    def _address(self, i: int) -> int:
+    def address(self, i: int) -> int:
+        """Of keyframe i's row; valid until the next `append`."""
         return self._table.data_ptr() + self._check_index(i) * ctypes.sizeof(KeyframeState)
 
     def _write(self, i: int, T_camera_world: np.ndarray, exposure: np.ndarray | None) -> None:

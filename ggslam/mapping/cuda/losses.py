@@ -61,7 +61,7 @@ class CudaImageLoss:
 
     def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
         self.library, self.device = library_and_device(device, library)
-        self._memory = GrowingMemory(self.device)
+        self.memory = GrowingMemory(self.device)
         self._results = torch.empty(_VALUES + 6, dtype=torch.float64, device=self.device)
         self._gradients = self._new_gradients(0, 0)
 
@@ -73,16 +73,34 @@ class CudaImageLoss:
         Raises:
             RenderError: an array has another shape, type or device than `RenderedImages` and `LossTarget` say.
         """
-        height, width = self._target_size(target)
-        job = ImageLossJob(height=height, width=width, device=self.device.index or 0, depth_scale=target.depth_scale)
-        for name, shape in (("image", (3, height, width)), ("depth", (height, width)), ("alpha", (height, width))):
-            tensor = getattr(rendered, name)
-            self._check(f"rendered {name}", tensor, (torch.float32,), shape)
-            setattr(job, name, tensor.data_ptr())
+        job = self.plan(rendered, self._target_size(target), settings)
+        job.depth_scale = target.depth_scale
         job.target_color, job.target_depth = target.color.data_ptr(), target.depth.data_ptr()
         job.target_depth_is_float = target.depth.dtype == torch.float32
         job.target_valid = None if target.valid is None else target.valid.data_ptr()
         job.exposure = None if target.exposure is None else target.exposure.data_ptr()
+        job.stream = self.library.stream(self.device)
+        self.library.call("image_loss", ctypes.byref(job))
+        return self.result
+
+    @property
+    def result(self) -> CudaLossResult:
+        """Where the last evaluation writes."""
+        return CudaLossResult(*self._gradients, self._results)
+
+    def plan(self, rendered: RenderedImages, size: tuple[int, int], settings: LossSettings) -> ImageLossJob:
+        """An evaluation of images of `size` (height, width) without a target, and not started: `result` is where it
+        will write, `memory` what it works in.
+
+        Raises:
+            RenderError: an image has another shape, type or device than `RenderedImages` says.
+        """
+        height, width = size
+        job = ImageLossJob(height=height, width=width, device=self.device.index or 0)
+        for name, shape in (("image", (3, height, width)), ("depth", (height, width)), ("alpha", (height, width))):
+            tensor = getattr(rendered, name)
+            self._check(f"rendered {name}", tensor, (torch.float32,), shape)
+            setattr(job, name, tensor.data_ptr())
         job.normalised_depth = settings.depth_kind == "normalised"
         job.charbonnier = settings.color_kind == "charbonnier"
         for name in LOSS_WEIGHTS:
@@ -90,11 +108,10 @@ class CudaImageLoss:
         if self._gradients[1].shape != (height, width):
             self._gradients = self._new_gradients(height, width)
         job.d_image, job.d_depth, job.d_alpha = (gradient.data_ptr() for gradient in self._gradients)
-        job.results, job.stream = self._results.data_ptr(), self.library.stream(self.device)
-        size = self.library.functions.ggslam_cuda_image_loss_bytes(ctypes.byref(job))
-        job.workspace = self._memory.block("loss", size).data_ptr()
-        self.library.call("image_loss", ctypes.byref(job))
-        return CudaLossResult(*self._gradients, self._results)
+        job.results = self._results.data_ptr()
+        size_of_block = self.library.functions.ggslam_cuda_image_loss_bytes(ctypes.byref(job))
+        job.workspace = self.memory.block("loss", size_of_block).data_ptr()
+        return job
 
     def _new_gradients(self, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         image = torch.empty(3, height, width, device=self.device)

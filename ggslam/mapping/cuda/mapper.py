@@ -8,6 +8,7 @@ poses are read. The losses it reports are those that have arrived without waitin
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
@@ -22,6 +23,7 @@ from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
+from ggslam.mapping.cuda.training import CudaTraining, StepKind
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller, MapLabels
@@ -60,19 +62,20 @@ class CudaMapper(Mapper):
         self._insertion = CudaInsertion(self.device, library)
         self._states = KeyframeStates(self.device, library)
         self._images = ImageStore(self.device)
-        self._totals = HostMirror(self._states.totals)
-        self._overflows = HostMirror(self._rasterizer.overflows)
+        self._rasterizer.overflows = self._states.report[6:].view(torch.int64)
+        self._report = HostMirror(self._states.report)
         self._pace = Pace(self.device)
         self._repeated = 0
-        self._valid_on_device: tuple[np.ndarray, torch.Tensor] | None = None
+        self._training = CudaTraining(self._rasterizer, self._loss, self._states)
+        self._gathers = False  # steps that are started together
 
     @property
     def losses(self) -> LossSums:
-        return LossSums(*self._totals.newest()[:4].tolist())
+        return LossSums(*self._report.newest()[:4].tolist())
 
     @property
     def last_psnr(self) -> float:
-        return float(self._totals.newest()[4])
+        return float(self._report.newest()[4])
 
     @property
     def image_bytes(self) -> int:
@@ -96,9 +99,13 @@ class CudaMapper(Mapper):
         move_with_keyframes(self.map, T_new_old)
 
     def run(self, iterations: int) -> None:
-        super().run(iterations + self._count_missed())
-        self._totals.send()
-        self._overflows.send()
+        self._gathers = True
+        try:
+            super().run(iterations + self._count_missed())
+        finally:
+            self._gathers = False
+            self._start_steps()
+        self._report.send()
         self._pace.piece_ends()
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
@@ -107,7 +114,7 @@ class CudaMapper(Mapper):
         numbers = self._trainable()
         for _ in range(self._count_missed(int(download(self._rasterizer.overflows)[0][0]))):
             self.iterate(self._draw(numbers), self.settings.refine_decay)
-        self._totals.send()
+        self._report.send()
 
     def drop_hidden(self) -> None:
         """Nothing: it has not been tried on a GPU."""
@@ -118,7 +125,7 @@ class CudaMapper(Mapper):
 
     def _count_missed(self, overflows: int | None = None) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
-        overflows = int(self._overflows.newest()[0]) if overflows is None else overflows
+        overflows = int(self._report.newest()[6:].view(np.int64)[0]) if overflows is None else overflows
         missed = max(0, overflows - self._repeated)
         self._repeated += missed
         return missed
@@ -198,12 +205,53 @@ class CudaMapper(Mapper):
         assert isinstance(keyframe, CudaKeyframe)
         images, s = keyframe.device_images, self.settings
         exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None
-        valid = self.valid_of(keyframe)
-        if valid is not None and (self._valid_on_device is None or self._valid_on_device[0] is not valid):
-            self._valid_on_device = (valid, torch.from_numpy(valid).to(self.device))
-        shown = None if valid is None or self._valid_on_device is None else self._valid_on_device[1]
+        shown = self._images.usable_of(keyframe, self._valid.get(keyframe.camera_number), self.valid_of)
         target = LossTarget(images.color, images.depth, keyframe.depth_unit, exposure, shown)
         return self._loss.evaluate(view, target, s.loss)
+
+    def _step(
+        self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
+    ) -> None:
+        training, lessons = self._training, self.identity.lessons if learns and self.identity is not None else None
+        plain = grid.is_whole and self.extra_loss is None and (lessons is None or lessons.takes(self.map, keyframe))
+        if not plain or not training.is_ready:
+            self._start_steps()
+            super()._step(keyframe, factors, grid, learns, settles)
+            return
+        kind = StepKind(keyframe.camera, self.settings, self.settings.loss, self.settings.exposure.enabled)
+        if not training.fits(kind):
+            self._start_steps()
+        images, valid, shown = self._images.of(keyframe), self._valid.get(keyframe.camera_number), None
+        if valid is not None or keyframe.moving is not None:
+            shown = self._images.usable_of(keyframe, valid, self.valid_of)
+        rate_factor, pose_factor = factors
+        optimizer = self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles)
+        fixed = keyframe.index == self._all_numbers[0] or (keyframe.instant is not None and self.is_world(keyframe))
+        pose_rate = 0.0 if fixed else pose_factor * self._pose_rate
+        training.add(kind, keyframe.index, images, keyframe.depth_unit, shown, optimizer, pose_rate)
+        if lessons is not None:
+            assert isinstance(keyframe, CudaKeyframe)
+            training.teach_last(lessons, self.map, keyframe)
+        self.times.steps += 1
+        keyframe.iterations += 1
+
+    def _start_steps(self) -> None:
+        """Starts the steps that were gathered."""
+        if self._training.count:
+            start = time.perf_counter()
+            self._training.start(self.map)
+            self.times.backward += time.perf_counter() - start
+
+    def _count_iteration(self) -> None:
+        super()._count_iteration()
+        if not self._gathers:
+            self._start_steps()
+
+    def _bound_values(self) -> None:
+        if self._training.count:
+            self._training.bound_last()
+        else:
+            super()._bound_values()
 
     def _finish_step(self, keyframe: Keyframe, twist: torch.Tensor, loss: CudaLossResult, pose_rate: float) -> None:
         exposure = self.settings.exposure

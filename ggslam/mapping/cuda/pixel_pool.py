@@ -10,8 +10,8 @@ import torch
 
 from ggslam.abi.cuda import PixelPoolJob
 from ggslam.cuda.library import CudaLibrary
+from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
-from ggslam.mapping.identity import IDS
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
 
@@ -29,9 +29,15 @@ class PixelDrawer:
     def __init__(self, device: torch.device, library: CudaLibrary, seed: int) -> None:
         self._device, self._library = device, library
         self.generator = torch.Generator(device).manual_seed(seed)
-        """What random numbers come from."""
-        self._counts = torch.empty(2, IDS, dtype=torch.int32, device=device)
-        self._per_pixel = torch.empty(2, IDS, dtype=torch.float64, device=device)
+        """What other random numbers come from."""
+        self._memory, self._draws = GrowingMemory(device), 0
+        self.seed = int(self.generator.initial_seed())
+        """Of the pixels."""
+
+    def next_draw(self) -> int:
+        """The number of the next draw of pixels: with the seed it tells which."""
+        self._draws += 1
+        return self._draws
 
     def draw(
         self, mask: torch.Tensor, alias: torch.Tensor, wanted: int, settings: IdentitySettings
@@ -52,19 +58,15 @@ class PixelDrawer:
                 f"mask: expected a contiguous torch.uint16 [H, W] on {self._device}, found {mask.dtype} "
                 f"{list(mask.shape)} on {mask.device}"
             )
-        odds = torch.empty(mask.numel(), dtype=torch.int64, device=self._device)
         pixels = torch.empty(wanted, dtype=torch.int32, device=self._device)
         weights = torch.empty(wanted, dtype=torch.float32, device=self._device)
-        random = torch.rand(wanted, generator=self.generator, dtype=torch.float64, device=self._device)
         job = PixelPoolJob(
-            mask=mask.data_ptr(), alias=alias.data_ptr(), counts=self._counts.data_ptr(),
-            per_pixel=self._per_pixel.data_ptr(), odds=odds.data_ptr(), random=random.data_ptr(),
-            pixels=pixels.data_ptr(), vote_weights=weights.data_ptr(), stream=self._library.stream(self._device),
-            balance=settings.balance, boundary=settings.boundary, device=self._device.index or 0,
-            height=mask.shape[0], width=mask.shape[1], drawn=wanted,
+            mask=mask.data_ptr(), alias=alias.data_ptr(), pixels=pixels.data_ptr(), vote_weights=weights.data_ptr(),
+            stream=self._library.stream(self._device), balance=settings.balance, boundary=settings.boundary,
+            seed=self.seed, draw=self.next_draw(), device=self._device.index or 0, height=mask.shape[0],
+            width=mask.shape[1], drawn=wanted,
         )  # fmt: skip
-        self._library.call("pixel_odds", ctypes.byref(job))
-        sums = odds.cumsum(0)
-        job.sums = sums.data_ptr()
+        room = self._library.functions.ggslam_cuda_pixel_pool_bytes(ctypes.byref(job))
+        job.workspace = self._memory.block("pool", room).data_ptr()
         self._library.call("draw_pixels", ctypes.byref(job))
-        return PixelPool(pixels, weights / weights.mean().clamp_min(1e-30))
+        return PixelPool(pixels, weights)

@@ -70,7 +70,14 @@ class Counter:
         Raises:
             RenderError: one of them had more pairs than can be numbered.
         """
-        recent = self._library.functions.ggslam_cuda_recent_pairs(self.handle)
+        return self.room_for(self.recent_pairs())
+
+    def recent_pairs(self) -> int:
+        """The most pairs of the last 64 renderings that are done, or calls of training."""
+        return self._library.functions.ggslam_cuda_recent_pairs(self.handle)
+
+    def room_for(self, recent: int) -> int | None:
+        """As `room_without_waiting`, given what `recent_pairs` says."""
         _check_pairs(recent)
         self._needed = max(recent, self._needed - (self._needed - recent) // 64 - 1)
         if self._needed == 0:

@@ -148,7 +148,7 @@ class CudaPixelTerms:
         self._check("gradient", gradient, torch.float32, (len(self), channels))
         if not gaussians.moments:
             raise RenderError("step: the map was made without moments")
-        adam = _adam_step(gaussians, optimizer)
+        adam = feature_step(gaussians, optimizer)
         self._call("step", self._by_gaussian(len(gaussians)), address(gradient), channels, adam)
 
     def vote(self, gaussians: GaussianMap, labels: torch.Tensor, pixel_weights: torch.Tensor | None = None) -> None:
@@ -227,7 +227,7 @@ class CudaPixelTerms:
         return channels
 
 
-def _adam_step(gaussians: GaussianMap, optimizer: FeatureAdamSettings) -> AdamStep:
+def feature_step(gaussians: GaussianMap, optimizer: FeatureAdamSettings) -> AdamStep:
     """The step of the features alone: no rate decays, and it is their own updates that count."""
 
     def logarithm(factor: float) -> float:

@@ -98,6 +98,8 @@ class CudaRasterizer:
         last_overflowed: int32 [1] on the device, 1 after a rendering that ran out of room, else 0. Of the last
             rendering in stream order; 0 after one that was waited for.
         overflows: int64 [1] on the device, how many renderings ran out of room so far.
+        counter: of pairs.
+        memory: that renderings work in.
 
     Raises:
         RenderError: an impossible near plane or low-pass filter.
@@ -119,10 +121,10 @@ class CudaRasterizer:
         self.waits = waits
         self.last_overflowed = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.overflows = torch.zeros(1, dtype=torch.int64, device=self.device)
-        self._counter = Counter(self.library, self.device.index or 0)
+        self.counter = Counter(self.library, self.device.index or 0)
         self._adam_steps = AdamSteps()
         self._planned: tuple[object, Sizes, int, int] = (None, Sizes(), 0, 0)
-        self._memory = GrowingMemory(self.device)
+        self.memory = GrowingMemory(self.device)
         self._images: dict[str, torch.Tensor] = {}
         self._last: FinishedRendering | None = None
 
@@ -148,7 +150,7 @@ class CudaRasterizer:
         """
         self._last = None
         self._last = self.render(
-            gaussians, camera, T_camera_world, self._memory, self._images,
+            gaussians, camera, T_camera_world, self.memory, self._images,
             features=features, median_depth=median_depth, active_sh_degree=active_sh_degree,
         )  # fmt: skip
         return self._last.buffers
@@ -167,15 +169,41 @@ class CudaRasterizer:
     ) -> FinishedRendering:
         """Renders in memory and images given by the caller (images are made where they do not fit), so that several
         renderings can wait to be differentiated."""
-        parameters = self._parameters(gaussians)
-        arrays = gaussian_arrays(parameters, features, active_sh_degree)
         if isinstance(T_camera_world, torch.Tensor):
             check_tensor("T_camera_world", T_camera_world, self.device, _POSE_SHAPE)
             pose, view = T_camera_world, camera_view(camera, self.near_plane, self.low_pass)
         else:
             pose, view = None, posed_view(camera, T_camera_world, self.near_plane, self.low_pass)
+        parameters = self._parameters(gaussians)
+        arrays = gaussian_arrays(parameters, features, active_sh_degree)
         channels = arrays.feature_channels if arrays.render_features else 0
         buffers = image_buffers(images, camera, channels, median_depth, self.device)
+        rendering = self._describe(gaussians, parameters, arrays, view, buffers, pose)
+        self._run(rendering, memory)
+        return rendering
+
+    def plan(self, gaussians: GaussianMap, camera: Camera, room: int) -> FinishedRendering:
+        """A rendering without features that others start, for poses that they give: in the rasterizer's memory and
+        images, with room for so many pairs. Once they do, what was rendered last cannot be differentiated any more."""
+        parameters = self._parameters(gaussians)
+        arrays, view = gaussian_arrays(parameters, False, None), camera_view(camera, self.near_plane, self.low_pass)
+        buffers = image_buffers(self._images, camera, 0, False, self.device)
+        rendering = self._describe(gaussians, parameters, arrays, view, buffers, None)
+        sizes, memory = self._plan(rendering, room), self.memory
+        rendering.use("gaussian_workspace", memory.block("gaussians", sizes.gaussian_workspace))
+        rendering.use("pixel_workspace", memory.block("pixels", sizes.pixel_workspace))
+        rendering.use("pair_workspace", memory.block("pairs", sizes.pair_workspace))
+        rendering.gradient_bytes = sizes.gradient_rows
+        return rendering
+
+    def forget(self) -> None:
+        """What was rendered last: its memory is used by others now."""
+        self._last = None
+
+    def _describe(
+        self, gaussians: Gaussians, parameters: GaussianTensors, arrays: structures.GaussianArrays,
+        view: structures.CameraView, buffers: RenderBuffers, pose: torch.Tensor | None,
+    ) -> FinishedRendering:  # fmt: skip
         stream, index = self.library.stream(self.device), self.device.index or 0
         native = Rendering(arrays, view, address(pose), target_pointers(buffers), stream=stream, device=index)
         native.overflowed = self.last_overflowed.data_ptr()
@@ -183,11 +211,10 @@ class CudaRasterizer:
         rendering = FinishedRendering(parameters, buffers, native, pose)
         if isinstance(gaussians, GaussianMap):
             rendering.source = MapState.of(gaussians)
-        self._run(rendering, memory)
         return rendering
 
     def _run(self, rendering: FinishedRendering, memory: GrowingMemory) -> None:
-        counter = self._counter
+        counter = self.counter
         room = counter.expected_pairs if self.waits else counter.room_without_waiting()
         # Blocks that grow free what kernels may still be working with. That does no harm: torch gives the memory away
         # again in the order of the stream, and all the work is on one stream.
@@ -223,7 +250,7 @@ class CudaRasterizer:
     def statistics(self) -> dict[str, int]:
         """Of the last forward: `visible` Gaussians and `pairs` of a Gaussian and an image tile. Waits for the device if
         the rendering did not."""
-        visible, pairs = self._require_last().totals()
+        visible, pairs = self.last_rendering.totals()
         return {"visible": visible, "pairs": pairs}
 
     def pixel_terms(self, pixels: torch.Tensor, capacity: int = 48, min_weight: float = 1e-3) -> CudaPixelTerms:
@@ -238,7 +265,7 @@ class CudaRasterizer:
         Raises:
             RenderError: nothing was rendered, pixels of another shape, type or device.
         """
-        last = self._require_last()
+        last = self.last_rendering
         if pixels.device != self.device:
             raise RenderError(f"pixels: expected a tensor on {self.device}, found one on {pixels.device}")
         return CudaPixelTerms.of_rendering(last.native, pixels, capacity, min_weight, self.library)
@@ -256,7 +283,7 @@ class CudaRasterizer:
     ) -> CudaGradients:
         """Gradients of a loss through the last `forward`; arguments and errors as `CpuRasterizer.backward`."""
         grads = (grad_image, grad_depth, grad_alpha, grad_features)
-        return self.differentiate(self._require_last(), grads, self._memory, detach_features=detach_features)
+        return self.differentiate(self.last_rendering, grads, self.memory, detach_features=detach_features)
 
     def pose_gradient(
         self,
@@ -266,11 +293,11 @@ class CudaRasterizer:
         grad_features: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Only the `twist` of `backward`; the gradients of the Gaussians are not written."""
-        last = self._require_last()
+        last = self.last_rendering
         grads = (grad_image, grad_depth, grad_alpha, grad_features)
         twist, touched = self._twist_and_touched(last)
         out = structures.GaussianGradients(twist=address(twist), touched=address(touched))
-        self._differentiate(last, grads, self._memory, False, out)
+        self._differentiate(last, grads, self.memory, False, out)
         return twist
 
     def backward_step(
@@ -286,7 +313,7 @@ class CudaRasterizer:
     ) -> CudaStepResult:
         """`backward` and one Adam step in one pass, nothing of which the host waits for; arguments, effect and errors
         as `CpuRasterizer.backward_step`, the map being on the rasterizer's device."""
-        last = self._require_last()
+        last = self.last_rendering
         if last.source != MapState.of(map):
             for name in PARAMETERS:
                 if (address(getattr(map, name)) or None) != getattr(last.native.gaussians, name):
@@ -295,7 +322,7 @@ class CudaRasterizer:
         twist, touched = self._twist_and_touched(last)
         out = structures.GaussianGradients(twist=address(twist), touched=address(touched))
         grads = (grad_image, grad_depth, grad_alpha, grad_features)
-        self._differentiate(last, grads, self._memory, detach_features, out, adam)
+        self._differentiate(last, grads, self.memory, detach_features, out, adam)
         self._last = None  # the parameters change now, so there is nothing left to differentiate
         return CudaStepResult(twist, touched)
 
@@ -351,7 +378,9 @@ class CudaRasterizer:
             return GaussianTensors(*(getattr(gaussians, name) for name in PARAMETERS))
         return checked_parameters(gaussians, self.device)
 
-    def _require_last(self) -> FinishedRendering:
+    @property
+    def last_rendering(self) -> FinishedRendering:
+        """Of the last `forward`; raises RenderError if there is none."""
         if self._last is None:
             raise RenderError("there is no rendering to differentiate: call forward first (and again after every step)")
         return self._last

@@ -18,6 +18,11 @@ void launch(Kernel kernel, std::int64_t blocks, int threads, cudaStream_t stream
   if (blocks > 0) kernel<<<static_cast<unsigned>(blocks), threads, 0, stream>>>(arguments...);
 }
 
+// Marks, while it is there, what could be recorded as a graph: the emulation refuses what no graph holds.
+struct CaptureRegion {
+  CaptureRegion() {}
+};
+
 }  // namespace ggslam::cuda
 #endif
 

@@ -30,4 +30,17 @@ cudaError_t running_sum(void* scratch, std::size_t scratch_bytes, const std::uin
   return cub::DeviceScan::InclusiveSum(scratch, scratch_bytes, numbers, sums, static_cast<int>(count), stream);
 }
 
+std::size_t long_sum_bytes(std::int64_t count) {
+  const std::int64_t* in = nullptr;
+  std::int64_t* out = nullptr;
+  std::size_t bytes = 0;
+  cub::DeviceScan::InclusiveSum(nullptr, bytes, in, out, static_cast<int>(count));
+  return bytes;
+}
+
+cudaError_t long_running_sum(void* scratch, std::size_t scratch_bytes, const std::int64_t* numbers, std::int64_t* sums,
+                             std::int64_t count, cudaStream_t stream) {
+  return cub::DeviceScan::InclusiveSum(scratch, scratch_bytes, numbers, sums, static_cast<int>(count), stream);
+}
+
 }  // namespace ggslam::cuda

@@ -17,4 +17,9 @@ cudaError_t sort_pairs(void* scratch, std::size_t scratch_bytes, const std::uint
 cudaError_t running_sum(void* scratch, std::size_t scratch_bytes, const std::uint32_t* numbers, std::uint32_t* sums,
                         std::int64_t count, cudaStream_t stream);
 
+// The same of longer numbers, with scratch memory of its own.
+std::size_t long_sum_bytes(std::int64_t count);
+cudaError_t long_running_sum(void* scratch, std::size_t scratch_bytes, const std::int64_t* numbers, std::int64_t* sums,
+                             std::int64_t count, cudaStream_t stream);
+
 }  // namespace ggslam::cuda

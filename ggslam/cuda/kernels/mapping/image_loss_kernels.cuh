@@ -13,6 +13,7 @@ constexpr float kSsimC1 = 0.01f * 0.01f, kSsimC2 = 0.03f * 0.03f;
 constexpr int kCollectThreads = kSumRows * kWarp;
 
 __global__ void __launch_bounds__(kLossThreads) count_depth_kernel(ImageLossJob job, LossWorkspace w) {
+  take_target(job);
   const std::int64_t pixel = static_cast<std::int64_t>(blockIdx.x) * kLossThreads + threadIdx.x;
   const bool inside = pixel < static_cast<std::int64_t>(job.height) * job.width;
   const int count = __syncthreads_count(inside && target_depth(job, pixel) > 0.0f);
@@ -47,6 +48,7 @@ __device__ inline void blur_sources(const float* x, const float* y, float out[4]
 // One tile of one channel.
 __global__ void __launch_bounds__(kLossThreads)
 similarity_kernel(ImageLossJob job, LossTiles tiles, LossWorkspace w) {
+  take_target(job);
   GGSLAM_SHARED float rendered[kHaloHigh][kHaloWide], target[kHaloHigh][kHaloWide];
   GGSLAM_SHARED BlurredRows rows[4];
   const LossTile tile = tile_of_block(tiles);
@@ -121,6 +123,7 @@ __device__ inline float differentiate_robust(const ImageLossJob& job, float scal
 // Colour terms of one tile of one channel.
 template <bool kSsim>
 __global__ void __launch_bounds__(kLossThreads) color_kernel(ImageLossJob job, LossTiles tiles, LossWorkspace w) {
+  take_target(job);
   const LossTile tile = tile_of_block(tiles);
   const Exposure exposure = exposure_of(job, tile.channel);
   float blurred[3][kPixelsPerThread] = {};
@@ -151,6 +154,7 @@ __global__ void __launch_bounds__(kLossThreads) color_kernel(ImageLossJob job, L
 
 // Depth and opacity terms of one tile.
 __global__ void __launch_bounds__(kLossThreads) depth_kernel(ImageLossJob job, LossTiles tiles, LossWorkspace w) {
+  take_target(job);
   const LossTile tile = tile_of_block(tiles);
   const std::uint32_t count = *w.valid_pixels;
   const float per_pixel = count > 0 ? 1.0f / static_cast<float>(count) : 0.0f;

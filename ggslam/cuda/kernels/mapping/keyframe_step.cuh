@@ -87,6 +87,11 @@ __device__ inline void add_to_totals(LossTotals& totals, const double* results) 
 __global__ void keyframe_step_kernel(KeyframeStepJob job) {
   constexpr unsigned kPoseLanes = 0x3f, kExposureLanes = kPoseLanes << 6;
   if (job.skipped != nullptr && *job.skipped != 0) return;
+  if (job.choice != nullptr) {
+    job.state = job.choice->state;
+    job.pose_rate = job.choice->pose_rate;
+    job.step_exposure = job.choice->step_exposure;
+  }
   const int lane = static_cast<int>(threadIdx.x);
   KeyframeState& state = *job.state;
   double gradient = 0.0;

@@ -12,6 +12,13 @@ constexpr int kHaloWide = kLossTileWide + 2 * kBlurRadius, kHaloHigh = kLossTile
 constexpr float kWindow0 = 0.2660117248617943f, kWindow1 = 0.21300553771125366f, kWindow2 = 0.1093606895097f;
 constexpr float kWindow3 = 0.03600077212843082f, kWindow4 = 0.007598758135239184f, kWindow5 = 0.0010283800844791099f;
 
+// The job with the images that are the target now.
+__device__ inline void take_target(ImageLossJob& job) {
+  if (job.target == nullptr) return;
+  job.target_color = job.target->color, job.target_depth = job.target->depth, job.target_valid = job.target->valid;
+  job.depth_scale = job.target->depth_scale, job.target_depth_is_float = job.target->depth_is_float;
+}
+
 // A tile of one channel (3: the depth image).
 struct LossTile {
   int x, y, channel, number;

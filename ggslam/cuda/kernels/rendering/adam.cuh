@@ -27,7 +27,8 @@ __device__ inline AdamFactors adam_factors(const AdamStep& adam, std::int32_t up
 __device__ inline float step_size(const AdamStep& adam, const AdamFactors& factors, AdamGroup group) {
   const float decay = ((adam.decayed_groups >> group) & 1) != 0 ? factors.decay : 1.0f;
   const float fall = ((adam.falling_groups >> group) & 1) != 0 ? factors.fall : 1.0f;
-  return adam.rates[group] * decay * fall * factors.rate;
+  const float rate = adam.current_rates != nullptr ? adam.current_rates[group] : adam.rates[group];
+  return rate * decay * fall * factors.rate;
 }
 
 // One parameter.

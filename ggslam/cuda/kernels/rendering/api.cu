@@ -9,6 +9,7 @@
 #include "rendering/composite_forward.cuh"
 #include "rendering/gather_kernel.cuh"
 #include "common/host.cuh"
+#include "rendering/count_pairs.cuh"
 #include "rendering/project_kernel.cuh"
 #include "common/sorting.cuh"
 
@@ -17,7 +18,7 @@ namespace {
 
 constexpr std::uint64_t kRecent = 64;
 
-// Receives the totals of the last kRecent projections on the host.
+// Receives the totals of the last kRecent projections on the host; of several that were counted together the largest.
 struct Counter {
   Totals* totals = nullptr;  // [kRecent] by turns, page-locked host memory
   std::uint64_t started = 0;
@@ -56,7 +57,12 @@ void for_each_group(const GaussianArrays& arrays, const Run& run) {
   } while (first < channels);
 }
 
-cudaError_t project_all(const Rendering& r, Counter& counter) {
+void send_totals(Counter& counter, const void* totals, cudaStream_t stream) {
+  cudaMemcpyAsync(counter.totals + counter.started++ % kRecent, totals, sizeof(Totals), cudaMemcpyDeviceToHost, stream);
+  cudaEventRecord(counter.ready, stream);
+}
+
+cudaError_t project_all(const Rendering& r, Counter* counter) {
   const GaussianWorkspace w = gaussians_of(r);
   const cudaStream_t stream = stream_of(r);
   const std::uint32_t hidden = hidden_key(r.view);
@@ -64,8 +70,7 @@ cudaError_t project_all(const Rendering& r, Counter& counter) {
   cudaMemsetAsync(w.totals, 0, sizeof(Totals), stream);
   launch(project_kernel, blocks_for(n, kProjectThreads), kProjectThreads, stream, r.gaussians, view_constants(r.view), r.pose,
          make_grid(r.view), float_bits(r.view.near_plane), hidden, w);
-  cudaMemcpyAsync(counter.totals + counter.started++ % kRecent, w.totals, sizeof(Totals), cudaMemcpyDeviceToHost, stream);
-  cudaEventRecord(counter.ready, stream);
+  if (counter != nullptr) send_totals(*counter, w.totals, stream);
   if (n == 0) return cudaSuccess;
   const cudaError_t sorted = sort_pairs(w.sorting, w.sorting_bytes, w.depth_keys, w.sorted_depth_keys, w.rows,
                                         w.rows_by_depth, n, bits_of(hidden), stream);
@@ -87,7 +92,7 @@ cudaError_t list_pairs(const Rendering& r, const Grid& grid, const GaussianWorks
     status = sort_pairs(pairs.sorting, pairs.sorting_bytes, pairs.tiles, pairs.sorted_tiles, pairs.rows,
                         pairs.sorted_rows, capacity, bits_of(static_cast<std::uint32_t>(grid.tiles())), stream);
   launch(tile_starts_kernel, blocks_for(r.pair_capacity + 1, kBinThreads), kBinThreads, stream, w,
-         pairs, grid.tiles(), pixels.tile_start, RoomReport{r.overflowed, r.overflows});
+         pairs, grid.tiles(), pixels.tile_start, RoomReport{r.overflowed, r.overflows, r.most_pairs});
   return status;
 }
 
@@ -164,6 +169,11 @@ cudaError_t differentiate_all(const Rendering& r, const ImageGradients& in, cons
 }
 
 }  // namespace
+
+void count_pairs(void* counter, const std::int64_t* totals, cudaStream_t stream) {
+  send_totals(*static_cast<Counter*>(counter), totals, stream);
+}
+
 }  // namespace ggslam::cuda
 
 using namespace ggslam::cuda;
@@ -207,7 +217,7 @@ GGSLAM_EXPORT int ggslam_cuda_plan(Rendering* r, Sizes* sizes) {
 }
 
 GGSLAM_EXPORT int ggslam_cuda_project(const Rendering* r, void* counter) {
-  return on_device(r->device, [&] { return project_all(*r, *static_cast<Counter*>(counter)); });
+  return on_device(r->device, [&] { return project_all(*r, static_cast<Counter*>(counter)); });
 }
 
 GGSLAM_EXPORT int ggslam_cuda_wait(const void* counter, std::int64_t* totals) {

@@ -40,6 +40,7 @@ write_pairs_kernel(std::int64_t count, Grid grid, GaussianWorkspace w, PairWorks
 struct RoomReport {
   std::int32_t* overflowed;
   std::int64_t* overflows;
+  std::int64_t* most_pairs;
 };
 
 // tile_start[t]: first pair of tile t or, if it has none, of the next tile that has. Places that no pair was written to
@@ -51,6 +52,8 @@ tile_starts_kernel(GaussianWorkspace w, PairWorkspace pairs, int tiles, std::uin
     const bool overflowed = out_of_room(w, pairs);
     *report.overflowed = overflowed ? 1 : 0;
     if (overflowed && report.overflows != nullptr) ++*report.overflows;
+    const std::int64_t found = static_cast<std::int64_t>(w.totals->pairs);
+    if (report.most_pairs != nullptr && found > *report.most_pairs) *report.most_pairs = found;
   }
   if (i > pairs.capacity) return;
   const auto tile_of = [&](std::uint32_t place) {

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps of identity learning on an NVIDIA GPU, each by one call of the library or as a part of a call of training.
+
+What all steps have in common is filled in when something that it names has moved. The steps are those that
+`CudaIdentityLearner` makes of single operations, with the same pixels and samples; products with the classifier are
+summed in another order.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import torch
+
+from ggslam.abi.cuda import MOST_NEIGHBOURS, IdentityJob, IdentityStep
+from ggslam.cuda.library import CudaLibrary
+from ggslam.cuda.memory import GrowingMemory
+from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.pixel_pool import PixelDrawer
+from ggslam.mapping.identity import IdentityTimes, IdentityTuning, MaskOnGrid
+from ggslam.mapping.identity_settings import IdentitySettings
+from ggslam.mapping.pixel_pool import PixelPool
+from ggslam.rendering.cuda.finished import MapState
+from ggslam.rendering.cuda.pixel_terms import feature_step
+from ggslam.rendering.cuda.rasterizer import CudaRasterizer
+from ggslam.rendering.pixel_terms import FeatureAdamSettings
+from ggslam.scene.gaussian_map import GaussianMap
+from ggslam.scene.identity import IDENTITY_CHANNELS
+from ggslam.system.tuning import Tuning
+
+
+class PoolStoreTuning(Tuning):
+    """Room for pixels that are drawn ahead."""
+
+    at_once = 16
+    """Keyframes for which room is made at a time."""
+
+
+_SCHEDULES: Final = ("sampled", "votes")
+
+
+class PoolStore:
+    """Room for the pixels of keyframes, made for several at a time.
+
+    Args:
+        device: where.
+        size: pixels of a keyframe.
+    """
+
+    def __init__(self, device: torch.device, size: int) -> None:
+        self._device, self._size = device, size
+        self._spare: list[PixelPool[torch.Tensor]] = []
+
+    def make_room(self) -> None:
+        """Makes some if there is none: to be called while nobody minds an allocation."""
+        if not self._spare:
+            shape = (PoolStoreTuning.at_once, self._size)
+            pixels = torch.zeros(shape, dtype=torch.int32, device=self._device)
+            weights = torch.zeros(shape, dtype=torch.float32, device=self._device)
+            self._spare = [PixelPool(*part) for part in zip(pixels.unbind(), weights.unbind(), strict=True)]
+
+    def take(self) -> PixelPool[torch.Tensor]:
+        """Room for one keyframe."""
+        self.make_room()
+        return self._spare.pop()
+
+    def give_back(self, pool: PixelPool[torch.Tensor]) -> None:
+        """What is not needed any more; nothing becomes of it if it is of another size."""
+        if len(pool.pixels) == self._size:
+            self._spare.append(pool)
+
+
+class Learner(Protocol):
+    """What steps are filled in from, see `CudaIdentityLearner`."""
+
+    settings: IdentitySettings
+    times: IdentityTimes
+    table: CudaClassTable
+    library: CudaLibrary
+    device: torch.device
+    device_alias: torch.Tensor
+    device_whole_of: torch.Tensor
+
+    @property
+    def drawer(self) -> PixelDrawer: ...
+
+    def sample_count(self, neighbours: int) -> int: ...
+
+    def pulls(self, gaussians: GaussianMap) -> bool: ...
+
+    def labels_for_parts(self, gaussians: GaussianMap) -> torch.Tensor | None: ...
+
+    def pool(self, number: int) -> PixelPool[torch.Tensor] | None: ...
+
+    def keep_pool(self, number: int, pool: PixelPool[torch.Tensor]) -> PixelPool[torch.Tensor] | None: ...
+
+    def note_losses(self, losses: torch.Tensor, known: torch.Tensor) -> None: ...
+
+
+@dataclass(frozen=True)
+class _Filled:
+    """What the job was filled from: as long as it is equal, so is the job."""
+
+    map: MapState
+    classes: tuple[int, int]
+    parts: int | None
+    size: tuple[int, int]
+    memory: int
+
+
+class CudaLessons:
+    """Fills in the steps of a learner.
+
+    Args:
+        learner: whose objects, classes and pixels they are of.
+    """
+
+    def __init__(self, learner: Learner) -> None:
+        self._learner, self._device = learner, learner.device
+        self._job, self._step = IdentityJob(), IdentityStep()
+        self._filled: _Filled | None = None
+        self._named: tuple[object, ...] = ()
+        self._memory = GrowingMemory(learner.device)
+        self._known = torch.zeros(1, dtype=torch.int32, device=learner.device)
+        self._losses = torch.zeros(learner.settings.pixels, device=learner.device)
+        self.pools = PoolStore(learner.device, IdentityTuning.pool_steps * learner.settings.pixels)
+
+    def takes(self, gaussians: GaussianMap, keyframe: Any) -> bool:
+        """Whether the library makes steps of this kind."""
+        s: IdentitySettings = self._learner.settings
+        whole = not isinstance(keyframe, MaskOnGrid) and gaussians.feature_channels == IDENTITY_CHANNELS
+        few = s.neighbours.weight == 0 or s.neighbours.neighbours <= MOST_NEIGHBOURS
+        return whole and few and gaussians.with_moments and s.schedule in _SCHEDULES and len(gaussians) > 0
+
+    def run(self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: Any, rate_factor: float) -> None:
+        """A step at pixels of what was rendered last."""
+        rendering, library = rasterizer.last_rendering.native, self._learner.library
+        rendering.stream = library.stream(self._device)
+        size = (rendering.view.height, rendering.view.width)
+        job = self.fill(self._step, gaussians, keyframe, size, rate_factor)
+        library.call("learn", ctypes.byref(job), ctypes.byref(self._step), ctypes.byref(rendering))
+
+    def fill(
+        self, step: IdentityStep, gaussians: GaussianMap, keyframe: Any, size: tuple[int, int], rate_factor: float
+    ) -> IdentityJob:
+        """Fills in the next step on a keyframe, whose images are of `size` (height, width), and counts it; returns the
+        job that goes with it. Valid until map, masks or classes change."""
+        learner = self._learner
+        self._fill_job(gaussians, size)
+        step.mask, step.rate_factor = keyframe.device_mask.data_ptr(), rate_factor
+        self._fill_pixels(step, keyframe.index)
+        step.pulls = learner.table.count > 0 and self._job.samples > 0 and learner.pulls(gaussians)
+        step.pull = learner.times.count
+        if self._job.trains:
+            learner.note_losses(self._losses, self._known)
+        learner.times.count += 1
+        return self._job
+
+    def _fill_pixels(self, step: IdentityStep, number: int) -> None:
+        """The next pixels of a keyframe; as `IdentityLearner` draws them."""
+        learner, wanted = self._learner, self._learner.settings.pixels
+        pool, step.drawn = learner.pool(number), 0
+        if pool is None or not pool.has(wanted):
+            pool = self.pools.take() if pool is None or len(pool.pixels) < len(self._losses) else pool
+            step.drawn, step.draw, pool.used = len(pool.pixels), learner.drawer.next_draw(), 0
+            dropped = learner.keep_pool(number, pool)
+            if dropped is not None:
+                self.pools.give_back(dropped)
+        step.pool, step.pool_weights = pool.pixels.data_ptr(), pool.vote_weights.data_ptr()
+        step.used = pool.used
+        pool.used += wanted
+
+    def _fill_job(self, gaussians: GaussianMap, size: tuple[int, int]) -> None:
+        learner = self._learner
+        table, shown = learner.table, learner.labels_for_parts(gaussians)
+        classes, parts = (table.training_arrays[0].data_ptr(), table.count), None if shown is None else shown.data_ptr()
+        wanted = _Filled(MapState.of(gaussians), classes, parts, size, self._memory.allocations)
+        if wanted != self._filled:
+            self._fill_in(gaussians, size, shown)
+            self._filled = _Filled(wanted.map, wanted.classes, wanted.parts, size, self._memory.allocations)
+
+    def _fill_in(self, gaussians: GaussianMap, size: tuple[int, int], shown: torch.Tensor | None) -> None:
+        job, learner, s = self._job, self._learner, self._learner.settings
+        table, near, count = learner.table, learner.settings.neighbours, len(gaussians)
+        job.means, job.gaussians = gaussians.means.data_ptr(), count
+        job.adam = feature_step(gaussians, FeatureAdamSettings(rate=0.0))
+        job.vote_ids, job.vote_weights = gaussians.vote_ids.data_ptr(), gaussians.vote_weights.data_ptr()
+        job.alias, job.class_of = learner.device_alias.data_ptr(), table.class_of.data_ptr()
+        job.whole_of = None if shown is None else learner.device_whole_of.data_ptr()
+        job.shown = None if shown is None else shown.data_ptr()
+        rows, first, second, steps = table.training_arrays
+        job.rows, job.first_moments, job.second_moments = rows.data_ptr(), first.data_ptr(), second.data_ptr()
+        job.steps, job.losses, job.known = steps.data_ptr(), self._losses.data_ptr(), self._known.data_ptr()
+        job.balance, job.boundary, job.rate, job.classifier_rate = s.balance, s.boundary, s.rate, s.classifier_rate
+        job.seed, job.weight, job.min_weight = learner.drawer.seed, s.weight, IdentityTuning.min_weight
+        job.channels, job.classes, job.pixels = IDENTITY_CHANNELS, table.count, s.pixels
+        job.capacity, job.trains = IdentityTuning.max_terms, s.schedule == "sampled" and table.count > 0
+        pulls = job.trains and near.weight > 0 and count > 1
+        job.neighbours = min(near.neighbours, count - 1) if pulls else 0
+        job.samples = learner.sample_count(job.neighbours) if pulls else 0
+        job.pull_weight = near.weight * near.value / max(1, table.count)
+        room = learner.library.functions.ggslam_cuda_identity_bytes(ctypes.byref(job), *size)
+        workspace = self._memory.block("lesson", room)
+        job.workspace = workspace.data_ptr()
+        self._named = (shown, workspace, rows, first, second)
