@@ -135,6 +135,7 @@ struct AdamMoments {
 struct KeyframeState {
   double pose[16];      // T_camera_world, 4 x 4
   double exposure[6];   // gain and offset of R, G, B
+  double exposure_anchor[6];  // what the exposure is pulled to
   AdamMoments pose_moments, exposure_moments;
   std::int64_t pose_steps, exposure_steps;
   float pose_copy[12];  // its first three rows, for the rasterizer
