@@ -417,6 +417,11 @@ class Mapper(ABC):
         return self.extra_loss is not None or self._is_identity_dense
 
     @property
+    def _loss_faults(self) -> torch.Tensor | None:
+        """Where gradients of `extra_loss` that are not finite are noted; None: they are refused at once."""
+        return None
+
+    @property
     def _is_noisy(self) -> bool:
         """Whether depth is, see `MapperSettings.sparse_noise`."""
         return self.depth_noise_px >= self.settings.sparse_noise
@@ -520,7 +525,9 @@ class Mapper(ABC):
                 grad_features = identity.step(self.map, self._rasterizer, masked, view)
         times.identity += watch.lap()
         if self.extra_loss is not None:
-            grad_features = add_extra_loss(self.extra_loss, view, keyframe, loss, grad_features)
+            grad_features = add_extra_loss(
+                self.extra_loss, view, keyframe, loss, grad_features, self._loss_faults
+            )  # fmt: skip
             times.loss += watch.lap()
         step = self._rasterizer.backward_step(
             self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,

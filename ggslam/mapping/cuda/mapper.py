@@ -29,6 +29,7 @@ from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
 from ggslam.mapping.cuda.shown_gaussians import mark_shown
 from ggslam.mapping.cuda.usable_pixels import UsablePixels
 from ggslam.mapping.deformation import move_with_keyframes
+from ggslam.mapping.extra_loss import new_faults, refuse_faults
 from ggslam.mapping.identity import MaskOnGrid
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.keyframe_exposures import KeyframeExposures
@@ -89,6 +90,8 @@ class CudaMapper(ComparingMapper):
         self._views: dict[int, CudaBetweenView] = {}  # by frame
         self._given_context = context
         self._shown_pixels = 0
+        self._faults = new_faults(self.device)
+        self._newest_faults = HostMirror(self._faults)
 
     @property
     def losses(self) -> LossSums:
@@ -125,11 +128,16 @@ class CudaMapper(ComparingMapper):
         super().run(iterations + self._count_missed())
         self._totals.send()
         self._overflows.send()
+        if self.extra_loss is not None:
+            self._newest_faults.send()
+            refuse_faults(self._newest_faults.newest())
         self._pace.piece_ends()
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
         self._repeated = int(download(self._rasterizer.overflows)[0][0])
         super().refine(iterations, progress, begin)
+        if self.extra_loss is not None:
+            refuse_faults(download(self._faults)[0])
         self._views = {}
         self._totals.send()
 
@@ -139,6 +147,10 @@ class CudaMapper(ComparingMapper):
             self.iterate(self._draw(numbers), 1.0 if averages else falling, averages)
             if averages:
                 self._mean.add(self.map)
+
+    @property
+    def _loss_faults(self) -> torch.Tensor | None:
+        return self._faults
 
     def _count_missed(self, overflows: int | None = None) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
