@@ -378,7 +378,10 @@ class Mapper(ABC):
         """One iteration of the final refinement, of which `done`, 0 to 1, is over, on some keyframes: a step on all
         pixels of one or, where depth is noisy, several on every second pixel of as many. It is the same whether
         identities are trained, too, or not. `settles` as of `_adam`."""
-        for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
+        count = MapperTuning.noisy_steps if self._is_noisy else 1
+        if self._steps_wholly:
+            pose_factor /= count
+        for step in range(count):
             keyframe = self._draw(numbers)
             grid = self._choose_grid(keyframe) if self._is_noisy else self._choose_size(keyframe, done)
             candidates = self._beside.get(keyframe.index, ())
@@ -389,7 +392,7 @@ class Mapper(ABC):
             else:
                 self._step(self._view_beside(beside, keyframe), (rate_factor, 0.0), grid, False, settles)
                 keyframe.iterations += 1
-            if not self._is_noisy or grid.is_whole:
+            if grid.is_whole and not self._steps_wholly:
                 break
         self._count_iteration()
 
@@ -397,9 +400,14 @@ class Mapper(ABC):
         """A frame between keyframes as a step sees it, with the pose that its keyframe gives it."""
         return frame.view(keyframe)
 
-    def _masked_on(self, keyframe: Keyframe, grid: PixelGrid) -> Keyframe | MaskOnGrid:
+    def _masks_on(self, keyframe: Keyframe, grid: PixelGrid) -> Keyframe | MaskOnGrid:
         """What identity steps read of a keyframe at a grid's pixels."""
         return keyframe if grid.is_whole else MaskOnGrid.of(keyframe, grid)
+
+    @property
+    def _steps_wholly(self) -> bool:
+        """Whether each of several steps of an iteration is on all pixels."""
+        return False
 
     def _choose_size(self, keyframe: Keyframe, done: float) -> PixelGrid:
         """The picture of a step of the final refinement; the recording's own if a loss needs it."""
@@ -520,7 +528,7 @@ class Mapper(ABC):
         times.loss += watch.lap()
         grad_features = None
         if learns and identity is not None:
-            masked = self._masked_on(keyframe, grid)
+            masked = self._masks_on(keyframe, grid)
             with part("objects"):
                 grad_features = identity.step(self.map, self._rasterizer, masked, view)
         times.identity += watch.lap()

@@ -161,7 +161,7 @@ def test_a_refinement_with_all_of_it_ends_at_the_same_pictures() -> None:
         mapper.judge_between()
         mapper.refine(16)
     moved, apart = np.abs(images(cpu) - before).mean(), np.abs(images(device) - images(cpu)).mean()
-    assert moved > 5e-3 and apart < 0.03 * moved
+    assert moved > 5e-3 and apart < 0.01 * moved  # 0.002
 
 
 def dark_and_bright(mapper: ComparingMapper) -> None:
@@ -174,16 +174,16 @@ def test_exposures_are_measured_and_trained_the_same() -> None:
     for mapper in (cpu, device):
         dark_and_bright(mapper)
     assert cpu._exposures.changed and device._exposures.changed and len(cpu.map) == len(device.map)
-    assert (cpu.map.sh - device.map.sh.cpu()).abs().max() < 0.02  # a level of 255 is 0.014
+    assert (cpu.map.sh - device.map.sh.cpu()).abs().max() < 1e-5
     for mapper in (cpu, device):
         for k in (3, 4, 3, 4):
             mapper.iterate(mapper.keyframes[k])
     exposures = [np.stack([k.exposure for k in mapper.keyframes]) for mapper in (cpu, device)]
-    assert np.abs(exposures[0][3, :, 0] - 0.5).max() < 0.05 and np.abs(exposures[0] - exposures[1]).max() < 2e-3
+    assert np.abs(exposures[0][3, :, 0] - 0.5).max() < 0.05 and np.abs(exposures[0] - exposures[1]).max() < 1e-5
     for mapper in (cpu, device):
         mapper.use_typical_exposure(at_end=True)
     exposures = [np.stack([k.exposure for k in mapper.keyframes]) for mapper in (cpu, device)]
-    assert np.abs(exposures[0] - exposures[1]).max() < 5e-3
+    assert np.abs(exposures[0] - exposures[1]).max() < 2e-3  # 0.0006
     for k in range(5):
         expected = cpu._comparable(cpu.keyframes[k])
         exposure = device._states.exposure(k) if device._exposures.is_exposed(device.keyframes[k]) else None

@@ -174,7 +174,7 @@ class CudaMapper(ComparingMapper):
         assert isinstance(keyframe, CudaKeyframe)
         labels = self.identity is not None and labeller is not None
         look = _Look(self, keyframe, T_world_camera, labels, self.settings.exposure.compensate)
-        color = self._colors(keyframe, look.seen())
+        color = self._colors(keyframe, look.view())
         if color is not keyframe.color:
             look.select_again(upload(color, self.device))
         if self.identity is not None and labeller is not None:
@@ -258,7 +258,7 @@ class CudaMapper(ComparingMapper):
             self._insertion_settings,
         )  # fmt: skip
 
-    def explained(
+    def find_explained(
         self, keyframe: CudaKeyframe, alpha: torch.Tensor | None, depth: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
         """What the map shows from a keyframe, alpha and depth [H, W]; where images show nothing there is nothing to
@@ -283,6 +283,10 @@ class CudaMapper(ComparingMapper):
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         return ALL_PIXELS
 
+    @property
+    def _steps_wholly(self) -> bool:
+        return not self._needs_all_pixels  # with a loss of whole pictures there is one step, as on the CPU
+
     def last_iterations(self, before: int) -> int:
         return round(MapperTuning.all_pixels_end_share * before) if self.is_live else super().last_iterations(before)
 
@@ -292,10 +296,10 @@ class CudaMapper(ComparingMapper):
             self._views[frame.frame_index] = CudaBetweenView(frame, keyframe, self._images, self.device)
         return self._views[frame.frame_index]
 
-    def _masked_on(self, keyframe: Keyframe, grid: PixelGrid) -> Keyframe | MaskOnGrid:
+    def _masks_on(self, keyframe: Keyframe, grid: PixelGrid) -> Keyframe | MaskOnGrid:
         mask = None if grid.is_whole or not isinstance(keyframe, CudaKeyframe) else keyframe.device_mask
         if mask is None:
-            return super()._masked_on(keyframe, grid)
+            return super()._masks_on(keyframe, grid)
         on_grid: torch.Tensor = grid.of(mask.view(torch.int16))  # type: ignore[assignment,arg-type]
         return CudaMaskOnGrid(keyframe.index, None, on_grid.contiguous().view(torch.uint16))
 
@@ -380,7 +384,7 @@ class _Look:
                 self._wanted += [*mapper.labels_on_grid(alpha, _LABEL_STRIDE), depth]
             if self._with_colors:
                 self._wanted += [image[_SOME].contiguous() for image in (view.image, alpha, depth)]
-        self._explained = mapper.explained(keyframe, alpha, depth)
+        self._explained = mapper.find_explained(keyframe, alpha, depth)
         self.selection = mapper.selection(keyframe.device_images().color, keyframe, self._explained, self._T)
 
     def select_again(self, color: torch.Tensor) -> None:
@@ -396,7 +400,7 @@ class _Look:
         ids, share, depth = self._found[:3]
         return MapLabels.from_grid(ids, share, depth, _LABEL_STRIDE)
 
-    def seen(self) -> SeenAgain | None:
+    def view(self) -> SeenAgain | None:
         """What the map shows where the keyframe looks; None: nothing, or colours were not asked for."""
         if not (self.shows and self._with_colors):
             return None
