@@ -13,7 +13,6 @@ from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.losses import LossGradients
 from ggslam.rendering.types import RenderBuffers
 
-
 _RENDERED: Final = ("image", "depth", "alpha", "features")
 
 
@@ -73,8 +72,9 @@ def add_extra_loss(
         found_gradients = torch.autograd.grad(value.reshape(()), list(leaves.values()), allow_unused=True)
     by_name = {name: _check(name, g, faults) for name, g in zip(leaves, found_gradients, strict=True)}
     for name, own in (("image", gradients.d_image), ("depth", gradients.d_depth), ("alpha", gradients.d_alpha)):
-        if by_name[name] is not None:
-            own.add_(by_name[name])
+        given = by_name[name]
+        if given is not None:
+            own.add_(given)
     extra = by_name.get("features")
     if extra is None:
         return grad_features

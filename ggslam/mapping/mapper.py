@@ -592,7 +592,7 @@ class Mapper(ABC):
         self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
     ) -> RenderBuffers:
         """The map as a keyframe sees it at a grid's pixels, with or without identities. `close_below` as the CPU
-        rasterizer's; others may draw pixels to their end."""
+        rasterizer's."""
 
     @abstractmethod
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> LossGradients:

@@ -204,10 +204,10 @@ class CudaMapper(ComparingMapper):
     def render_keyframe(self, keyframe: CudaKeyframe, with_room: bool) -> RenderBuffers:
         """The map as a keyframe sees it, without identities; `with_room`: waits for room for all that is in view."""
         with self._with_room(with_room):
-            return self._render(keyframe, features=False)
+            return self._render(keyframe, features=False, close_below=self.settings.close_below)
 
     def render_view(self, camera: Camera, T_camera_world: np.ndarray) -> RenderBuffers:
-        self._rasterizer.low_pass = LOW_PASS
+        self._rasterizer.low_pass, self._rasterizer.close_below = LOW_PASS, 0.0
         with self._with_room():
             view = self._rasterizer.forward(self.map, camera, T_camera_world, features=False)
         return RenderBuffers(*map(torch.from_numpy, download(view.image, view.depth, view.alpha)))
@@ -308,7 +308,7 @@ class CudaMapper(ComparingMapper):
     ) -> RenderBuffers:
         assert isinstance(keyframe, DeviceKeyframe)
         camera = keyframe.camera if grid.is_whole else grid.camera(keyframe.camera)
-        self._rasterizer.low_pass = grid.low_pass(LOW_PASS)
+        self._rasterizer.low_pass, self._rasterizer.close_below = grid.low_pass(LOW_PASS), close_below
         return self._rasterizer.forward(self.map, camera, keyframe.device_pose, features=features)
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> CudaLossResult:
