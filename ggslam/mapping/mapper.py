@@ -260,7 +260,11 @@ class Mapper(ABC):
         arguments as the attributes of `BetweenFrame`."""
         wanted = self.keeps_between and self._is_plain(self.keyframes[keyframe])
         if wanted and sum(kept.color.nbytes for kept in self.between) < BetweenTuning.kept_bytes:
-            self.between.append(code_frame(frame, keyframe, T_keyframe_camera))
+            self._add_between(frame, keyframe, T_keyframe_camera)
+
+    def _add_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
+        """A frame joins `between`."""
+        self.between.append(code_frame(frame, keyframe, T_keyframe_camera))
 
     def judge_between(self) -> None:  # noqa: B027
         """Before the final refinement: finds which frames between keyframes are not of the map's exposure, or much less

@@ -132,6 +132,17 @@ def with_between(mapper: ComparingMapper) -> ComparingMapper:
     return mapper
 
 
+def test_frames_between_keyframes_are_kept_in_their_order() -> None:
+    cpu, device = both()
+    for mapper in (cpu, device):
+        for number in range(12):
+            mapper.keep_between(dataclasses.replace(wall(1), index=number), 1, POSES[number % 4])
+        assert list(mapper._find_beside([1]).values()) == [list(range(12))]
+    for one, other in zip(cpu.between, device.between, strict=True):
+        assert one.frame_index == other.frame_index and np.array_equal(one.color, other.color)
+        assert np.array_equal(one.T_keyframe_camera, other.T_keyframe_camera)
+
+
 def test_frames_between_keyframes_are_seen_and_judged_the_same() -> None:
     cpu, device = map(with_between, both())
     keyframe = device.keyframes[1]

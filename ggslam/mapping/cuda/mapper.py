@@ -20,6 +20,7 @@ from ggslam.cuda.streams import Pace, SideStream
 from ggslam.cuda.transfers import HostMirror, download, upload
 from ggslam.mapping.between_frames import BetweenFrame
 from ggslam.mapping.comparing_mapper import ComparingMapper
+from ggslam.mapping.cuda.between_coder import BetweenCoder
 from ggslam.mapping.cuda.between_view import CudaBetweenView
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
@@ -87,6 +88,7 @@ class CudaMapper(ComparingMapper):
         self._exposures = KeyframeExposures(settings.exposure)
         self._anchors: list[np.ndarray] = []  # of the keyframes' exposures, as the device has them
         self._usable = UsablePixels(self.device)
+        self._coder = BetweenCoder()
         self._views: dict[int, CudaBetweenView] = {}  # by frame
         self._given_context = context
         self._shown_pixels = 0
@@ -289,6 +291,13 @@ class CudaMapper(ComparingMapper):
 
     def last_iterations(self, before: int) -> int:
         return round(MapperTuning.all_pixels_end_share * before) if self.is_live else super().last_iterations(before)
+
+    def _add_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
+        self._coder.add(frame, keyframe, T_keyframe_camera, self.between)
+
+    def _find_beside(self, numbers: Sequence[int]) -> dict[int, list[int]]:
+        self._coder.finish(self.between)
+        return super()._find_beside(numbers)
 
     def _view_beside(self, frame: BetweenFrame, keyframe: Keyframe) -> Keyframe:
         assert isinstance(keyframe, CudaKeyframe)
