@@ -86,15 +86,20 @@ class BetweenFrame:
         Raises:
             FormatError: its image is not of the keyframe's size: it may come from a file.
         """
+        image = self.decode(keyframe)
+        return Keyframe(
+            keyframe.index, self.frame_index, self.timestamp, keyframe.camera, image,
+            np.zeros(image.shape[:2], np.uint16), inverse(keyframe.T_world_camera @ self.T_keyframe_camera),
+            camera_number=keyframe.camera_number, depth_unit=keyframe.depth_unit,
+        )  # fmt: skip
+
+    def decode(self, keyframe: Keyframe) -> np.ndarray:
+        """Its colours, uint8 [H, W, 3]; raises FormatError as `view`."""
         self.check(keyframe)
         image = cv2.imdecode(self.color, cv2.IMREAD_COLOR)
         if image is None or image.shape[1::-1] != _size_of(keyframe):
             raise _foreign()
-        return Keyframe(
-            keyframe.index, self.frame_index, self.timestamp, keyframe.camera, cv2.cvtColor(image, cv2.COLOR_BGR2RGB),
-            np.zeros(image.shape[:2], np.uint16), inverse(keyframe.T_world_camera @ self.T_keyframe_camera),
-            camera_number=keyframe.camera_number, depth_unit=keyframe.depth_unit,
-        )  # fmt: skip
+        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _size_of(keyframe: Keyframe) -> tuple[int, int]:

@@ -123,6 +123,9 @@ class TrainingRasterizer(Protocol):
     ) -> Any:  # fmt: skip
         """See `CpuRasterizer.backward_step`; the result has the pose's gradient as `twist`."""
 
+    def backward(self, grad_image: torch.Tensor | None) -> Any:
+        """See `CpuRasterizer.backward`; the result has the gradient of the colours as `sh`."""
+
 
 class _Stopwatch:
     """Seconds from lap to lap."""
@@ -172,7 +175,7 @@ class Mapper(ABC):
         self.is_live = False
         """Whether frames come at a camera's pace: keyframes do not wait then while one looks for what surfaces hide."""
         self.fits_view_colors = False
-        """Whether the final refinement ends with colours that depend on the view; see `mapping.cpu.view_colors`."""
+        """Whether the final refinement ends with colours that depend on the view; see `mapping.view_colors`."""
         self.residency: Residency | None = None
         """Keeps a part of the map on disk; None: all of it is in memory."""
         self.left_out = set()
@@ -184,7 +187,7 @@ class Mapper(ABC):
         self._beside: dict[int, list[BetweenFrame]] = {}
         self._valid = {}
         self.extra_loss: ExtraLoss | None = None
-        """A loss of the user's own, added to the mapper's; on the CPU only."""
+        """A loss of the user's own, added to the mapper's."""
         self._rasterizer: TrainingRasterizer
         self._mean = MeanMap()
         self._adam_of_pixel: tuple[float, bool, AdamSettings] | None = None
@@ -249,7 +252,7 @@ class Mapper(ABC):
     @property
     def keeps_between(self) -> bool:
         """Whether the final refinement trains on frames between keyframes, if there are any. Where depth is noisy they
-        are not where they are thought to be; on the CPU, with the whole map in memory."""
+        are not where they are thought to be; with the whole map in memory."""
         return False
 
     def keep_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
@@ -257,11 +260,15 @@ class Mapper(ABC):
         arguments as the attributes of `BetweenFrame`."""
         wanted = self.keeps_between and self._is_plain(self.keyframes[keyframe])
         if wanted and sum(kept.color.nbytes for kept in self.between) < BetweenTuning.kept_bytes:
-            self.between.append(code_frame(frame, keyframe, T_keyframe_camera))
+            self._add_between(frame, keyframe, T_keyframe_camera)
+
+    def _add_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
+        """A frame joins `between`."""
+        self.between.append(code_frame(frame, keyframe, T_keyframe_camera))
 
     def judge_between(self) -> None:  # noqa: B027
         """Before the final refinement: finds which frames between keyframes are not of the map's exposure, or much less
-        sharp than their keyframes; on the CPU."""
+        sharp than their keyframes."""
 
     def _find_beside(self, numbers: Sequence[int]) -> dict[int, list[int]]:
         """By the number of a keyframe the places in `between` of the frames that can be compared with the map."""
@@ -289,7 +296,7 @@ class Mapper(ABC):
 
     def use_typical_exposure(self, at_end: bool = False) -> None:  # noqa: B027
         """If exposures are compensated and most keyframes are brighter or darker than the map, the map gets the
-        exposure that is typical of them; on the CPU.
+        exposure that is typical of them.
 
         Args:
             at_end: before the final refinement: exposures are measured again first, and every difference counts.
@@ -375,7 +382,10 @@ class Mapper(ABC):
         """One iteration of the final refinement, of which `done`, 0 to 1, is over, on some keyframes: a step on all
         pixels of one or, where depth is noisy, several on every second pixel of as many. It is the same whether
         identities are trained, too, or not. `settles` as of `_adam`."""
-        for step in range(MapperTuning.noisy_steps if self._is_noisy else 1):
+        count = MapperTuning.noisy_steps if self._is_noisy else 1
+        if self._steps_wholly:
+            pose_factor /= count
+        for step in range(count):
             keyframe = self._draw(numbers)
             grid = self._choose_grid(keyframe) if self._is_noisy else self._choose_size(keyframe, done)
             candidates = self._beside.get(keyframe.index, ())
@@ -384,11 +394,24 @@ class Mapper(ABC):
                 learns = step == 0 and self._is_identity_due(keyframe)
                 self._step(keyframe, (rate_factor, pose_factor), grid, learns, settles)
             else:
-                self._step(beside.view(keyframe), (rate_factor, 0.0), grid, False, settles)
+                self._step(self._view_beside(beside, keyframe), (rate_factor, 0.0), grid, False, settles)
                 keyframe.iterations += 1
-            if not self._is_noisy or grid.is_whole:
+            if grid.is_whole and not self._steps_wholly:
                 break
         self._count_iteration()
+
+    def _view_beside(self, frame: BetweenFrame, keyframe: Keyframe) -> Keyframe:
+        """A frame between keyframes as a step sees it, with the pose that its keyframe gives it."""
+        return frame.view(keyframe)
+
+    def _masks_on(self, keyframe: Keyframe, grid: PixelGrid) -> Keyframe | MaskOnGrid:
+        """What identity steps read of a keyframe at a grid's pixels."""
+        return keyframe if grid.is_whole else MaskOnGrid.of(keyframe, grid)
+
+    @property
+    def _steps_wholly(self) -> bool:
+        """Whether each of several steps of an iteration is on all pixels."""
+        return False
 
     def _choose_size(self, keyframe: Keyframe, done: float) -> PixelGrid:
         """The picture of a step of the final refinement; the recording's own if a loss needs it."""
@@ -404,6 +427,11 @@ class Mapper(ABC):
     def _needs_all_pixels(self) -> bool:
         """Whether a loss is of whole pictures of the recording's size."""
         return self.extra_loss is not None or self._is_identity_dense
+
+    @property
+    def _loss_faults(self) -> torch.Tensor | None:
+        """Where gradients of `extra_loss` that are not finite are noted; None: they are refused at once."""
+        return None
 
     @property
     def _is_noisy(self) -> bool:
@@ -504,12 +532,14 @@ class Mapper(ABC):
         times.loss += watch.lap()
         grad_features = None
         if learns and identity is not None:
-            masked = keyframe if grid.is_whole else MaskOnGrid.of(keyframe, grid)
+            masked = self._masks_on(keyframe, grid)
             with part("objects"):
                 grad_features = identity.step(self.map, self._rasterizer, masked, view)
         times.identity += watch.lap()
         if self.extra_loss is not None:
-            grad_features = add_extra_loss(self.extra_loss, view, keyframe, loss, grad_features)
+            grad_features = add_extra_loss(
+                self.extra_loss, view, keyframe, loss, grad_features, self._loss_faults
+            )  # fmt: skip
             times.loss += watch.lap()
         step = self._rasterizer.backward_step(
             self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,
@@ -566,7 +596,7 @@ class Mapper(ABC):
         self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
     ) -> RenderBuffers:
         """The map as a keyframe sees it at a grid's pixels, with or without identities. `close_below` as the CPU
-        rasterizer's; others may draw pixels to their end."""
+        rasterizer's."""
 
     @abstractmethod
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> LossGradients:
@@ -606,14 +636,19 @@ class Mapper(ABC):
                     self.average(steps - 1 - i, share * steps)
                 if progress is not None and done > begin and (done % 20 == 0 or done == iterations):
                     progress(done, iterations)
+            self._repeat_missed(numbers, share > 0)
             self._mean.move_into(self.map)
             self._bound_values()
         if self.fits_view_colors and (self.residency is None or self.residency.is_whole):
             self._fit_view_colors()
         self._beside = {}
 
+    def _repeat_missed(self, numbers: Sequence[int], averages: bool) -> None:  # noqa: B027
+        """Steps of the final refinement on these keyframes in the place of those that did nothing, if there are such.
+        `averages`: the map becomes a mean, which they join."""
+
     def _fit_view_colors(self) -> None:  # noqa: B027
-        """Gives Gaussians colours that depend on the view where keyframes ask for them; on the CPU."""
+        """Gives Gaussians colours that depend on the view where keyframes ask for them."""
 
     def end_refinement(self) -> None:
         """The map becomes the mean over what a refinement, perhaps cut off, has made of it in the last steps."""

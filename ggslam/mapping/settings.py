@@ -110,8 +110,8 @@ class PruningSettings(PruningTuning):
     max_scale_m: float = setting(0.25, 1e-4, 1e4, "m")
     """Gaussians with a larger standard deviation are removed."""
     min_weight: float = setting(0.05, 0, 1)
-    """Gaussians that contribute less than this share to every pixel of every keyframe are removed as hidden (CPU,
-    before the final refinement, and during a run with noisy depth). 0: none."""
+    """Gaussians that contribute less than this share to every pixel of every keyframe are removed as hidden
+    (before the final refinement, and during a run with noisy depth). 0: none."""
 
 
 @tuning_class(frozen=True)
@@ -161,7 +161,7 @@ class ExposureSettings(ExposureTuning):
     """Train an exposure for each keyframe. Scores are of renders without exposure, which lose 0.4 to 1.1 dB with a
     steady camera."""
     compensate: bool = setting(True, basic=True)
-    """Train an exposure for keyframes that are clearly brighter or darker than the map (CPU)."""
+    """Train an exposure for keyframes that are clearly brighter or darker than the map."""
     change: float = setting(0.45, 0.01, 10)
     """Compensation starts at this mean change of the gains, as a natural logarithm (0.45: a factor of 1.57)."""
 
@@ -190,14 +190,14 @@ class ViewAlignmentTuning:
 
 @settings_class(frozen=True)
 class ViewAlignmentSettings(ViewAlignmentTuning):
-    """Alignment of frames to the map by colour alone (on the CPU).
+    """Alignment of frames to the map by colour alone.
 
     After the last frame it aligns frames between keyframes; where depth errs by more than its images show, also all
     frames of synchronous runs as they arrive, and keyframes before the final refinement.
     """
 
     enabled: bool = setting(True, basic=True)
-    """Align frames to the map photometrically where depth is noisy, after the last frame or as they arrive (CPU)."""
+    """Align frames to the map photometrically where depth is noisy, after the last frame or as they arrive."""
 
 
 @tuning_class(frozen=True)
@@ -246,11 +246,11 @@ class MapperTuning:
     """Clone and split Gaussians that images pull at, as 3DGS does (CPU). added: besides inserting them at unexplained
     pixels; instead: these are inserted at every fourth pixel of every fourth row only."""
     sparse_noise: float = setting(0.2, 0, 1e6, "px")
-    """If the depth noise is at least this wide in the image, a step after the last frame on the CPU becomes two sparse
-    steps on two keyframes; 0: always."""
+    """If the depth noise is at least this wide in the image, a step after the last frame becomes two on two keyframes,
+    sparse ones on the CPU; 0: always."""
     close_below: float = setting(0.01, 0, 0.5)
-    """On the CPU a pixel ends when less than this share of its light is left, which saves a sixth of a step's time; 0:
-    draw all Gaussians."""
+    """In training a pixel ends when less than this share of its light is left: the last Gaussian takes it. That saves a
+    sixth of a step's time on the CPU; 0: draw all Gaussians."""
     refine_decay: float = setting(0.1, 1e-6, 1)
     """Learning rates decay to this share in a final refinement that does not average."""
 
@@ -266,7 +266,7 @@ class MapperSettings(MapperTuning):
     first_frame_iterations: int = setting(10, 0, 10**5)
     """Training steps on the first keyframe before the second frame is read."""
     average_last: float = setting(0.3, 0, 1)
-    """Share of the final refinement's steps over which the map is averaged (CPU); 0: learning rates decay instead."""
+    """Share of the final refinement's steps over which the map is averaged; 0: learning rates decay instead."""
     insertion: InsertionSettings = field(default_factory=InsertionSettings)
     rates: LearningRates = field(default_factory=LearningRates)
     loss: LossSettings = field(default_factory=lambda: LossSettings(depth_weight=0.6))

@@ -74,22 +74,37 @@ class SeenAgain:
         alpha: of the rendering [H, W].
         rendered_depth: metres [H, W].
         depth: what the camera measured [H, W], metres, 0 = none.
+        thinned: whether these have only the rows and columns that are compared, one in `ExposureTuning.stride`; good
+            for all but `relative_sharpness`.
     """
 
     image: np.ndarray
     alpha: np.ndarray
     rendered_depth: np.ndarray
     depth: np.ndarray
+    thinned: bool = False
+
+    def some(self, image: np.ndarray) -> np.ndarray:
+        """The rows and columns that are compared, of an image [H, W]."""
+        return image if self.thinned else image[_SOME]
 
     def common_pixels(self) -> np.ndarray:
         """Which of every STEP-th row and column both see, bool [h, w]."""
-        depth, rendered_depth = self.depth[_SOME], self.rendered_depth[_SOME]
+        depth, rendered_depth = self.some(self.depth), self.some(self.rendered_depth)
         near = np.abs(rendered_depth - depth) < ExposureTuning.max_depth_error * depth
-        return np.asarray((depth > 0) & (self.alpha[_SOME] > ExposureTuning.min_alpha) & near)
+        return np.asarray((depth > 0) & (self.some(self.alpha) > ExposureTuning.min_alpha) & near)
 
     def measure(self, color: np.ndarray) -> np.ndarray | None:
         """`measure_exposure` of what the camera saw, uint8 [H, W, 3]."""
-        return measure_exposure(color, self.depth, self.image, self.alpha, self.rendered_depth)
+        known = self.common_pixels()
+        exposure = identity_exposure()
+        for channel in range(3):
+            x, y = self.some(self.image[channel])[known], color[_SOME][..., channel][known].astype(np.float32) / 255
+            used = (x > ExposureTuning.dark) & (x < ExposureTuning.bright) & (y < ExposureTuning.bright)
+            if used.sum() < ExposureTuning.min_share * known.size:
+                return None
+            exposure[channel, 0] = _median(y[used] / x[used])
+        return exposure if (exposure[:, 0] > 0).all() else None
 
 
 def is_lit(color: np.ndarray) -> bool:
@@ -110,7 +125,7 @@ def shows_otherwise(color: np.ndarray, seen: SeenAgain) -> bool:
     if known.mean() < ExposureTuning.min_share:
         return False
     grey = color[_SOME].astype(np.float32).mean(2) / 255
-    return bool(np.median(np.abs(grey - seen.image.mean(0)[_SOME])[known]) > ExposureTuning.contradiction)
+    return bool(np.median(np.abs(grey - seen.some(seen.image.mean(0)))[known]) > ExposureTuning.contradiction)
 
 
 def measure_exposure(
@@ -128,15 +143,7 @@ def measure_exposure(
         image: rendered colour [3, H, W].
         alpha, rendered_depth: of the rendering [H, W].
     """
-    known = SeenAgain(image, alpha, rendered_depth, depth).common_pixels()
-    exposure = identity_exposure()
-    for channel in range(3):
-        x, y = image[channel][_SOME][known], color[_SOME][..., channel][known].astype(np.float32) / 255
-        used = (x > ExposureTuning.dark) & (x < ExposureTuning.bright) & (y < ExposureTuning.bright)
-        if used.sum() < ExposureTuning.min_share * known.size:
-            return None
-        exposure[channel, 0] = _median(y[used] / x[used])
-    return exposure if (exposure[:, 0] > 0).all() else None
+    return SeenAgain(image, alpha, rendered_depth, depth).measure(color)
 
 
 def _median(values: np.ndarray) -> float:

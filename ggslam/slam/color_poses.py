@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.mapping.cpu.mapper import CpuMapper
+from ggslam.mapping.comparing_mapper import ComparingMapper
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.mapper import Mapper
 from ggslam.mapping.settings import ViewAlignmentSettings
@@ -77,7 +77,7 @@ class ColorPoses:
             metres, their grey values as a JPEG file, and as a PNG file where they do not show the map, uint8 arrays; an
             empty one: nowhere.
         held_bytes: what they take.
-        active: whether frames may be aligned: the map is trained on the CPU.
+        active: whether frames may be aligned.
         live: whether another thread trains the map meanwhile, so that frames can be aligned at the end only.
     """
 
@@ -90,7 +90,7 @@ class ColorPoses:
     live: bool = False
 
     def __post_init__(self) -> None:
-        self.active = isinstance(self.mapper, CpuMapper) and self.mapper.settings.view_alignment.enabled
+        self.active = isinstance(self.mapper, ComparingMapper) and self.mapper.settings.view_alignment.enabled
 
     def align(self, frame: Frame, found: TrackingResult) -> TrackingResult:
         """What the tracker found, with the pose by colour where depth hides its errors and that does not contradict
@@ -229,7 +229,7 @@ class ColorPoses:
         """T_world_camera [4, 4] by colour, from one near by; None if there is none that can be believed, or none whose
         grey difference is less than a share `better` of that at the one near by."""
         camera, T_camera_world = self.state.camera, inverse(T_world_camera)
-        assert isinstance(self.mapper, CpuMapper)
+        assert isinstance(self.mapper, ComparingMapper)
         view = self.mapper.render_view(camera, T_camera_world)
         depth, alpha = view.expected_depth.numpy(), view.alpha.numpy()
         if hidden is not None:

@@ -92,8 +92,8 @@ class Config:
     run in parallel."""
     refine_iterations: int = setting(-1, -1, 10**7, basic=True)
     """Training steps after the last frame; 0: none. -1: automatic: 1.3 x the steps so far, at least 10 per keyframe
-    (2 x where depth is exact, 3 x if images are large, too; 0.4 x in real time, 0.7 x on a GPU or with a memory limit).
-    Gains about 2 dB."""
+    (2 x where depth is exact, 3 x if images are large, too; 0.7 x with a memory limit; in real time 0.4 x, on a GPU
+    0.7 x). Gains about 2 dB."""
     memory_limit_mb: float = setting(0.0, 0, 1e9, "MB", basic=True)
     """Resident memory the run may use: parts of the map and keyframe images that do not fit are moved to disk. 0: no
     limit."""

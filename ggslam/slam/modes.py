@@ -66,24 +66,16 @@ CAPABILITIES = (
         "tracking.recovery.new_part_after", lambda c: c.loops.enabled and c.tracking.recovery.new_part_after > 0,
     ),
     Capability(
-        "correcting poses by colour where depth is wrong", {Mode.RIG: _OUT, Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END},
+        "correcting poses by colour where depth is wrong", {Mode.RIG: _OUT, Mode.REALTIME: Lack.AT_END},
         "mapping.view_alignment.enabled", lambda c: c.mapping.view_alignment.enabled,
     ),
     Capability(
-        "compensating changes of exposure", {Mode.GPU: _OUT}, "mapping.exposure.compensate",
-        lambda c: c.mapping.exposure.compensate,
-    ),
-    Capability(
-        "averaging the map over the last steps", {Mode.GPU: _OUT}, "mapping.average_last",
-        lambda c: c.mapping.average_last > 0,
-    ),
-    Capability(
-        "colours that depend on the view, fitted after training", {Mode.GPU: _OUT, Mode.PAGED: _OUT}, "sh_degree",
+        "colours that depend on the view, fitted after training", {Mode.PAGED: _OUT}, "sh_degree",
         lambda c: c.fits_view_colors,
     ),
     Capability(
         "training on frames in between where depth is exact",
-        {Mode.RIG: _OUT, Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}, "mapping.exposure.enabled",
+        {Mode.RIG: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}, "mapping.exposure.enabled",
         lambda c: not c.mapping.exposure.enabled,
     ),
     Capability(
@@ -94,7 +86,7 @@ CAPABILITIES = (
         "cloning and splitting Gaussians", {Mode.GPU: _OUT}, "mapping.densification",
         lambda c: c.mapping.densification != "never",
     ),
-    Capability("pruning hidden Gaussians where depth is noisy", {Mode.GPU: _OUT, Mode.REALTIME: Lack.AT_END}),
+    Capability("pruning hidden Gaussians where depth is noisy", {Mode.REALTIME: Lack.AT_END}),
     Capability("checkpoints and `resume`", {Mode.GPU: _OUT, Mode.PAGED: _OUT, Mode.REALTIME: _OUT}),
     Capability("repeating bit for bit", {Mode.GPU: _OUT, Mode.REALTIME: _OUT}),
 )  # fmt: skip

@@ -143,9 +143,11 @@ def make_mapper(
         return mapper
     device = library.whole_device(None)
     device_learner = CudaIdentityLearner(config.identity, config.seed, device, library) if learns else None
-    return CudaMapper(
-        GaussianMap(degree, channels, device), config.mapping, library, config.seed, device_learner
+    on_device = CudaMapper(
+        GaussianMap(degree, channels, device), config.mapping, library, config.seed, device_learner, context
     )
+    on_device.fits_view_colors = config.fits_view_colors
+    return on_device
 
 
 def make_tracker(camera: Camera, config: Config, context: NativeContext, library: CudaLibrary | None) -> Tracker:

@@ -12,8 +12,8 @@ import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
-from ggslam.mapping.cpu.exposure import ExposureAdam, identity_exposure
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
+from ggslam.mapping.exposure import ExposureAdam, identity_exposure
 from ggslam.mapping.keyframe import PoseAdam
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.scene.poses import se3_exp

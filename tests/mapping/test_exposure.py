@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from ggslam.errors import RenderError
-from ggslam.mapping.cpu.exposure import ExposureAdam, identity_exposure
 from ggslam.mapping.cpu.losses import CpuImageLoss
+from ggslam.mapping.exposure import ExposureAdam, identity_exposure
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.settings import ExposureSettings, LossSettings
 from ggslam.native.loader import NativeContext

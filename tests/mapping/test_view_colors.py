@@ -11,8 +11,8 @@ import torch
 
 from ggslam.errors import CoreInputError
 from ggslam.mapping.cpu.mapper import CpuMapper
-from ggslam.mapping.cpu.view_colors import ShownColors, ViewColorTuning, fit_view_colors
 from ggslam.mapping.settings import MapperSettings
+from ggslam.mapping.view_colors import ShownColors, ViewColorTuning, fit_view_colors
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.rendering.cpu import CpuRasterizer
 from ggslam.scene.camera import Camera

@@ -18,10 +18,10 @@ from test_fused_adam import SETTINGS as ADAM
 from test_fused_adam import make_map
 
 from ggslam.cuda.library import CudaLibrary
-from ggslam.mapping.cpu.exposure import ExposureAdam, identity_exposure
 from ggslam.mapping.cpu.losses import CpuImageLoss
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss
+from ggslam.mapping.exposure import ExposureAdam, identity_exposure
 from ggslam.mapping.keyframe import PoseAdam
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.settings import ExposureSettings, LossSettings

@@ -59,11 +59,10 @@ def test_same_run_as_on_the_cpu(
     frames: list[Frame], cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without identity nothing is drawn at random: map and trajectory are the CPU's up to rounding, if its steps draw
-    all pixels and those to the end, too, the last ones get smaller, and what surfaces hide stays."""
+    all pixels, too."""
     monkeypatch.setattr(CpuMapper, "_choose_grid", lambda mapper, keyframe: ALL_PIXELS)
-    as_on_the_gpu = ["mapping.close_below=0", "mapping.average_last=0", "mapping.pruning.min_weight=0"]
-    as_on_the_gpu.append("refine_iterations=10")
-    settings = config("identity.enabled=false", "keyframes.max_gap=2", *as_on_the_gpu)
+    monkeypatch.setattr(CpuMapper, "_steps_wholly", True)
+    settings = config("identity.enabled=false", "keyframes.max_gap=2", "refine_iterations=10")
     slam, found = run(frames, settings, cuda_library)
     expected_slam, expected = run(frames, settings, None)
     assert len(found.keyframes) == len(expected.keyframes) > 1

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from ggslam.geometry.soft_edges import edge_sharpness, soft_edges
-from ggslam.mapping.cpu.mapper import CpuMapper, SoftOutlineTuning
+from ggslam.mapping.comparing_mapper import SoftOutlineTuning
+from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.slam.config import load_config
@@ -100,7 +101,7 @@ def test_beside_soft_outlines_every_pixel_becomes_a_gaussian(soft: bool) -> None
     slam.step(dataclasses.replace(frame(depth), color=color))
     mapper = slam.mapper
     assert isinstance(mapper, CpuMapper) and mapper.has_soft_outlines == soft
-    assert mapper._insertion.fill_stride == (1 if soft else mapper.settings.insertion.fill_stride)
+    assert mapper._insertion_settings.fill_stride == (1 if soft else mapper.settings.insertion.fill_stride)
     share = mapper._loss_settings(mapper.keyframes[0]).depth_weight / mapper.settings.loss.depth_weight
     assert share == pytest.approx(SoftOutlineTuning.depth_weight_share if soft else 1)
     missing = (mapper.keyframes[0].depth_m() == 0).sum()

@@ -40,6 +40,9 @@ struct ImageLossJob {
   std::int32_t charbonnier;       // sqrt(r^2 + eps^2) - eps instead of |r| for colour
   float depth_scale;              // metres per unit of target_depth
   float dssim_weight, depth_weight, opacity_weight, no_depth_weight, minimum_alpha, charbonnier_epsilon;
+  // Where the geometric mean of the exposure's gains is larger than this, colours of pixels with a channel of at least
+  // so much (0 to 255) do not count; 0: all count.
+  float overexposed_gain, saturated_from;
 };
 
 // NaN where nothing was measured. The gradient of the exposure, [3][2], follows.
@@ -142,6 +145,7 @@ struct AdamMoments {
 struct KeyframeState {
   double pose[16];      // T_camera_world, 4 x 4
   double exposure[6];   // gain and offset of R, G, B
+  double exposure_anchor[6];  // what the exposure is pulled to
   AdamMoments pose_moments, exposure_moments;
   std::int64_t pose_steps, exposure_steps;
   float pose_copy[12];  // its first three rows, for the rasterizer

@@ -6,7 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "abi/cuda/identity.hpp"
+#include "abi/cuda/sampled_identity.hpp"
 #include "abi/cuda/mapping.hpp"
 #include "abi/cuda/rendering.hpp"
 #include "abi/export.hpp"

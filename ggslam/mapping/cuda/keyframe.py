@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keyframes whose poses, exposures and images are on a device."""
+"""Keyframes, and frames between them, whose poses, exposures and images are on a device."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Hashable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from ggslam.cuda.transfers import upload
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.keyframe import Keyframe
+from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
 from ggslam.system.tuning import Tuning
 
 
@@ -30,26 +32,49 @@ class CudaKeyframeImages:
     Attributes:
         color: uint8 [H, W, 3].
         depth: uint16 [H, W], see `Keyframe`.
+        depth_of: the array that it was uploaded from; None: one that does not change.
         mask: uint16 [H, W], uploaded when first asked for.
         mask_of: the array that it was uploaded from.
-        shown: bool [H, W], where colours count, uploaded when first asked for; None: everywhere.
-        shown_of: what it was made from.
     """
 
     color: torch.Tensor
     depth: torch.Tensor
+    depth_of: np.ndarray | None = None
     mask: torch.Tensor | None = None
     mask_of: np.ndarray | None = None
-    shown: torch.Tensor | None = None
-    shown_of: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
 
     @property
     def nbytes(self) -> int:
         """Memory that they take."""
-        return sum(image.nbytes for image in (self.color, self.depth, self.mask, self.shown) if image is not None)
+        return sum(image.nbytes for image in (self.color, self.depth, self.mask) if image is not None)
 
 
-class CudaKeyframe(Keyframe):
+class DeviceKeyframe(Keyframe):
+    """What training on a device reads of a keyframe, or of a frame between keyframes."""
+
+    _images: ImageStore
+
+    @property
+    @abstractmethod
+    def image_key(self) -> Hashable:
+        """What its images are kept by."""
+
+    @property
+    @abstractmethod
+    def device_pose(self) -> torch.Tensor:
+        """First three rows of its T_camera_world, float32 [12]. Nobody changes it before the next keyframe or step."""
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether any depth was measured."""
+        return True
+
+    def device_images(self, grid: PixelGrid = ALL_PIXELS) -> CudaKeyframeImages:
+        """On the device, what a step on a grid's pixels is compared with."""
+        return self._images.of(self, grid)
+
+
+class CudaKeyframe(DeviceKeyframe):
     """A keyframe whose pose and exposure are optimised on a device. Once it was trained, reading them waits for that.
 
     Args:
@@ -87,12 +112,23 @@ class CudaKeyframe(Keyframe):
 
     @exposure.setter
     def exposure(self, exposure: np.ndarray) -> None:
-        """Only the beginning sets it, and that goes with the row."""
+        if self._states is not None:  # the first goes with the row
+            self._states.write_exposure(self.index, exposure)
 
     @property
-    def device_images(self) -> CudaKeyframeImages:
-        """On the device."""
-        return self._images.of(self)
+    def image_key(self) -> Hashable:
+        return self.index
+
+    @property
+    def device_pose(self) -> torch.Tensor:
+        assert self._states is not None
+        return self._states.pose(self.index)
+
+    @property
+    def exact_device_pose(self) -> torch.Tensor:
+        """T_camera_world on the device, float64 [4, 4]; valid until the next keyframe or step."""
+        assert self._states is not None
+        return self._states.exact_pose(self.index)
 
     @property
     def device_mask(self) -> torch.Tensor | None:
@@ -110,22 +146,29 @@ class ImageStore:
 
     def __init__(self, device: torch.device, limit: int = DeviceImageTuning.max_bytes) -> None:
         self._device, self._limit = device, limit
-        self._images: OrderedDict[int, CudaKeyframeImages] = OrderedDict()
+        self._images: OrderedDict[Hashable, CudaKeyframeImages] = OrderedDict()
+        self._nothing: dict[tuple[int, ...], torch.Tensor] = {}  # depth of frames without any, by size
         self.nbytes = 0
         """Memory that they take at present."""
 
-    def of(self, keyframe: Keyframe) -> CudaKeyframeImages:
-        """Those of a keyframe, uploaded if need be."""
-        images = self._images.pop(keyframe.index, None)
-        if images is None:
-            images = CudaKeyframeImages(upload(keyframe.color, self._device), upload(keyframe.depth, self._device))
+    def of(self, keyframe: DeviceKeyframe, grid: PixelGrid = ALL_PIXELS) -> CudaKeyframeImages:
+        """Those of a keyframe at a grid's pixels, uploaded if need be."""
+        key = keyframe.image_key if grid.is_whole else (keyframe.image_key, grid)
+        images, depth_now = self._images.pop(key, None), vars(keyframe).get("depth")  # one in an archive never changes
+        if images is not None and depth_now is not None and images.depth_of is not depth_now:
+            self.nbytes -= images.nbytes
+            images.depth, images.depth_of = self._upload(grid.depth_of(depth_now)), depth_now
             self.nbytes += images.nbytes
-        self._images[keyframe.index] = images  # the one used last stands last
-        if self.nbytes > self._limit:
-            self._make_room()
+        if images is None:
+            color = self._upload(grid.color_of(keyframe.color))
+            depth = self._no_depth(color) if not keyframe.has_depth else self._upload(grid.depth_of(keyframe.depth))
+            images = CudaKeyframeImages(color, depth, depth_now)
+            self.nbytes += images.nbytes
+        self._images[key] = images  # the one used last stands last
+        self._make_room()
         return images
 
-    def mask_of(self, keyframe: Keyframe) -> torch.Tensor | None:
+    def mask_of(self, keyframe: DeviceKeyframe) -> torch.Tensor | None:
         """The mask that a keyframe has now."""
         mask = keyframe.mask
         if mask is None:
@@ -138,27 +181,15 @@ class ImageStore:
             self._make_room()
         return images.mask
 
-    def usable_of(
-        self, keyframe: Keyframe, valid: np.ndarray | None, find: Callable[[Keyframe], np.ndarray | None]
-    ) -> torch.Tensor | None:
-        """Where a keyframe's colours count, bool [H, W]; None: everywhere.
+    def _upload(self, image: np.ndarray) -> torch.Tensor:
+        return upload(image, self._device)
 
-        Args:
-            valid: where images of its camera show something; None: everywhere.
-            find: tells it on the host; asked only if `valid` or what moved is another one than the last time.
-        """
-        moving = keyframe.moving
-        if valid is None and moving is None:
-            return None
-        images = self.of(keyframe)
-        if images.shown_of[0] is not valid or images.shown_of[1] is not moving:
-            self.nbytes -= images.nbytes
-            shown = find(keyframe)
-            images.shown = None if shown is None else upload(shown, self._device)
-            images.shown_of = (valid, moving)
-            self.nbytes += images.nbytes
-            self._make_room()
-        return images.shown
+    def _no_depth(self, color: torch.Tensor) -> torch.Tensor:
+        """uint16 [H, W] of zeros, one for all images of the size of `color`."""
+        size = (color.shape[0], color.shape[1])
+        if size not in self._nothing:
+            self._nothing[size] = torch.zeros(size, dtype=torch.int16, device=self._device).view(torch.uint16)
+        return self._nothing[size]
 
     def _make_room(self) -> None:
         while self.nbytes > self._limit and len(self._images) > 1:

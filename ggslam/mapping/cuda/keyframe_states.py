@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ggslam.abi.cuda import KeyframeState, KeyframeStepJob, KeyframeWriteJob
+from ggslam.abi.cuda import AdamMoments, KeyframeState, KeyframeStepJob, KeyframeWriteJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.streams import let_go
+from ggslam.cuda.transfers import upload
 from ggslam.errors import RenderError
 from ggslam.mapping.losses import LossValues
 from ggslam.mapping.settings import ExposureSettings
@@ -115,6 +116,10 @@ class KeyframeStates:
         """Keyframe i's exposure, as the image loss takes it: a view, float32 [3, 2], as `pose`."""
         return self._exposures[self._check_index(i)]
 
+    def exact_pose(self, i: int) -> torch.Tensor:
+        """Keyframe i's T_camera_world: a view, float64 [4, 4], as `pose`."""
+        return self._doubles_of(KeyframeState.pose, i).view(4, 4)
+
     def step(
         self,
         i: int,
@@ -167,6 +172,26 @@ class KeyframeStates:
         """
         self._write(self._check_index(i), T_camera_world, None)
 
+    def write_exposure(self, i: int, exposure: np.ndarray) -> None:
+        """Sets keyframe i's exposure [3, 2]; the moments of its steps stay."""
+        given = self._upload_exposure(exposure)
+        self._doubles_of(KeyframeState.exposure, i).copy_(given)
+        self._exposures[self._check_index(i)].copy_(given.view(3, 2))
+        self._changes += 1
+
+    def write_anchor(self, i: int, anchor: np.ndarray) -> None:
+        """Sets the exposure [3, 2] to which steps pull keyframe i's; at first it is the identity."""
+        self._doubles_of(KeyframeState.exposure_anchor, i).copy_(self._upload_exposure(anchor))
+
+    def scale_gradients(self, gain: np.ndarray) -> None:
+        """The moments of all exposures follow a map that became `gain` [3] times as bright: gradients with respect to
+        a gain are as large as the map is bright."""
+        offset, rows = KeyframeState.exposure_moments.offset, self._table[: self._count]
+        moments = rows[:, offset : offset + ctypes.sizeof(AdamMoments)].view(torch.float64).view(-1, 2, 3, 2)
+        factors = upload(np.stack([gain, np.square(gain)]).astype(np.float64), self.device)
+        moments[..., 0].mul_(factors)
+        self._changes += 1
+
     def write_poses(self, T_camera_world: np.ndarray) -> None:
         """Sets the poses of all keyframes [K, 4, 4], as `write_pose`."""
         if len(T_camera_world) != self._count:
@@ -202,6 +227,16 @@ class KeyframeStates:
         numbers = table.view(torch.float32)
         self._poses = numbers[:, for_rasterizer : for_rasterizer + 12]
         self._exposures = numbers[:, for_loss : for_loss + 6].unflatten(1, (3, 2))
+
+    def _doubles_of(self, field: ctypes._CField, i: int) -> torch.Tensor:
+        """Doubles of keyframe i's row, a view [n]."""
+        return self._table[self._check_index(i), field.offset : field.offset + field.size].view(torch.float64)
+
+    def _upload_exposure(self, exposure: np.ndarray) -> torch.Tensor:
+        """float64 [6] on the device."""
+        if np.shape(exposure) != (3, 2):
+            raise RenderError(f"exposure of a keyframe: expected [3, 2], found {list(np.shape(exposure))}")
+        return upload(np.asarray(exposure, np.float64).reshape(-1), self.device)
 
     def _check_index(self, i: int) -> int:
         if not 0 <= i < self._count:

@@ -18,8 +18,10 @@ from ggslam.abi.cuda import ImageLossJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
+from ggslam.mapping.keyframe_exposures import KeyframeExposureTuning
 from ggslam.mapping.losses import LOSS_WEIGHTS, LossGradients, LossTarget, LossValues, RenderedImages
 from ggslam.mapping.settings import LossSettings
+from ggslam.rendering.exposure import ExposureTuning
 
 _VALUES = len(fields(LossValues))
 
@@ -53,14 +55,20 @@ class CudaImageLoss:
     Args:
         device: CUDA device; None: the current one.
         library: the compiled kernels; None: those of the device, compiled if need be.
+        leaves_saturated: whether saturated pixels of targets that are brighter than the map are left out, as
+            `KeyframeExposures.usable_pixels` does.
 
     Raises:
         MissingDependency: no CUDA device, or the kernels cannot be compiled.
         NativeCoreError: the compiled kernels do not fit this code.
     """
 
-    def __init__(self, device: torch.device | str | None = None, library: CudaLibrary | None = None) -> None:
+    def __init__(
+        self, device: torch.device | str | None = None, library: CudaLibrary | None = None,
+        leaves_saturated: bool = False,
+    ) -> None:  # fmt: skip
         self.library, self.device = library_and_device(device, library)
+        self._leaves_saturated = leaves_saturated
         self.memory = GrowingMemory(self.device)
         self._results = torch.empty(_VALUES + 6, dtype=torch.float64, device=self.device)
         self._gradients = self._new_gradients(0, 0)
@@ -103,6 +111,9 @@ class CudaImageLoss:
             setattr(job, name, tensor.data_ptr())
         job.normalised_depth = settings.depth_kind == "normalised"
         job.charbonnier = settings.color_kind == "charbonnier"
+        if self._leaves_saturated:
+            job.overexposed_gain = KeyframeExposureTuning.overexposed_gain
+            job.saturated_from = 255 * ExposureTuning.bright
         for name in LOSS_WEIGHTS:
             setattr(job, name, getattr(settings, name))
         if self._gradients[1].shape != (height, width):

@@ -9,42 +9,63 @@ poses are read. The losses it reports are those that have arrived without waitin
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.streams import Pace, SideStream
-from ggslam.cuda.transfers import HostMirror, download
+from ggslam.cuda.transfers import HostMirror, download, upload
+from ggslam.mapping.between_frames import BetweenFrame
+from ggslam.mapping.comparing_mapper import ComparingMapper
+from ggslam.mapping.cuda.between_coder import BetweenCoder
+from ggslam.mapping.cuda.between_view import CudaBetweenView
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
-from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages, ImageStore
+from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceKeyframe, ImageStore
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
+from ggslam.mapping.cuda.shown_gaussians import mark_shown
 from ggslam.mapping.cuda.training import CudaTraining, StepKind
+from ggslam.mapping.cuda.usable_pixels import UsablePixels
 from ggslam.mapping.deformation import move_with_keyframes
+from ggslam.mapping.extra_loss import new_faults, refuse_faults
+from ggslam.mapping.identity import MaskOnGrid
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
+from ggslam.mapping.keyframe_exposures import KeyframeExposures
 from ggslam.mapping.labelling import Labeller, MapLabels
 from ggslam.mapping.losses import LossTarget
-from ggslam.mapping.mapper import LossSums, Mapper, MapperTuning
+from ggslam.mapping.mapper import LossSums, MapperTuning
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
+from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
-from ggslam.rendering.types import RenderBuffers
+from ggslam.rendering.exposure import ExposureTuning, SeenAgain, identity_exposure
+from ggslam.rendering.types import LOW_PASS, RenderBuffers
+from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 
 
-class CudaMapper(Mapper):
+@dataclass(frozen=True)
+class CudaMaskOnGrid(MaskOnGrid):
+    """A keyframe's mask at the pixels of a grid, on the device, too."""
+
+    device_mask: torch.Tensor | None = None
+
+
+class CudaMapper(ComparingMapper):
     """See `Mapper`. Sums in changing order: runs on a GPU differ in the last digits.
 
     Args:
         gaussians: the map, on the device.
         library: the kernels.
+        context: threads of the CPU; None: all.
         Others: as in `Mapper`.
     """
 
@@ -53,12 +74,12 @@ class CudaMapper(Mapper):
 
     def __init__(
         self, gaussians: GaussianMap, settings: MapperSettings, library: CudaLibrary, seed: int = 0,
-        identity: CudaIdentityLearner | None = None,
+        identity: CudaIdentityLearner | None = None, context: NativeContext | None = None,
     ) -> None:  # fmt: skip
         super().__init__(gaussians, settings, seed, identity)
         self.device = library.whole_device(None)
         self._rasterizer = CudaRasterizer(self.device, library=library, waits=False)
-        self._loss = CudaImageLoss(self.device, library)
+        self._loss = CudaImageLoss(self.device, library, leaves_saturated=True)
         self._insertion = CudaInsertion(self.device, library)
         self._states = KeyframeStates(self.device, library)
         self._images = ImageStore(self.device)
@@ -68,6 +89,15 @@ class CudaMapper(Mapper):
         self._repeated = 0
         self._training = CudaTraining(self._rasterizer, self._loss, self._states)
         self._gathers = False  # steps that are started together
+        self._exposures = KeyframeExposures(settings.exposure)
+        self._anchors: list[np.ndarray] = []  # of the keyframes' exposures, as the device has them
+        self._usable = UsablePixels(self.device)
+        self._coder = BetweenCoder()
+        self._views: dict[int, CudaBetweenView] = {}  # by frame
+        self._given_context = context
+        self._shown_pixels = 0
+        self._faults = new_faults(self.device)
+        self._newest_faults = HostMirror(self._faults)
 
     @property
     def losses(self) -> LossSums:
@@ -91,6 +121,8 @@ class CudaMapper(Mapper):
     def load_map(self, gaussians: GaussianMap, keyframes: list[Keyframe]) -> None:
         ours: list[Keyframe] = [CudaKeyframe(keyframe, self._states, self._images) for keyframe in keyframes]
         super().load_map(gaussians.to(self.device), ours)
+        self._exposures.load(ours)
+        self._exposures_changed()
 
     def move_keyframes(self, T_new_old: np.ndarray) -> None:
         old = self._states.read_poses()
@@ -106,22 +138,29 @@ class CudaMapper(Mapper):
             self._gathers = False
             self._start_steps()
         self._report.send()
+        if self.extra_loss is not None:
+            self._newest_faults.send()
+            refuse_faults(self._newest_faults.newest())
         self._pace.piece_ends()
 
     def refine(self, iterations: int, progress: Callable[[int, int], None] | None = None, begin: int = 0) -> None:
         self._repeated = int(download(self._rasterizer.overflows)[0][0])
         super().refine(iterations, progress, begin)
-        numbers = self._trainable()
-        for _ in range(self._count_missed(int(download(self._rasterizer.overflows)[0][0]))):
-            self.iterate(self._draw(numbers), self.settings.refine_decay)
+        if self.extra_loss is not None:
+            refuse_faults(download(self._faults)[0])
+        self._views = {}
         self._report.send()
 
-    def drop_hidden(self) -> None:
-        """Nothing: it has not been tried on a GPU."""
+    def _repeat_missed(self, numbers: Sequence[int], averages: bool) -> None:
+        for _ in range(self._count_missed(int(download(self._rasterizer.overflows)[0][0]))):
+            falling = self.settings.refine_decay
+            self.iterate(self._draw(numbers), 1.0 if averages else falling, averages)
+            if averages:
+                self._mean.add(self.map)
 
     @property
-    def _averaged_share(self) -> float:
-        return 0.0  # the mean has not been tried on a GPU
+    def _loss_faults(self) -> torch.Tensor | None:
+        return self._faults
 
     def _count_missed(self, overflows: int | None = None) -> int:
         """Iterations that did nothing, as far as is known, because their rendering found no room: to be made again."""
@@ -133,6 +172,7 @@ class CudaMapper(Mapper):
     # --- growth ------------------------------------------------------------------------------------------------------
 
     def _new_keyframe(self, frame: Frame, T_world_camera: np.ndarray) -> CudaKeyframe:
+        self._exposures.add()
         keyframe = make_keyframe(len(self.keyframes), frame, T_world_camera)
         return CudaKeyframe(keyframe, self._states, self._images)
 
@@ -142,9 +182,13 @@ class CudaMapper(Mapper):
     ) -> None:  # fmt: skip
         begin_others()
         assert isinstance(keyframe, CudaKeyframe)
-        look = _Look(self, keyframe, T_world_camera)
+        labels = self.identity is not None and labeller is not None
+        look = _Look(self, keyframe, T_world_camera, labels, self.settings.exposure.compensate)
+        color = self._colors(keyframe, look.view())
+        if color is not keyframe.color:
+            look.select_again(upload(color, self.device))
         if self.identity is not None and labeller is not None:
-            self._take_labels(keyframe, labeller(keyframe, look.labels if self.map.count else None))
+            self._take_labels(keyframe, labeller(keyframe, look.labels if look.shows else None))
         new = self._insertion.build(look.selection, look.count())
         opacity = self.settings.insertion.opacity
         logit = torch.full_like(new.means[:, 0], float(np.log(opacity / (1 - opacity))))
@@ -154,13 +198,59 @@ class CudaMapper(Mapper):
         if self.identity is not None:
             self.identity.begin(self.map, rows, self.identity.labels_at(keyframe, new.pixels))
 
-    def render_keyframe(self, keyframe: CudaKeyframe, with_room: bool) -> RenderBuffers:
-        """The map as a keyframe sees it, without identities; `with_room`: waits for room for all that is in view."""
+    @property
+    def _densification(self) -> str:
+        return "never"
+
+    @contextmanager
+    def _with_room(self, with_room: bool = True) -> Iterator[None]:
+        """Renderings within wait for room for all that is in view."""
         self._rasterizer.waits = with_room
         try:
-            return self._render(keyframe, features=False)
+            yield
         finally:
             self._rasterizer.waits = False
+
+    def render_keyframe(self, keyframe: CudaKeyframe, with_room: bool) -> RenderBuffers:
+        """The map as a keyframe sees it, without identities; `with_room`: waits for room for all that is in view."""
+        with self._with_room(with_room):
+            return self._render(keyframe, features=False, close_below=self.settings.close_below)
+
+    def render_view(self, camera: Camera, T_camera_world: np.ndarray) -> RenderBuffers:
+        self._rasterizer.low_pass, self._rasterizer.close_below = LOW_PASS, 0.0
+        with self._with_room():
+            view = self._rasterizer.forward(self.map, camera, T_camera_world, features=False)
+        return RenderBuffers(*map(torch.from_numpy, download(view.image, view.depth, view.alpha)))
+
+    def _render_all(self, keyframe: Keyframe, grid: PixelGrid = ALL_PIXELS) -> RenderBuffers:
+        with self._with_room():
+            view = self._render(keyframe, features=False, grid=grid)
+        self._shown_pixels = view.alpha.numel()
+        return view
+
+    def _fetch(self, *images: torch.Tensor) -> list[np.ndarray]:
+        return download(*images)
+
+    def _mark_shown(self, shown: torch.Tensor, least: float) -> None:
+        mark_shown(self._rasterizer, self._shown_pixels, shown, least)
+
+    @property
+    def _context(self) -> NativeContext:
+        if self._given_context is None:
+            self._given_context = NativeContext()
+        return self._given_context
+
+    def _exposures_changed(self, gain: np.ndarray | None = None) -> None:
+        if gain is not None:
+            self._states.scale_gradients(gain)
+        if not self._exposures.changed:
+            return
+        anchors = [optimizer.anchor for optimizer in self._exposures.optimizers]
+        self._anchors += [identity_exposure() for _ in anchors[len(self._anchors) :]]
+        for number, (anchor, sent) in enumerate(zip(anchors, self._anchors, strict=True)):
+            if not np.array_equal(anchor, sent):
+                self._states.write_anchor(number, anchor)
+                self._anchors[number] = anchor.copy()
 
     @property
     def room_was_short(self) -> torch.Tensor:
@@ -168,14 +258,27 @@ class CudaMapper(Mapper):
         return self._rasterizer.last_overflowed
 
     def selection(
-        self, images: CudaKeyframeImages, keyframe: CudaKeyframe, alpha: torch.Tensor | None,
-        depth: torch.Tensor | None, T_world_camera: np.ndarray,
+        self, color: torch.Tensor, keyframe: CudaKeyframe, explained: tuple[torch.Tensor | None, torch.Tensor | None],
+        T_world_camera: np.ndarray,
     ) -> Selection:  # fmt: skip
-        """Starts to choose the pixels of a keyframe that the map, rendered as `alpha` and `depth`, does not explain."""
+        """Starts to choose the pixels of a keyframe, whose colours are those given, that the map does not explain,
+        rendered as alpha and depth of `explained`, which has to stay."""
         return self._insertion.select(
-            images.color, images.depth, keyframe.depth_unit, alpha, depth, keyframe.camera, T_world_camera,
-            self.settings.insertion,
+            color, keyframe.device_images().depth, keyframe.depth_unit, *explained, keyframe.camera, T_world_camera,
+            self._insertion_settings,
         )  # fmt: skip
+
+    def find_explained(
+        self, keyframe: CudaKeyframe, alpha: torch.Tensor | None, depth: torch.Tensor | None
+    ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+        """What the map shows from a keyframe, alpha and depth [H, W]; where images show nothing there is nothing to
+        explain."""
+        valid = self._valid_on_device(keyframe)
+        if valid is None:
+            return alpha, depth
+        if alpha is None:
+            return (~valid).float(), torch.zeros(valid.shape, device=self.device)
+        return torch.where(valid, alpha, 1.0), depth
 
     def labels_on_grid(self, alpha: torch.Tensor, stride: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Object that the last rendering shows on every `stride`-th pixel and row, int32 [h, w], and its share."""
@@ -190,47 +293,82 @@ class CudaMapper(Mapper):
     def _choose_grid(self, keyframe: Keyframe) -> PixelGrid:
         return ALL_PIXELS
 
-    def _choose_size(self, keyframe: Keyframe, done: float) -> PixelGrid:
-        return ALL_PIXELS
+    @property
+    def _steps_wholly(self) -> bool:
+        return not self._needs_all_pixels  # with a loss of whole pictures there is one step, as on the CPU
 
     def last_iterations(self, before: int) -> int:
-        return round(MapperTuning.all_pixels_end_share * before)
+        return round(MapperTuning.all_pixels_end_share * before) if self.is_live else super().last_iterations(before)
+
+    def _add_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
+        self._coder.add(frame, keyframe, T_keyframe_camera, self.between)
+
+    def _find_beside(self, numbers: Sequence[int]) -> dict[int, list[int]]:
+        self._coder.finish(self.between)
+        return super()._find_beside(numbers)
+
+    def _view_beside(self, frame: BetweenFrame, keyframe: Keyframe) -> Keyframe:
+        assert isinstance(keyframe, CudaKeyframe)
+        if frame.frame_index not in self._views:
+            self._views[frame.frame_index] = CudaBetweenView(frame, keyframe, self._images, self.device)
+        return self._views[frame.frame_index]
+
+    def _masks_on(self, keyframe: Keyframe, grid: PixelGrid) -> Keyframe | MaskOnGrid:
+        mask = None if grid.is_whole or not isinstance(keyframe, CudaKeyframe) else keyframe.device_mask
+        if mask is None:
+            return super()._masks_on(keyframe, grid)
+        on_grid: torch.Tensor = grid.of(mask.view(torch.int16))  # type: ignore[assignment,arg-type]
+        return CudaMaskOnGrid(keyframe.index, None, on_grid.contiguous().view(torch.uint16))
 
     def _render(
         self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
     ) -> RenderBuffers:
-        return self._rasterizer.forward(self.map, keyframe.camera, self._states.pose(keyframe.index), features=features)
+        assert isinstance(keyframe, DeviceKeyframe)
+        camera = keyframe.camera if grid.is_whole else grid.camera(keyframe.camera)
+        self._rasterizer.low_pass, self._rasterizer.close_below = grid.low_pass(LOW_PASS), close_below
+        return self._rasterizer.forward(self.map, camera, keyframe.device_pose, features=features)
 
     def _evaluate_loss(self, keyframe: Keyframe, view: RenderBuffers, grid: PixelGrid = ALL_PIXELS) -> CudaLossResult:
-        assert isinstance(keyframe, CudaKeyframe)
-        images, s = keyframe.device_images, self.settings
-        exposure = self._states.exposure(keyframe.index) if s.exposure.enabled else None
-        shown = self._images.usable_of(keyframe, self._valid.get(keyframe.camera_number), self.valid_of)
+        assert isinstance(keyframe, DeviceKeyframe)
+        images, exposure = keyframe.device_images(grid), None
+        if self._exposures.is_exposed(keyframe):
+            exposure = self._states.exposure(keyframe.index)
+        shown = self._comparable_on_device(keyframe, grid)
         target = LossTarget(images.color, images.depth, keyframe.depth_unit, exposure, shown)
-        return self._loss.evaluate(view, target, s.loss)
+        return self._loss.evaluate(view, target, self._loss_settings(keyframe))
+
+    def _valid_on_device(self, keyframe: Keyframe, grid: PixelGrid = ALL_PIXELS) -> torch.Tensor | None:
+        """`valid_of` at a grid's pixels."""
+        sources = (self._valid.get(keyframe.camera_number), keyframe.moving)
+        return self._usable.valid(keyframe, sources, lambda: self.valid_of(keyframe), grid)
+
+    def _comparable_on_device(self, keyframe: Keyframe, grid: PixelGrid) -> torch.Tensor | None:
+        """`_comparable` at a grid's pixels, but for saturated ones, which the loss leaves out."""
+        if self._exposures.blind[keyframe.index]:
+            return self._usable.nowhere(keyframe, grid)
+        return self._valid_on_device(keyframe, grid)
 
     def _step(
         self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
     ) -> None:
         training, lessons = self._training, self.identity.lessons if learns and self.identity is not None else None
         plain = grid.is_whole and self.extra_loss is None and (lessons is None or lessons.takes(self.map, keyframe))
-        if not plain or not training.is_ready:
+        if not plain or not training.is_ready or not isinstance(keyframe, CudaKeyframe):
             self._start_steps()
             super()._step(keyframe, factors, grid, learns, settles)
             return
-        kind = StepKind(keyframe.camera, self.settings, self.settings.loss, self.settings.exposure.enabled)
+        exposed = self._exposures.is_exposed(keyframe)
+        filters = grid.low_pass(LOW_PASS), self.settings.close_below
+        kind = StepKind(keyframe.camera, self.settings, self._loss_settings(keyframe), exposed, *filters)
         if not training.fits(kind):
             self._start_steps()
-        images, valid, shown = self._images.of(keyframe), self._valid.get(keyframe.camera_number), None
-        if valid is not None or keyframe.moving is not None:
-            shown = self._images.usable_of(keyframe, valid, self.valid_of)
+        images, shown = keyframe.device_images(), self._comparable_on_device(keyframe, grid)
         rate_factor, pose_factor = factors
         optimizer = self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles)
         fixed = keyframe.index == self._all_numbers[0] or (keyframe.instant is not None and self.is_world(keyframe))
         pose_rate = 0.0 if fixed else pose_factor * self._pose_rate
         training.add(kind, keyframe.index, images, keyframe.depth_unit, shown, optimizer, pose_rate)
         if lessons is not None:
-            assert isinstance(keyframe, CudaKeyframe)
             training.teach_last(lessons, self.map, keyframe)
         self.times.steps += 1
         keyframe.iterations += 1
@@ -254,11 +392,15 @@ class CudaMapper(Mapper):
             super()._bound_values()
 
     def _finish_step(self, keyframe: Keyframe, twist: torch.Tensor, loss: CudaLossResult, pose_rate: float) -> None:
-        exposure = self.settings.exposure
+        steps_exposure = keyframe.index > 0 and self._exposures.is_exposed(keyframe)
         self._states.step(
             keyframe.index, twist, loss.results, self._rasterizer.last_overflowed, pose_rate,
-            exposure if exposure.enabled and keyframe.index > 0 else None,
+            self.settings.exposure if steps_exposure else None,
         )  # fmt: skip
+
+
+_SOME = (..., slice(None, None, ExposureTuning.stride), slice(None, None, ExposureTuning.stride))
+_LABEL_STRIDE = 2
 
 
 class _Look:
@@ -269,42 +411,63 @@ class _Look:
         mapper: whose map it is.
         keyframe: the new one.
         T_world_camera: [4, 4], its pose.
+        with_labels: whether what the map shows of the objects will be asked for.
+        with_colors: whether its colours will be.
     """
 
-    def __init__(self, mapper: CudaMapper, keyframe: CudaKeyframe, T_world_camera: np.ndarray) -> None:
+    def __init__(
+        self, mapper: CudaMapper, keyframe: CudaKeyframe, T_world_camera: np.ndarray, with_labels: bool,
+        with_colors: bool,
+    ) -> None:  # fmt: skip
         self._mapper, self._keyframe, self._T = mapper, keyframe, T_world_camera
+        self._with_labels, self._with_colors = with_labels, with_colors
+        self.shows = mapper.map.count > 0
+        """Whether there is a map to look at."""
         self._count: int | None = None
+        self._found: list[np.ndarray] = []
         self._start(with_room=False)
 
     def _start(self, with_room: bool) -> None:
         mapper, keyframe, self._with_room = self._mapper, self._keyframe, with_room
-        self._alpha = self._depth = None
-        if mapper.map.count:
+        alpha = depth = None
+        self._wanted: list[torch.Tensor] = []
+        if self.shows:
             view = mapper.render_keyframe(keyframe, with_room)
-            self._alpha, self._depth = view.alpha, view.expected_depth
-        images = keyframe.device_images
-        self.selection = mapper.selection(images, keyframe, self._alpha, self._depth, self._T)
+            alpha, depth = view.alpha, view.expected_depth
+            if self._with_labels:
+                self._wanted += [*mapper.labels_on_grid(alpha, _LABEL_STRIDE), depth]
+            if self._with_colors:
+                self._wanted += [image[_SOME].contiguous() for image in (view.image, alpha, depth)]
+        self._explained = mapper.find_explained(keyframe, alpha, depth)
+        self.selection = mapper.selection(keyframe.device_images().color, keyframe, self._explained, self._T)
 
-    def labels(self, stride: int = 2) -> MapLabels:
-        """What the map shows of the objects, looked at on every `stride`-th pixel and row; on the host."""
-        assert self._alpha is not None and self._depth is not None
-        ids, share = self._mapper.labels_on_grid(self._alpha, stride)
-        found = self._fetch(ids, share, self._depth)
-        if found is None:
-            return self.labels(stride)
-        return MapLabels.from_grid(found[0], found[1], found[2], stride)
+    def select_again(self, color: torch.Tensor) -> None:
+        """Chooses pixels of the keyframe with other colours, uint8 [H, W, 3] on the device."""
+        self.count()  # by now it is known whether there was room
+        self._color = color  # it has to stay
+        self.selection = self._mapper.selection(color, self._keyframe, self._explained, self._T)
+        self._count = int(download(self.selection.total)[0][0])
+
+    def labels(self) -> MapLabels:
+        """What the map shows of the objects, looked at on every `_LABEL_STRIDE`-th pixel and row; on the host."""
+        self.count()
+        ids, share, depth = self._found[:3]
+        return MapLabels.from_grid(ids, share, depth, _LABEL_STRIDE)
+
+    def view(self) -> SeenAgain | None:
+        """What the map shows where the keyframe looks; None: nothing, or colours were not asked for."""
+        if not (self.shows and self._with_colors):
+            return None
+        self.count()
+        image, alpha, depth = self._found[-3:]
+        return SeenAgain(image, alpha, depth, self._keyframe.depth_m()[_SOME], thinned=True)
 
     def count(self) -> int:
         """Of the Gaussians to insert."""
         while self._count is None:
-            self._fetch()
+            *self._found, total, short = download(*self._wanted, self.selection.total, self._mapper.room_was_short)
+            if short[0] and self.shows and not self._with_room:
+                self._start(with_room=True)
+            else:
+                self._count = int(total[0])
         return self._count
-
-    def _fetch(self, *tensors: torch.Tensor) -> list[np.ndarray] | None:
-        """These on the host, and the count known; None if all has to be done again, and was started."""
-        *found, total, short = download(*tensors, self.selection.total, self._mapper.room_was_short)
-        if short[0] and self._alpha is not None and not self._with_room:
-            self._start(with_room=True)
-            return None
-        self._count = int(total[0])
-        return found

@@ -44,17 +44,22 @@ class StepKind:
         settings: of the mapper.
         loss: of the images.
         exposed: whether keyframes have exposures of their own, which follow their gradients.
+        low_pass: filter of the renderings, pixels^2.
+        close_below: see `CudaRasterizer`.
     """
 
     camera: Camera
     settings: MapperSettings
     loss: LossSettings
     exposed: bool
+    low_pass: float
+    close_below: float
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, StepKind):
             return NotImplemented
         same = self.settings is other.settings and self.exposed == other.exposed
+        same = same and (self.low_pass, self.close_below) == (other.low_pass, other.close_below)
         same = same and (self.camera is other.camera or self.camera == other.camera)
         return same and (self.loss is other.loss or self.loss == other.loss)
 
@@ -66,7 +71,7 @@ class _Filled:
     map: MapState
     room: int
     memory: int
-    projection: tuple[float, ...]
+    near_plane: float
     optimizer: tuple[object, ...]
 
 
@@ -179,13 +184,13 @@ class CudaTraining:
         """Fills the job if it is not as it should be."""
         kind, optimizer, rasterizer = self._kind, self._optimizer, self._rasterizer
         assert kind is not None and optimizer is not None
+        rasterizer.low_pass, rasterizer.close_below = kind.low_pass, kind.close_below
         state = MapState.of(gaussians)
         if self._filled is None or self._filled.map != state:  # there may have been other renderings since
             self._recent.value = rasterizer.counter.recent_pairs()
         room = rasterizer.counter.room_for(self._recent.value) or rasterizer.counter.spare_pairs
         allocations = rasterizer.memory.allocations + self._loss.memory.allocations
-        projection = (rasterizer.near_plane, rasterizer.low_pass)
-        wanted = _Filled(state, room, allocations, projection, _shape_of(optimizer))
+        wanted = _Filled(state, room, allocations, rasterizer.near_plane, _shape_of(optimizer))
         if wanted == self._filled:
             return
         self._fill_in(gaussians, kind, room, optimizer)

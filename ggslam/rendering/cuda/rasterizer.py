@@ -95,6 +95,8 @@ class CudaRasterizer:
 
     Attributes:
         waits: as the argument; may be changed between renderings, for one whose images have to be complete.
+        close_below: 0 at first; of the renderings that follow, as the argument of `CpuRasterizer.forward`. Renderings
+            with median depth are drawn to their end.
         last_overflowed: int32 [1] on the device, 1 after a rendering that ran out of room, else 0. Of the last
             rendering in stream order; 0 after one that was waited for.
         overflows: int64 [1] on the device, how many renderings ran out of room so far.
@@ -119,6 +121,7 @@ class CudaRasterizer:
         self.low_pass = low_pass
         self.library, self.device = library_and_device(device, library)
         self.waits = waits
+        self.close_below = 0.0
         self.last_overflowed = torch.zeros(1, dtype=torch.int32, device=self.device)
         self.overflows = torch.zeros(1, dtype=torch.int64, device=self.device)
         self.counter = Counter(self.library, self.device.index or 0)
@@ -176,6 +179,7 @@ class CudaRasterizer:
             pose, view = None, posed_view(camera, T_camera_world, self.near_plane, self.low_pass)
         parameters = self._parameters(gaussians)
         arrays = gaussian_arrays(parameters, features, active_sh_degree)
+        view.close_below = 0.0 if median_depth else self.close_below
         channels = arrays.feature_channels if arrays.render_features else 0
         buffers = image_buffers(images, camera, channels, median_depth, self.device)
         rendering = self._describe(gaussians, parameters, arrays, view, buffers, pose)
@@ -187,6 +191,7 @@ class CudaRasterizer:
         images, with room for so many pairs. Once they do, what was rendered last cannot be differentiated any more."""
         parameters = self._parameters(gaussians)
         arrays, view = gaussian_arrays(parameters, False, None), camera_view(camera, self.near_plane, self.low_pass)
+        view.close_below = self.close_below
         buffers = image_buffers(self._images, camera, 0, False, self.device)
         rendering = self._describe(gaussians, parameters, arrays, view, buffers, None)
         sizes, memory = self._plan(rendering, room), self.memory

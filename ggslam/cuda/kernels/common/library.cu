@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "abi/cuda/common.hpp"
-#include "abi/cuda/identity.hpp"
 #include "abi/cuda/mapping.hpp"
 #include "abi/cuda/rendering.hpp"
+#include "abi/cuda/sampled_identity.hpp"
 #include "abi/cuda/tracking.hpp"
 #include "abi/cuda/training.hpp"
 

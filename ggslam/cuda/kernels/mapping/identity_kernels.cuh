@@ -2,7 +2,7 @@
 // What identity learning needs beside the kernels of terms, classes and neighbours: products with the classifier, which
 // has few columns, and what joins the parts of a step. Every sum has a fixed order.
 #pragma once
-#include "abi/cuda/identity.hpp"
+#include "abi/cuda/sampled_identity.hpp"
 #include "common/random.cuh"
 #include "common/warp_reduction.cuh"
 

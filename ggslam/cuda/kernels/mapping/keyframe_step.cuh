@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // What is optimised of a keyframe besides the map, its pose and its exposure, and one step of Adam (Kingma and Ba 2015)
-// on them. The arithmetic is that of PoseAdam (ggslam/mapping/keyframe.py), ExposureAdam (ggslam/mapping/cpu/exposure.py) and
+// on them. The arithmetic is that of PoseAdam (ggslam/mapping/keyframe.py), ExposureAdam (ggslam/mapping/exposure.py) and
 // se3_exp (ggslam/scene/poses.py).
 #pragma once
 #include "common/platform.cuh"
@@ -67,8 +67,7 @@ __device__ inline void step_pose(KeyframeState& state, int lane, double gradient
 // One component of the exposure.
 __device__ inline void step_exposure(KeyframeState& state, int k, std::int64_t step, double gradient,
                                      const KeyframeStepJob& job) {
-  const double identity = k % 2 == 0 ? 1.0 : 0.0;
-  const double pulled = gradient + job.exposure_regularization * (state.exposure[k] - identity);
+  const double pulled = gradient + job.exposure_regularization * (state.exposure[k] - state.exposure_anchor[k]);
   const double direction = adam_direction(state.exposure_moments, k, step, pulled, kExposureEpsilon);
   state.exposure[k] += job.exposure_rate * direction;
   state.exposure_copy[k] = static_cast<float>(state.exposure[k]);
@@ -118,6 +117,7 @@ __global__ void keyframe_write_kernel(KeyframeWriteJob job) {
   if (lane < 6) {
     state.exposure[lane] = job.exposure[lane];
     state.exposure_copy[lane] = static_cast<float>(job.exposure[lane]);
+    state.exposure_anchor[lane] = lane % 2 == 0 ? 1.0 : 0.0;
     for (AdamMoments* moments : {&state.pose_moments, &state.exposure_moments})
       moments->first[lane] = moments->second[lane] = 0.0;
   }

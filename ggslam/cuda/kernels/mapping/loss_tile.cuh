@@ -51,11 +51,16 @@ __device__ inline float target_depth(const ImageLossJob& job, std::int64_t pixel
 
 struct Exposure {
   float gain, offset;
+  float saturated_from;  // colour of the target, 0 to 255, from which a pixel does not count; infinite: all do
 };
 
 __device__ inline Exposure exposure_of(const ImageLossJob& job, int channel) {
-  if (job.exposure == nullptr) return {1.0f, 0.0f};
-  return {job.exposure[2 * channel], job.exposure[2 * channel + 1]};
+  if (job.exposure == nullptr) return {1.0f, 0.0f, INFINITY};
+  float change = 1.0f;
+  for (int c = 0; c < 3; ++c) change *= fmaxf(job.exposure[2 * c], 1e-6f);
+  const float gain = job.overexposed_gain;
+  const bool over = job.saturated_from > 0.0f && change > gain * gain * gain;
+  return {job.exposure[2 * channel], job.exposure[2 * channel + 1], over ? job.saturated_from : INFINITY};
 }
 
 // One channel of a pixel on both sides.
@@ -74,6 +79,11 @@ __device__ inline ColorPair color_pair(const ImageLossJob& job, const Exposure& 
   p.depth = target_depth(job, pixel);
   p.weight = p.depth > 0.0f ? 1.0f : job.no_depth_weight;
   if (job.target_valid != nullptr && job.target_valid[pixel] == 0) p.weight = 0.0f;
+  if (exposure.saturated_from < INFINITY) {
+    const std::uint8_t* color = job.target_color + 3 * pixel;
+    for (int c = 0; c < 3; ++c)
+      if (static_cast<float>(color[c]) >= exposure.saturated_from) p.weight = 0.0f;
+  }
   p.corrected = exposure.gain * p.rendered + exposure.offset;
   p.residual = p.weight * (p.corrected - p.target);
   return p;

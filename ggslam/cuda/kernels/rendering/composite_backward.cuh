@@ -21,7 +21,7 @@ constexpr int kBackwardBatch = kFeatures > 8 ? 64 : 128;
 template <int kFeatures>
 struct PixelState {
   float x, y;
-  float transmittance, behind;
+  float transmittance, behind;  // minus the transmittance until the splat that closed the pixel is taken out
   int last;
   float red, green, blue, depth;                    // image gradients
   float features[kFeatures > 0 ? kFeatures : 1];
@@ -46,7 +46,7 @@ __device__ inline PixelState<kFeatures> load_pixel(const ImageGradients& in, con
   p.green = value_or_zero(in.image, base, plane + pixel.index);
   p.blue = value_or_zero(in.image, base, 2 * plane + pixel.index);
   p.depth = value_or_zero(in.depth, base, pixel.index);
-  p.behind = -p.transmittance * value_or_zero(in.alpha, base, pixel.index);
+  p.behind = -fabsf(p.transmittance) * value_or_zero(in.alpha, base, pixel.index);
 #pragma unroll
   for (int q = 0; q < kFeatures; ++q)
     p.features[q] = value_or_zero(in.features, pixel.inside && q < group.count, (group.first + q) * plane + pixel.index);
@@ -62,12 +62,14 @@ struct Contribution {
 template <int kFeatures, bool kDetached>
 __device__ inline Contribution differentiate(const Splat& s, const float4* features, int entry,
                                              PixelState<kFeatures>& p) {
-  const float exponent = log2_alpha(s, p.x - s.mean_x, p.y - s.mean_y);
+  // The splat that closed a pixel, its last, counts as one of full opacity, to which the limit kMaxAlpha applies.
+  const bool closed = p.transmittance < 0.0f && entry == p.last;
+  const float exponent = closed ? 0.0f : log2_alpha(s, p.x - s.mean_x, p.y - s.mean_y);
   const bool taken = exponent >= kLog2MinAlpha && entry <= p.last;
   const float unlimited = exp2f(exponent);
   const float alpha = taken ? fminf(unlimited, kMaxAlpha) : 0.0f;
   const float inverse = __fdividef(1.0f, 1.0f - alpha);
-  const float before = p.transmittance * inverse, weight = alpha * before;
+  const float before = (closed ? -p.transmittance : p.transmittance) * inverse, weight = alpha * before;
   float dot = p.red * s.red + p.green * s.green + p.blue * s.blue + p.depth * s.depth;
   if constexpr (!kDetached) {
 #pragma unroll

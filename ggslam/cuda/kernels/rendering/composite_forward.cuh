@@ -16,16 +16,20 @@ struct PixelSums {
   int last = -1;
 };
 
-// Lets a pixel take one splat; false if no pixel of the warp takes it.
+// Lets a pixel take one splat; false if no pixel of the warp takes it. The one that takes the transmittance below
+// close_below takes what is left, and leaves minus what kMaxAlpha lets through: the pixel has ended.
 template <int kFeatures>
 __device__ inline bool take(const Splat& s, const float4* features, float x, float y, int entry,
-                            PixelSums<kFeatures>& sums) {
+                            float close_below, PixelSums<kFeatures>& sums) {
   const float exponent = log2_alpha(s, x - s.mean_x, y - s.mean_y);
   const bool taken = exponent >= kLog2MinAlpha && sums.transmittance >= kMinTransmittance;
   if (__ballot_sync(kAllLanes, taken) == 0) return false;
   const float alpha = taken ? fminf(exp2f(exponent), kMaxAlpha) : 0.0f;
-  const float before = sums.transmittance, weight = alpha * before;
+  const float before = sums.transmittance;
+  float weight = alpha * before;
   sums.transmittance = before - weight;
+  if (taken && sums.transmittance < close_below)
+    weight = kMaxAlpha * before, sums.transmittance = (kMaxAlpha - 1.0f) * before;
   sums.red += weight * s.red, sums.green += weight * s.green, sums.blue += weight * s.blue;
   sums.depth += weight * s.depth;
   if (before >= 0.5f && sums.transmittance < 0.5f) sums.median_depth = s.depth;
@@ -52,7 +56,7 @@ __device__ inline void write_pixel(const RenderTargets& targets, const PixelWork
   targets.image[plane + pixel.index] = sums.green;
   targets.image[2 * plane + pixel.index] = sums.blue;
   targets.depth[pixel.index] = sums.depth;
-  targets.alpha[pixel.index] = 1.0f - sums.transmittance;
+  targets.alpha[pixel.index] = 1.0f - fabsf(sums.transmittance);
   if (targets.median_depth != nullptr) targets.median_depth[pixel.index] = sums.median_depth;
   w.transmittance[pixel.index] = sums.transmittance;
   w.last_entry[pixel.index] = sums.last;
@@ -105,7 +109,8 @@ composite_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussians, 
       unsigned taken = 0;
       for (unsigned left = __ballot_sync(kAllLanes, mine); left != 0; left &= left - 1) {
         const int bit = __ffs(static_cast<int>(left)) - 1, k = k0 + bit;
-        if (take<kFeatures>(batch.splats[k], batch.features[k], x, y, static_cast<int>(first - begin) + k, sums))
+        if (take<kFeatures>(batch.splats[k], batch.features[k], x, y, static_cast<int>(first - begin) + k,
+                            grid.close_below, sums))
           taken |= 1u << bit;
       }
       if (lane == 0) contributed[warp][chunk] = taken;

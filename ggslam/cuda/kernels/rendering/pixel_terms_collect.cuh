@@ -18,6 +18,7 @@ struct TermWalk {
   float x = 0.0f, y = 0.0f;
   std::uint32_t begin = 0;  // of the tile's list
   int last = -1;            // number in the list of the last contribution, -1: none
+  bool closed = false;      // by that contribution, which took all that was left
   int part = 0;             // of the tile that the pixel lies in: bit of `contributed`
   float transmittance = 1.0f;
   int size = 0;             // terms found so far; may be more than there is room for
@@ -35,6 +36,7 @@ __device__ inline TermWalk begin_walk(const Grid& grid, const PixelWorkspace& w,
   walk.x = static_cast<float>(x), walk.y = static_cast<float>(y);
   walk.begin = w.tile_start[y / kTileSize * grid.tiles_x + x / kTileSize];
   walk.last = w.last_entry[pixel];
+  walk.closed = w.transmittance[pixel] < 0.0f;
   walk.part = y % kTileSize / kWarpHeight * 2 + x % kTileSize / kWarpWidth;
   return walk;
 }
@@ -68,11 +70,12 @@ __device__ inline int list_contributors(const TermWalk& walk, const PairWorkspac
   return found;
 }
 
-// Lets the pixel take up to 32 Gaussians, one per lane, and notes those of weight.
-__device__ inline void take_terms(TermWalk& walk, const Splat* splats, bool given, std::uint32_t row, int lane,
-                                  float min_weight, std::int32_t* gaussians, float* weights, int capacity) {
+// Lets the pixel take up to 32 Gaussians, one per lane, and notes those of weight. closes: the lane's one closed it.
+__device__ inline void take_terms(TermWalk& walk, const Splat* splats, bool given, bool closes, std::uint32_t row,
+                                  int lane, float min_weight, std::int32_t* gaussians, float* weights, int capacity) {
   float exponent = 2.0f * kLog2MinAlpha;
   if (given) exponent = log2_alpha(splats[row], walk.x - splats[row].mean_x, walk.y - splats[row].mean_y);
+  if (closes) exponent = 0.0f;
   const bool taken = exponent >= kLog2MinAlpha;
   const float alpha = taken ? fminf(exp2f(exponent), kMaxAlpha) : 0.0f;
   float weight = 0.0f;
@@ -107,7 +110,9 @@ collect_terms_kernel(Grid grid, const Splat* splats, PairWorkspace pairs, PixelW
     const int found = list_contributors(walk, pairs, first, lane, rows);
     for (int k = 0; k < found && walk.goes_on(out.capacity, min_weight); k += kWarp) {
       const bool given = k + lane < found;
-      take_terms(walk, splats, given, given ? rows[k + lane] : 0, lane, min_weight, gaussians, weights, out.capacity);
+      const bool closes = walk.closed && k + lane == found - 1 && first + kLookahead > walk.last;
+      take_terms(walk, splats, given, closes, given ? rows[k + lane] : 0, lane, min_weight, gaussians, weights,
+                 out.capacity);
     }
   }
   const int size = min(walk.size, out.capacity);

@@ -21,11 +21,13 @@ struct Totals {
 
 struct Grid {
   int width, height, tiles_x, tiles_y;
+  float close_below;  // of the view: transmittance below which a pixel is closed
   __host__ __device__ int tiles() const { return tiles_x * tiles_y; }
 };
 
 inline Grid make_grid(const CameraView& view) {
-  return {view.width, view.height, (view.width + kTileSize - 1) / kTileSize, (view.height + kTileSize - 1) / kTileSize};
+  const int tiles_x = (view.width + kTileSize - 1) / kTileSize, tiles_y = (view.height + kTileSize - 1) / kTileSize;
+  return {view.width, view.height, tiles_x, tiles_y, view.close_below};
 }
 
 // Number of bits that tell apart the numbers from 0 to largest.
@@ -64,7 +66,7 @@ struct PairWorkspace {
 
 struct PixelWorkspace {
   std::uint32_t* tile_start;  // [tiles + 1]
-  float* transmittance;       // [H, W], after the last Gaussian
+  float* transmittance;       // [H, W], after the last Gaussian; minus it, where that one has closed the pixel
   std::int32_t* last_entry;   // [H, W], number in the tile's list of the last contribution, -1 for none
   std::size_t bytes;
 };

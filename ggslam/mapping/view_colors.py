@@ -52,7 +52,7 @@ class ViewColorTuning(Tuning):
 
 @dataclass(frozen=True)
 class ShownColors:
-    """What a view shows of Gaussians, as `CpuRasterizer.backward` tells by gradients of their constant coefficients.
+    """What a view shows of Gaussians, as a rasterizer's `backward` tells by gradients of their constant coefficients.
 
     Attributes:
         centre: of the camera [3], world frame.
@@ -71,8 +71,8 @@ def fit_view_colors(
     """Adds harmonics to the Gaussians that ask for them, if enough do; returns their share.
 
     Args:
-        gaussians: the map on the CPU; its degree rises if need be.
-        views: what views show of it as it is; is called anew for each group of Gaussians.
+        gaussians: the map, on any device; its degree rises if need be.
+        views: what views show of it as it is, on the CPU; is called anew for each group of Gaussians.
         ridge: see `ViewColorTuning.ridge`.
         context: threads to work on. The result is the same, bit for bit, for any number of them.
     """
@@ -83,7 +83,8 @@ def fit_view_colors(
     gaussians.raise_degree(ViewColorTuning.degree)
     count = _unknowns()
     for begin, rows, added in found:
-        gaussians.sh.numpy()[begin + rows, 1 : count + 1] += added
+        index = torch.from_numpy(begin + rows).to(gaussians.device)
+        gaussians.sh[index, 1 : count + 1] += torch.from_numpy(added).to(gaussians.device)
     return share
 
 
@@ -110,7 +111,7 @@ def _fit(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows from `begin` on [M] that ask for harmonics, and these [M, K - 1, 3]."""
     library, t = load_library(), ViewColorTuning
-    means = gaussians.means.numpy()[begin : begin + _group()]
+    means = gaussians.means[begin : begin + _group()].cpu().numpy()
     equations = np.zeros((len(means), _row_floats()), np.float32)
     for view in views():
         weights, residuals = (array.numpy()[begin : begin + len(means)] for array in (view.weights, view.residuals))

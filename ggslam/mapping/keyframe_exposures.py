@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.mapping.cpu.exposure import ExposureAdam
+from ggslam.mapping.exposure import ExposureAdam
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.rendering.exposure import (
@@ -39,7 +39,7 @@ class KeyframeExposureTuning(Tuning):
     """Smallest contrast between neighbouring pixels, relative to the map's, of a keyframe in focus."""
 
 
-@savable()
+@savable(formerly="ggslam.mapping.cpu.keyframe_exposures.KeyframeExposures")
 class KeyframeExposures:
     """Exposures of the keyframes of one mapper, by number.
 
@@ -163,7 +163,7 @@ class KeyframeExposures:
         if self.blind[keyframe.index]:
             return np.zeros(keyframe.color.shape[:2], bool)
         if self.is_exposed(keyframe) and change_of(keyframe.exposure) > KeyframeExposureTuning.overexposed_gain:
-            return np.asarray((keyframe.color < ExposureTuning.bright * 255).all(2))
+            return unsaturated_pixels(keyframe.color)
         return None
 
     def typical(self, keyframes: Sequence[Keyframe]) -> np.ndarray | None:
@@ -185,6 +185,11 @@ class KeyframeExposures:
             optimizer.anchor, optimizer.measured = _against(optimizer.anchor, gain), _against(optimizer.measured, gain)
             optimizer.first[:, 0] *= gain  # gradients with respect to a gain are as large as the map is bright
             optimizer.second[:, 0] *= gain**2
+
+
+def unsaturated_pixels(color: np.ndarray) -> np.ndarray:
+    """Pixels of an image uint8 [H, W, 3] of which no channel is saturated, bool [H, W]."""
+    return np.asarray((color < ExposureTuning.bright * 255).all(2))
 
 
 def _against(exposure: np.ndarray, gain: np.ndarray) -> np.ndarray:

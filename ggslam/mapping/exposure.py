@@ -16,7 +16,7 @@ from ggslam.system.savable import savable
 _IDENTITY = identity_exposure()
 
 
-@savable()
+@savable(formerly="ggslam.mapping.cpu.exposure.ExposureAdam")
 class ExposureAdam:
     """Adam (Kingma and Ba 2015) on gain and offset of one keyframe.
 
