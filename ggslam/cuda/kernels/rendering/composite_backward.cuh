@@ -21,8 +21,8 @@ constexpr int kBackwardBatch = kFeatures > 8 ? 64 : 128;
 template <int kFeatures>
 struct PixelState {
   float x, y;
-  float transmittance, behind;  // minus the transmittance until the splat that closed the pixel is taken out
-  int last;
+  float transmittance, behind;
+  int last;  // twice the number of the last splat, and 1 if that one has closed the pixel
   float red, green, blue, depth;                    // image gradients
   float features[kFeatures > 0 ? kFeatures : 1];
 };
@@ -39,14 +39,15 @@ __device__ inline PixelState<kFeatures> load_pixel(const ImageGradients& in, con
   const std::int64_t plane = static_cast<std::int64_t>(grid.width) * grid.height;
   PixelState<kFeatures> p;
   p.x = static_cast<float>(pixel.x), p.y = static_cast<float>(pixel.y);
-  p.transmittance = pixel.inside ? w.transmittance[pixel.index] : 0.0f;
-  p.last = pixel.inside && complete ? w.last_entry[pixel.index] : -1;
+  const float left = pixel.inside ? w.transmittance[pixel.index] : 0.0f;
+  p.transmittance = fabsf(left);
+  p.last = 2 * (pixel.inside && complete ? w.last_entry[pixel.index] : -1) + (left < 0.0f ? 1 : 0);
   const bool base = pixel.inside && group.first == 0;  // later groups add their features' part only
   p.red = value_or_zero(in.image, base, pixel.index);
   p.green = value_or_zero(in.image, base, plane + pixel.index);
   p.blue = value_or_zero(in.image, base, 2 * plane + pixel.index);
   p.depth = value_or_zero(in.depth, base, pixel.index);
-  p.behind = -fabsf(p.transmittance) * value_or_zero(in.alpha, base, pixel.index);
+  p.behind = -p.transmittance * value_or_zero(in.alpha, base, pixel.index);
 #pragma unroll
   for (int q = 0; q < kFeatures; ++q)
     p.features[q] = value_or_zero(in.features, pixel.inside && q < group.count, (group.first + q) * plane + pixel.index);
@@ -62,14 +63,15 @@ struct Contribution {
 template <int kFeatures, bool kDetached>
 __device__ inline Contribution differentiate(const Splat& s, const float4* features, int entry,
                                              PixelState<kFeatures>& p) {
-  // The splat that closed a pixel, its last, counts as one of full opacity, to which the limit kMaxAlpha applies.
-  const bool closed = p.transmittance < 0.0f && entry == p.last;
-  const float exponent = closed ? 0.0f : log2_alpha(s, p.x - s.mean_x, p.y - s.mean_y);
-  const bool taken = exponent >= kLog2MinAlpha && entry <= p.last;
+  float exponent = log2_alpha(s, p.x - s.mean_x, p.y - s.mean_y);
+  // The splat that closed a pixel counts as one of full opacity, to which the limit kMaxAlpha applies.
+  if (2 * entry + 1 == p.last) exponent = 0.0f;
+  if (2 * entry > p.last) exponent = 2.0f * kLog2MinAlpha;  // behind the last one
+  const bool taken = exponent >= kLog2MinAlpha;
   const float unlimited = exp2f(exponent);
   const float alpha = taken ? fminf(unlimited, kMaxAlpha) : 0.0f;
   const float inverse = __fdividef(1.0f, 1.0f - alpha);
-  const float before = (closed ? -p.transmittance : p.transmittance) * inverse, weight = alpha * before;
+  const float before = p.transmittance * inverse, weight = alpha * before;
   float dot = p.red * s.red + p.green * s.green + p.blue * s.blue + p.depth * s.depth;
   if constexpr (!kDetached) {
 #pragma unroll
@@ -136,7 +138,7 @@ differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussia
   QueuedSplat mine = {};
   int queued = 0;
 
-  for (int end = maximum_of_block(pixel.last) + 1; end > 0; end -= kBatch) {
+  for (int end = (maximum_of_block(pixel.last) >> 1) + 1; end > 0; end -= kBatch) {
     const int first = max(end - kBatch, 0), n = end - first;
     __syncthreads();
     // The list's start is read anew for each batch rather than kept in a register all along.
