@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fusion by CUDA kernels against the compiled core: the same blocks, and voxels within a step or two of rounding."""
+"""The fusion by CUDA kernels against the compiled core: the same blocks, voxels within a step or two of rounding."""
 
 from __future__ import annotations
 
@@ -62,7 +62,8 @@ def fused(library: CudaLibrary, settings: TsdfSettings, seen: list[tuple], **oth
 @pytest.mark.parametrize("voxel", [0.05, 0.1])
 def test_fusion_is_that_of_the_core(cuda_library: CudaLibrary, voxel: float) -> None:
     tsdf, other = fused(cuda_library, TsdfSettings(voxel=voxel), views(6))
-    assert len(other) == pytest.approx(len(tsdf), abs=2) and other.dense_blocks == pytest.approx(tsdf.dense_blocks, abs=2)
+    assert len(other) == pytest.approx(len(tsdf), abs=2)
+    assert other.dense_blocks == pytest.approx(tsdf.dense_blocks, abs=2)
     assert_same(tsdf, other.to_native())
 
 

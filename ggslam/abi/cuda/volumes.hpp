@@ -194,6 +194,23 @@ struct FieldJob {
   float max_distance;  // voxels
 };
 
+// The surface of a map as a camera sees it. Rays go to the first change from free space to the inside.
+struct CastJob {
+  FusedMap map;
+  std::uint64_t* cells;  // [row_room, 8]: those with surface, by their lowest voxel (i, j, k): bit i + 8 j of word k
+  std::uint8_t* kinds;   // [row_room], bits: a voxel is inside; there are cells with surface
+  // Images, all 0 where no surface is seen: depth along the optical axis [H, W] in metres, unit normals in the camera's
+  // axes [H, W, 3], colours [H, W, 3], labels [H, W].
+  float *depth, *normals;
+  std::uint8_t* colors;
+  std::uint16_t* labels;
+  void* stream;
+  float fx, fy, cx, cy, nearest, farthest;
+  float rotation[9], position[3];  // world from camera; of the camera, metres
+  std::int32_t width, height, device, grid;
+  std::int32_t least_weight;  // voxels of less, in 65535ths of the largest, are unknown; at least 1
+};
+
 }  // namespace ggslam::cuda
 
 // Floats in FuseJob.tiles: smallest and largest depth of tiles of 4 pixels along an edge, and of twice as many, and so on.
@@ -209,3 +226,5 @@ GGSLAM_EXPORT int ggslam_cuda_fuse(const ggslam::cuda::FuseJob* job);
 
 // Brings a distance field up to date with its map.
 GGSLAM_EXPORT int ggslam_cuda_field_update(const ggslam::cuda::FieldJob* job);
+
+GGSLAM_EXPORT int ggslam_cuda_cast_rays(const ggslam::cuda::CastJob* job);

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.abi.cuda import FieldDistances, FieldJob, FieldRow, FieldSites, FusedBlock, FusedCount
-from ggslam.cuda.transfers import download
+from ggslam.abi.cuda import FieldJob, FusedCount
 from ggslam.volumes.cuda.field_memory import FieldMemory
+from ggslam.volumes.cuda.field_on_host import held_field, put_field
 from ggslam.volumes.cuda.fusion_jobs import grid_blocks
 from ggslam.volumes.cuda.tsdf import CudaTsdf
-from ggslam.volumes.esdf import FieldSettings, SurfaceDiscs
-from ggslam.volumes.tsdf import VOXELS
-
+from ggslam.volumes.esdf import DistanceField, FieldSettings, SurfaceDiscs
+from ggslam.volumes.tsdf import VOXELS, TsdfMap
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,8 @@ class CudaField:
         return self._memory.bytes
 
     def update(self) -> None:
-        """Starts to bring the field up to date with the views so far; see `DistanceField.update`. The host does not wait
-        for it."""
+        """Starts to bring the field up to date with the views so far, see `DistanceField.update`. The host does not
+        wait for it."""
         self._start(False)
 
     def recompute(self) -> None:
@@ -84,40 +83,32 @@ class CudaField:
 
     def coordinates(self) -> np.ndarray:
         """Coordinates of all blocks with distances, int32 [B, 3], in no particular order; waits."""
-        return self._blocks()[0]
+        return held_field(self.tsdf.state, self._memory).at
 
     def read(self, coordinates: np.ndarray) -> np.ndarray:
-        """Distances of the voxels of the blocks at coordinates [n, 3], float32 [n, 512], metres; NaN: unknown. Waits."""
-        at, rows, _ = self._blocks()
-        found = download(self._memory.read("distances", int(rows.max(initial=-1)) + 1))[0]
-        distances = found.reshape(-1).view(np.dtype(FieldDistances))["distance"]
-        places = {tuple(c): row for c, row in zip(at.tolist(), rows.tolist(), strict=True)}
-        out = np.full((len(coordinates), VOXELS), np.nan, np.float32)
-        for n, place in enumerate(np.asarray(coordinates).tolist()):
-            if (row := places.get(tuple(place))) is not None:
-                out[n] = distances[row]
-        return out
+        """Distances of the voxels of blocks at coordinates [n, 3], float32 [n, 512], metres, NaN: unknown; waits."""
+        held = held_field(self.tsdf.state, self._memory)
+        places = {tuple(at): row for row, at in enumerate(held.at.tolist())}
+        rows = np.array([places.get(tuple(at), -1) for at in np.asarray(coordinates).tolist()], np.intp)
+        distances = np.concatenate([held.distances["distance"], np.full((1, VOXELS), np.nan, np.float32)])
+        return distances[rows]
 
     def discs(self) -> SurfaceDiscs:
         """The surface that distances are measured from; waits."""
-        at, rows, states = self._blocks()
-        held = states["site_slot"] > 0
-        slots = states["site_slot"][held] - 1
-        found = download(self._memory.read("sites", int(slots.max(initial=-1)) + 1))[0]
-        sites = found.reshape(-1).view(np.dtype(FieldSites))[slots]
-        there = np.unpackbits(sites["held"].view(np.uint8).reshape(len(slots), -1), axis=1, bitorder="little") > 0
-        points = np.moveaxis(sites["at"], 1, 2) + 8.0 * at[held][:, None] + 0.5
+        held = held_field(self.tsdf.state, self._memory)
+        blocks, slots, numbers = held.site_numbers()
         voxel, origin = self.tsdf.settings.voxel, self.tsdf.origin
-        points = (voxel * points[there]).astype(np.float32)
+        points = (voxel * (held.sites["at"][slots, :, numbers] + 8.0 * held.at[blocks] + 0.5)).astype(np.float32)
         moved = points if origin is None or not origin.any() else points + origin
-        return SurfaceDiscs(moved, np.moveaxis(sites["normal"], 1, 2)[there], voxel * sites["radius"][there])
+        normals, radii = held.sites["normal"][slots, :, numbers], held.sites["radius"][slots, numbers]
+        return SurfaceDiscs(moved, normals, voxel * radii)
 
-    def _blocks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Coordinates, rows and `FieldRow`s of the blocks that have distances."""
-        state = self.tsdf.state
-        count = int(state.settled()[FusedCount.ROWS_USED])
-        blocks, rows = download(state.memory.read("blocks", count), self._memory.read("rows", count))
-        listed = blocks.reshape(-1).view(np.dtype(FusedBlock))
-        states = rows.reshape(-1).view(np.dtype(FieldRow))
-        there = (listed["present"] != 0) & (states["computed"] != 0)
-        return listed["at"][there], np.nonzero(there)[0], states[there]
+    def to_native(self, tsdf: TsdfMap) -> DistanceField:
+        """The same field in the compiled core; waits.
+
+        Args:
+            tsdf: what `to_native` of the field's map gave, after the field was brought up to date with it.
+        """
+        field = DistanceField(tsdf, self.settings)
+        put_field(held_field(self.tsdf.state, self._memory), field)
+        return field

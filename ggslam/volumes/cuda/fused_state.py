@@ -37,6 +37,7 @@ class FusedState:
         images: of views, by their place in the ring.
         grown: called with the new room after the map grew.
         cleared: called after the map was emptied.
+        recent_blocks: blocks of the map some operations ago.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class FusedState:
         self.images = [ViewImages(device) for _ in range(UNDER_WAY)]
         self.grown: list[Callable[[Room], None]] = []
         self.cleared: list[Callable[[], None]] = []
+        self.recent_blocks = 0
         self._begun = np.zeros(FUSED_COUNTS, np.int32)
 
     def begin_with(self, counts: np.ndarray) -> None:
@@ -62,7 +64,7 @@ class FusedState:
             return
         if counts[FusedCount.STOPPED_AT]:
             counts = self.settled()
-        room = self.memory.room
+        room, self.recent_blocks = self.memory.room, int(counts[FusedCount.PRESENT_BLOCKS])
         used = {
             "rows": counts[FusedCount.ROWS_USED], "updates": counts[FusedCount.UPDATE_COUNT],
             "slots": counts[FusedCount.SLOTS_USED], "sites": counts[FusedCount.SITE_SLOTS_USED],
@@ -95,7 +97,7 @@ class FusedState:
         """Empties the map."""
         self.memory.clear()
         self.ring.forget()
-        self._begun = np.zeros(FUSED_COUNTS, np.int32)
+        self._begun, self.recent_blocks = np.zeros(FUSED_COUNTS, np.int32), 0
         for call in self.cleared:
             call()
 

@@ -58,7 +58,8 @@ class MapMemory:
 
     def grow(self, room: Room) -> None:
         """Moves the map to larger memory; what was started before still reads the old one."""
-        kept = {} if room.slots != self.room.slots else {k: self._arrays[k] for k in ("voxels", "points") if k in self._arrays}
+        same = ("voxels", "points") if room.slots == self.room.slots else ()
+        kept = {name: self._arrays[name] for name in same if name in self._arrays}
         before, now = self.structure(), self._allocate(room, kept)
         self._call("fused_move", before, self._structure(now, room))
         self._arrays, self.room = now, room

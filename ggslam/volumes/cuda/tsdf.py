@@ -84,6 +84,11 @@ class CudaTsdf:
         return int(self.state.settled()[FusedCount.DENSE_BLOCKS])
 
     @property
+    def recent_blocks(self) -> int:
+        """Number of blocks some views ago, for which nobody waits."""
+        return self.state.recent_blocks
+
+    @property
     def memory_bytes(self) -> int:
         """Memory of the map on the device."""
         return self.state.memory.bytes
