@@ -39,7 +39,8 @@ def assert_same(one: RenderedSurface, two: RenderedSurface) -> None:
 def test_exact_scenes_are_seen_where_they_are(cuda_library: CudaLibrary) -> None:
     tsdf = TsdfMap(TsdfSettings(voxel=VOXEL))
     ball = sphere((0.013, -0.021, 0.004), 0.3)
-    write_scene(tsdf, union(ball, box_room((-1.1, -1.03, -1.01), (1.07, 1.02, 1.04))), block_range((-1.3,) * 3, (1.3,) * 3, VOXEL))
+    room = box_room((-1.1, -1.03, -1.01), (1.07, 1.02, 1.04))
+    write_scene(tsdf, union(ball, room), block_range((-1.3,) * 3, (1.3,) * 3, VOXEL))
     on_device = CudaTsdf.of_native(tsdf, library=cuda_library)
     cast = CudaRaycast(on_device)
     found = cast.read(cast.render(CAMERA, POSE))

@@ -26,8 +26,6 @@ from ggslam.volumes.volume_settings import VolumeSettings
 
 FIELD = FieldSettings(max_distance=0.5)
 COARSE = TsdfSettings(voxel=0.1)
-PER_FRAME = 3
-"""Operations of torch for a frame and its update: copies of the images, and twice of what the device says of itself."""
 
 
 class Allocations(TorchDispatchMode):
@@ -68,7 +66,7 @@ def test_frames_are_fused_without_a_wait_and_without_memory() -> None:
         assert len(watch.uploads) == frames and not any(upload.blocking for upload in watch.uploads)
         assert [call.operation for call in watch.calls] == frames * ["fuse", "field_update"]
         assert {download.bytes for download in watch.downloads} == {256} and len(watch.downloads) == 2 * frames
-        assert len(allocations.done()) == PER_FRAME * frames
+        assert set(allocations.done()) == {"copy_"}  # those recorded above; the watch's own, when they arrive
         found = tsdf.to_native()
     same = TsdfMap(COARSE)
     for view in seen:

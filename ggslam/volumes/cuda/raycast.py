@@ -48,8 +48,8 @@ class CudaRaycast:
         self, camera: Camera, T_world_camera: np.ndarray, near: float = 0.1, far: float = 10.0,
         min_weight: float | None = None,
     ) -> DeviceSurface:  # fmt: skip
-        """Starts to cast a ray through every pixel centre; arguments and errors as of `render_depth`. The host waits for
-        nothing."""
+        """Starts to cast a ray through every pixel centre; arguments and errors as of `render_depth`. The host waits
+        for nothing."""
         pose = check_view(T_world_camera, near, far)
         tsdf, c = self._tsdf, camera
         pose = pose if tsdf.origin is None else moved_pose(pose, -tsdf.origin)

@@ -129,7 +129,7 @@ __device__ inline void look_closer(const FuseJob& job, const TilePyramid& pyrami
 }
 
 // Looks at all cubes of a level, whose side is `side` blocks.
-__global__ void __launch_bounds__(kListThreads)
+__global__ void __launch_bounds__(kListThreads, 1)
 search_kernel(FuseJob job, TilePyramid pyramid, BlockCamera camera, SearchCells cells, int level, int side) {
   if (is_stopped(job.map)) return;
   const std::int64_t all = static_cast<std::int64_t>(cells.count[0]) * cells.count[1] * cells.count[2];

@@ -120,7 +120,7 @@ __device__ inline void seek(const FieldJob& job, const FieldRow& r, const std::i
 }
 
 // New distances of the listed blocks, a block of threads for each, a thread for each voxel, in the order of sites.
-__global__ void __launch_bounds__(kVoxels) distances_kernel(FieldJob job, float slack) {
+__global__ void __launch_bounds__(kVoxels, 1) distances_kernel(FieldJob job, float slack) {
   GGSLAM_SHARED NearSlots near;
   if (is_stopped(job.map)) return;
   const int voxel = voxel_of_number(threadIdx.x);
