@@ -33,7 +33,7 @@ class DeviceFusion:
     def __init__(self, device: str, settings: VolumeSettings, onto: TsdfMap | None, esdf: bool) -> None:
         if onto is not None or settings.decay_every:
             raise ConfigError("`device`: on a device a TSDF neither decays nor is one gone on with")
-        self._device, self._esdf = _checked(device), esdf
+        self._device, self._esdf = _find_device(device), esdf
         self._field: CudaField | None = None
         self._tsdf = self._begin(settings)
 
@@ -82,7 +82,7 @@ class DeviceFusion:
         return tsdf, DistanceField(tsdf, self._settings.esdf) if self._esdf else None
 
 
-def _checked(device: str) -> torch.device:
+def _find_device(device: str) -> torch.device:
     try:
         torch.zeros(1, device=device).cpu()
         return torch.device(device)

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from cuda_emulation import emulated_library
 from distance_scenes import Scene, block_range, box_room, plane, rotation, sphere, union, voxel_centres, write_scene
 from test_cuda_tsdf import BALL, ROOM, SETTINGS, TINY, views
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.volumes.cuda.field import CudaField
+from ggslam.volumes.cuda.raycast import CudaRaycast
 from ggslam.volumes.cuda.tsdf import CudaTsdf
 from ggslam.volumes.esdf import DistanceField, FieldSettings
 from ggslam.volumes.settings import TsdfSettings
@@ -138,3 +140,30 @@ def test_exact_rooms_have_exact_distances(cuda_library: CudaLibrary) -> None:
     held = ~np.isnan(found) & (truth > 0.1) & (truth < 0.6) & (np.abs(found) < 0.79)
     error = np.abs(found - truth)[held] / SETTINGS.voxel
     assert held.sum() > 1000 and np.median(error) < 0.3
+
+
+def test_the_order_of_threads_and_blocks_does_not_matter() -> None:
+    """Bit for bit: voxels, distances and rays; rows of blocks are by chance."""
+    library, seen = emulated_library(), views(3, 30, 22)
+
+    def run(order: int) -> list[np.ndarray]:
+        library.functions.ggslam_emulation_order(order)
+        try:
+            tsdf = CudaTsdf(COARSE, library=library)
+            field, cast = CudaField(tsdf, FieldSettings(max_distance=0.5)), CudaRaycast(tsdf)
+            for view in seen:
+                tsdf.integrate(*view)
+                field.update()
+            images = cast.read(cast.render(seen[1][1], seen[1][2]))
+            native = tsdf.to_native()
+            blocks = native.blocks().coordinates
+            blocks = blocks[np.lexsort(blocks.T)]
+            voxels = native.read(blocks)
+            return [blocks, *vars(voxels).values(), field.read(blocks), *vars(images).values()]
+        finally:
+            library.functions.ggslam_emulation_order(0)
+
+    plain = run(0)
+    for order in (1, 2):
+        for one, two in zip(plain, run(order), strict=True):
+            assert np.array_equal(one, two, equal_nan=one.dtype.kind == "f")

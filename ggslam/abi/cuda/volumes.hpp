@@ -144,6 +144,8 @@ struct FieldNode {
   float radius, half;  // half the thickness
   float within[3];     // the middle of one of the sites
   std::int32_t count;  // of sites; 0: none
+  std::int32_t at[3];  // of the block
+  std::int32_t unused;
 };
 
 // The surface in a block: a disc for each of its voxels that has one. Voxels are in parts of 4^3: number 64 p + x + 4 y +

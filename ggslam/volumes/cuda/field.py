@@ -75,7 +75,7 @@ class CudaField:
 
     def stats(self) -> CudaFieldStats:
         """What the last operation did, which has to have been an update; waits for it."""
-        counts = self.tsdf.state.settled()
+        counts = self.tsdf.state.settle()
         names = (
             FusedCount.CHANGED_ROWS, FusedCount.CHANGED_SITES, FusedCount.CONCERNED_ROWS, FusedCount.COMPUTED_VOXELS
         )  # fmt: skip

@@ -58,7 +58,7 @@ def held_field(state: FusedState, memory: FieldMemory) -> HeldField:
         state: of the map.
         memory: of the field.
     """
-    counts = state.settled()
+    counts = state.settle()
     rows, slots = int(counts[FusedCount.ROWS_USED]), int(counts[FusedCount.SITE_SLOTS_USED])
     found = download(
         state.memory.read("blocks", rows), memory.read("rows", rows), memory.read("distances", rows),

@@ -63,7 +63,7 @@ class FusedState:
         if counts is None:
             return
         if counts[FusedCount.STOPPED_AT]:
-            counts = self.settled()
+            counts = self.settle()
         room, self.recent_blocks = self.memory.room, int(counts[FusedCount.PRESENT_BLOCKS])
         used = {
             "rows": counts[FusedCount.ROWS_USED], "updates": counts[FusedCount.UPDATE_COUNT],
@@ -74,7 +74,7 @@ class FusedState:
         if full:
             self._grow(room.with_room_for(**full))
 
-    def settled(self) -> np.ndarray:
+    def settle(self) -> np.ndarray:
         """Counts int32 [FUSED_COUNTS] when all that was started is done, for which the host waits.
 
         Raises:
@@ -86,7 +86,7 @@ class FusedState:
             if hasattr(operation, "is_too_large") and operation.is_too_large(counts):
                 refused.append(operation)
             else:
-                self._grow(self.memory.room.with_room_for(**_needed(counts)))
+                self._grow(self.memory.room.with_room_for(**_room_for_all(counts)))
             self.ring.start_again(counts.copy())
             counts = self.ring.newest()
         for operation in refused:
@@ -108,7 +108,7 @@ class FusedState:
                 call(room)
 
 
-def _needed(counts: np.ndarray) -> dict[str, int]:
+def _room_for_all(counts: np.ndarray) -> dict[str, int]:
     names = {
         "rows": FusedCount.ROWS_NEEDED, "slots": FusedCount.SLOTS_NEEDED, "listed": FusedCount.LIST_NEEDED,
         "updates": FusedCount.UPDATES_NEEDED, "sites": FusedCount.SITE_SLOTS_NEEDED,

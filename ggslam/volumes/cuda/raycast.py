@@ -69,7 +69,7 @@ class CudaRaycast:
 
     def read(self, images: DeviceSurface) -> RenderedSurface:
         """The images on the host; waits for the map and them."""
-        self._tsdf.state.settled()
+        self._tsdf.state.settle()
         depth, normals, colors, labels = download(images.depth, images.normals, images.colors, images.labels)
         return RenderedSurface(depth, normals, colors, labels.view(np.uint16)[..., 0])
 

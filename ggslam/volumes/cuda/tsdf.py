@@ -76,12 +76,12 @@ class CudaTsdf:
 
     def __len__(self) -> int:
         """Number of blocks; waits for the views so far."""
-        return int(self.state.settled()[FusedCount.PRESENT_BLOCKS])
+        return int(self.state.settle()[FusedCount.PRESENT_BLOCKS])
 
     @property
     def dense_blocks(self) -> int:
         """Blocks with voxels; waits for the views so far."""
-        return int(self.state.settled()[FusedCount.DENSE_BLOCKS])
+        return int(self.state.settle()[FusedCount.DENSE_BLOCKS])
 
     @property
     def recent_blocks(self) -> int:
@@ -123,6 +123,6 @@ class CudaTsdf:
 
     def to_native(self, context: NativeContext | None = None) -> TsdfMap:
         """The same map in the compiled core, for meshes and files; waits for the views so far."""
-        counts = self.state.settled()
+        counts = self.state.settle()
         rows, slots = int(counts[FusedCount.ROWS_USED]), int(counts[FusedCount.SLOTS_USED])
         return map_on_host(self.state.memory, rows, slots, self.settings, self.origin, context)

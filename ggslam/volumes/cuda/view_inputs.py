@@ -31,7 +31,7 @@ class ViewImages:
 
     def __init__(self, device: torch.device) -> None:
         self._upload, self._memory = Upload(device), GrowingMemory(device)
-        self.depth = np.empty((0, 0), np.float32)
+        self.depth: np.ndarray = np.empty((0, 0), np.float32)
         """The depth that was sent last, metres [H, W]; of memory that is used again."""
 
     def send(self, view: FusionView) -> SentImages:

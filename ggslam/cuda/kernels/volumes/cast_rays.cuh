@@ -117,7 +117,7 @@ __device__ inline void describe_hit(const CastJob& job, const Ray& ray, const Ra
 }
 
 // A thread for each pixel, a block of threads for 16 x 16 of them.
-__global__ void __launch_bounds__(kRayThreads) cast_kernel(CastJob job, int tiles_wide) {
+__global__ void __launch_bounds__(kRayThreads, 1) cast_kernel(CastJob job, int tiles_wide) {
   if (is_stopped(job.map)) return;
   const int x = static_cast<int>(blockIdx.x) % tiles_wide * kRayTile + static_cast<int>(threadIdx.x) % kRayTile;
   const int y = static_cast<int>(blockIdx.x) / tiles_wide * kRayTile + static_cast<int>(threadIdx.x) / kRayTile;

@@ -56,6 +56,11 @@ __device__ inline std::uint64_t order_of(int q, const std::int32_t (&shift)[3]) 
   return part((voxel >> 6) + shift[2]) << 32 | part((voxel >> 3 & 7) + shift[1]) << 16 | part((voxel & 7) + shift[0]);
 }
 
+// Voxels from the block at work to that of a node.
+__device__ inline void shift_of(const FieldNode& node, const std::int32_t* at, std::int32_t (&shift)[3]) {
+  for (int a = 0; a < 3; ++a) shift[a] = kSide * (node.at[a] - at[a]);
+}
+
 // Voxels from the block at work to that of a slot.
 __device__ inline void shift_of(const FieldJob& job, std::int32_t slot, const std::int32_t* at, std::int32_t (&shift)[3]) {
   const std::int32_t* there = job.map.blocks[job.field.sites[slot].row].at;

@@ -56,9 +56,10 @@ __device__ inline int mean_disc(const FieldSites& s, const std::uint64_t* which,
 }
 
 // A node of the sites first ... end - 1 that `which` has bits of, by a warp.
-__device__ inline void make_node(const FieldSites& s, const std::uint64_t* which, int first, int end, float slack,
-                                 FieldNode& out) {
+__device__ inline void make_node(const FieldSites& s, const std::int32_t* at, const std::uint64_t* which, int first,
+                                 int end, float slack, FieldNode& out) {
   FieldNode node{};
+  for (int a = 0; a < 3; ++a) node.at[a] = at[a];
   node.count = mean_disc(s, which, first, end, node);
   const int lane = threadIdx.x % kWarp;
   if (node.count == 0) {
@@ -92,13 +93,13 @@ __device__ inline void make_node(const FieldSites& s, const std::uint64_t* which
 }
 
 // The nodes of all sites of a slot and of those that came, by a block of threads.
-__device__ inline void make_nodes(const FieldArrays& field, std::int32_t slot, float slack) {
+__device__ inline void make_nodes(const FieldArrays& field, std::int32_t slot, const std::int32_t* at, float slack) {
   const FieldSites& s = field.sites[slot];
   for (int task = threadIdx.x / kWarp; task < 2 * (1 + kParts); task += kVoxels / kWarp) {
     const int part = task % (1 + kParts);
     const int first = part == 0 ? 0 : (part - 1) * kInPart, end = part == 0 ? kVoxels : first + kInPart;
     FieldNode* const nodes = task > kParts ? field.arrivals : field.nodes;
-    make_node(s, task > kParts ? s.came : s.held, first, end, slack,
+    make_node(s, at, task > kParts ? s.came : s.held, first, end, slack,
               nodes[static_cast<std::int64_t>(part) * field.site_room + slot]);
   }
 }

@@ -37,10 +37,9 @@ struct SlotList {
 };
 
 // What separates the middle of the block at work from a node's sites at least, and from one of them.
-__device__ inline float gap_to_node(const FieldJob& job, const FieldNode& node, std::int32_t slot, const std::int32_t* at,
-                                    float& there) {
+__device__ inline float gap_to_node(const FieldNode& node, const std::int32_t* at, float& there) {
   std::int32_t shift[3];
-  shift_of(job, slot, at, shift);
+  shift_of(node, at, shift);
   float from[3];
   there = 0;
   for (int a = 0; a < 3; ++a) {
@@ -53,15 +52,14 @@ __device__ inline float gap_to_node(const FieldJob& job, const FieldNode& node, 
 
 // Finds the slots that may matter, if no voxel of the block at `at` is farther from its site than `most`; the nearest is
 // returned, -1 if there are none. If they are too many, near.count is -1.
-__device__ inline std::int32_t find_near(const FieldJob& job, const SlotList& list, const std::int32_t* at, float most,
-                                         NearSlots& near) {
+__device__ inline std::int32_t find_near(const SlotList& list, const std::int32_t* at, float most, NearSlots& near) {
   std::uint64_t best = ~std::uint64_t{0}, first = ~std::uint64_t{0};
   for (std::int32_t i = threadIdx.x; i < list.count; i += kVoxels) {
     const std::int32_t slot = list.at(i);
     const FieldNode node = list.nodes[slot];
     if (node.count == 0) continue;
     float there;
-    const float least = gap_to_node(job, node, slot, at, there);
+    const float least = gap_to_node(node, at, there);
     const std::uint64_t a = ordered(there, 0), b = ordered(least, static_cast<std::uint32_t>(slot));
     best = a < best ? a : best, first = b < first ? b : first;
   }
@@ -77,7 +75,7 @@ __device__ inline std::int32_t find_near(const FieldJob& job, const SlotList& li
     const FieldNode node = list.nodes[slot];
     if (node.count == 0) continue;
     float there;
-    if (!(gap_to_node(job, node, slot, at, there) <= limit)) continue;
+    if (!(gap_to_node(node, at, there) <= limit)) continue;
     const std::int32_t n = atomicAdd(&near.count, 1);
     if (n < kMostNear) near.slot[n] = slot;
   }
@@ -177,7 +175,7 @@ __device__ inline void offer_near(Search& search, Seeker& seeker, const SlotList
     if (matters) {
       const FieldNode node = search.nodes[slot];
       std::int32_t shift[3];
-      shift_of(search.job, slot, search.at, shift);
+      shift_of(node, search.at, shift);
       matters = node.count > 0 && may_matter(search, node.middle, node.normal, node.radius, node.half, shift);
     }
     for (unsigned left = __ballot_sync(kAllLanes, matters); left != 0; left &= left - 1)

@@ -129,7 +129,7 @@ __global__ void __launch_bounds__(kVoxels) sites_kernel(FieldJob job, float slac
     FieldSites& sites = job.field.sites[shared_slot];
     take_sites(job, sites, q, has, lost, is_new, now);
     __syncthreads();
-    make_nodes(job.field, shared_slot, slack);
+    make_nodes(job.field, shared_slot, job.map.blocks[row].at, slack);
   }
 }
 

@@ -22,10 +22,9 @@ __device__ inline bool differs(const FieldJob& job, std::int32_t row) {
   for (int v = t; v < kVoxels; v += kSelectThreads)
     if (is_gone(job.field, job.field.distances[row].owner[v])) return true;
   for (std::int32_t i = t; i < job.map.counts[kArrivedSlots]; i += kSelectThreads) {
-    const std::int32_t slot = job.field.arrived[i];
-    const FieldNode node = job.field.arrivals[slot];
+    const FieldNode node = job.field.arrivals[job.field.arrived[i]];
     float there;
-    if (node.count > 0 && gap_to_node(job, node, slot, job.map.blocks[row].at, there) <= r.farthest + kBlockReach + 0.01f)
+    if (node.count > 0 && gap_to_node(node, job.map.blocks[row].at, there) <= r.farthest + kBlockReach + 0.01f)
       return true;
   }
   return false;
@@ -107,13 +106,13 @@ __device__ inline void seek(const FieldJob& job, const FieldRow& r, const std::i
   const std::int32_t arrived = job.map.counts[kArrivedSlots];
   if (job.anew == 0 && r.computed != 0 && arrived > 0) {
     const SlotList list{job.field.arrived, arrived, job.field.arrivals};
-    const std::int32_t first = find_near(job, list, at, r.farthest, near);
+    const std::int32_t first = find_near(list, at, r.farthest, near);
     if (first >= 0 && __ballot_sync(kAllLanes, search.asks) != 0) offer_near(search, s, list, near, first);
     __syncthreads();
   }
   if (__syncthreads_count(task.search) == 0) return;
   const SlotList all{nullptr, job.map.counts[kSiteSlotsUsed], job.field.nodes};
-  const std::int32_t first = find_near(job, all, at, job.max_distance, near);
+  const std::int32_t first = find_near(all, at, job.max_distance, near);
   search.nodes = job.field.nodes, search.of_arrivals = false, search.asks = task.search;
   if (first >= 0 && __ballot_sync(kAllLanes, search.asks) != 0) offer_near(search, s, all, near, first);
   __syncthreads();
