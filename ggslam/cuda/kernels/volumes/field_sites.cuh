@@ -103,7 +103,7 @@ __device__ inline void write_known(FieldRow& r, std::uint8_t* flags, int voxel, 
 }
 
 // A block of threads for each listed block of the map, a thread for each voxel, in the order of the sites.
-__global__ void __launch_bounds__(kVoxels) sites_kernel(FieldJob job, float slack) {
+__global__ void __launch_bounds__(kVoxels, 1) sites_kernel(FieldJob job, float slack) {
   GGSLAM_SHARED HaloValues values;
   GGSLAM_SHARED std::uint8_t flags[kVoxels];
   GGSLAM_SHARED std::int32_t shared_slot;
