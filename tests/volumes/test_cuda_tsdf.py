@@ -10,7 +10,9 @@ import pytest
 from analytic_scenes import Box, Sphere, Union, looking_at, render_depth, small_camera
 
 from ggslam.cuda.library import CudaLibrary
+from ggslam.errors import VoxelError
 from ggslam.scene.poses import se3_exp
+from ggslam.volumes.cuda import view_operation
 from ggslam.volumes.cuda.room import Room
 from ggslam.volumes.cuda.tsdf import CudaTsdf
 from ggslam.volumes.settings import TsdfSettings
@@ -154,3 +156,20 @@ def test_voxels_too_small_for_the_view_are_named(cuda_library: CudaLibrary) -> N
     tsdf.integrate(depth, camera, np.eye(4))
     near = tsdf.to_native()
     assert 0 < near.dense_blocks < 3000
+
+
+def test_views_of_too_many_blocks_are_refused_and_the_others_fused(
+    cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_operation, "MOST_UPDATES", 40)
+    depth, camera, T = views(1)[0][:3]
+    small = np.zeros_like(depth)
+    small[10:14, 10:14] = 1.0
+    tsdf, other = TsdfMap(SETTINGS), CudaTsdf(SETTINGS, library=cuda_library, room=TINY)
+    for image in (small, np.nan_to_num(depth, posinf=0), small):
+        other.integrate(image, camera, T)
+    with pytest.raises(VoxelError, match="too many blocks"):
+        len(other)
+    for _ in range(2):
+        tsdf.integrate(small, camera, T)
+    assert_same(tsdf, other.to_native())

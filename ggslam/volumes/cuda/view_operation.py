@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ggslam.abi.cuda import FusedCount
+from ggslam.errors import VoxelError
 from ggslam.volumes.cuda.view_inputs import SentImages
 from ggslam.volumes.fusion_view import FusionView
 from ggslam.volumes.tsdf import TsdfMap
@@ -58,7 +59,9 @@ class ViewOperation:
         return True
 
     def check(self) -> None:
-        """Raises what the compiled core raises of a view that was refused: a VoxelError that names voxels that work."""
+        """Raises a VoxelError if the view was refused: the compiled core's, which names voxels that work, if it refuses
+        the view, too."""
         if self._refused:
-            T = np.linalg.inv(self._view.T_camera_world)
-            TsdfMap(self._state.settings, points=False).integrate(self._depth, self._view.camera, T)
+            T, settings = np.linalg.inv(self._view.T_camera_world), self._state.settings
+            TsdfMap(settings, points=False).integrate(self._depth, self._view.camera, T)
+            raise VoxelError(f"view: it shows too many blocks for voxels of {settings.voxel:g} m on a device")
