@@ -94,8 +94,10 @@ __device__ inline void sum_valid(std::int32_t* valid, int wide, int high) {
     }
   }
   __syncthreads();
-  for (int x = 1 + threadIdx.x; x <= wide; x += kTotalThreads)
-    for (int y = 2; y <= high; ++y) valid[y * stride + x] += valid[(y - 1) * stride + x];
+  for (int x = 1 + threadIdx.x; x <= wide; x += kTotalThreads) {
+    std::int32_t sum = 0;
+    for (int y = 1; y <= high; ++y) valid[y * stride + x] = sum += valid[y * stride + x];
+  }
 }
 
 // The larger tiles, and the sums of pixels with depth. One block.
