@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Rays walk from block to block, and in blocks with surface from cell to cell: native/src/volumes/kernels/raycast.cpp.
 #pragma once
+#include "volumes/ray_cells.cuh"
 #include "volumes/surface_cells.cuh"
-#include "native/formulas/ray_cells.hpp"
 
 namespace ggslam::cuda {
 

@@ -1,13 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// A ray through the cells between voxels of a TSDF: the field in a cell is interpolated trilinearly and followed exactly.
+// A ray through the cells between voxels of a TSDF: the field in a cell is interpolated trilinearly and followed exactly, as
+// native/src/volumes/kernels/raycast.cpp does it (which is a sixth slower on a CPU with these functions than with its own).
 // Positions in voxels; voxel centres are at whole numbers.
 #pragma once
-#include <cmath>
-#include <cstdint>
+#include "volumes/numbers.cuh"
 
-#include "native/formulas/formulas.hpp"
-
-namespace GGSLAM_FORMULAS {
+namespace ggslam::cuda {
 
 constexpr float kCloseEnough = 8;  // of 32767, at a truncation of 4 voxels a thousandth of a voxel
 constexpr int kMostSteps = 6;
@@ -18,13 +16,13 @@ struct Ray {
   int step[3];
 };
 
-GGSLAM_FORMULA void place_on(const Ray& ray, float depth, float out[3]) {
+__device__ inline void place_on(const Ray& ray, float depth, float out[3]) {
   for (int a = 0; a < 3; ++a) out[a] = ray.origin[a] + depth * ray.direction[a];
 }
 
 // The ray through the centre of pixel (u, v); View: a camera with rotation (world from camera) and position, metres.
 template <class View>
-GGSLAM_FORMULA Ray ray_through(const View& view, int u, int v, float voxel) {
+__device__ inline Ray ray_through(const View& view, int u, int v, float voxel) {
   const float local[3] = {(u - view.cx) / view.fx, (v - view.cy) / view.fy, 1};
   Ray ray;
   for (int a = 0; a < 3; ++a) {
@@ -44,13 +42,13 @@ struct CellField {
   float origin[3];
 };
 
-GGSLAM_FORMULA void inside_cell(const CellField& f, const Ray& ray, float depth, float share[3]) {
+__device__ inline void inside_cell(const CellField& f, const Ray& ray, float depth, float share[3]) {
   place_on(ray, depth, share);
   for (int a = 0; a < 3; ++a) share[a] = smaller_of(larger_of(share[a] - f.origin[a], 0.0f), 1.0f);
 }
 
 // Mixes with shares that are not negative: where all corners are positive, so is the field.
-GGSLAM_FORMULA float field_at(const CellField& f, const Ray& ray, float depth) {
+__device__ inline float field_at(const CellField& f, const Ray& ray, float depth) {
   float s[3], x[4];
   inside_cell(f, ray, depth, s);
   for (int c = 0; c < 4; ++c) x[c] = (1 - s[0]) * f.value[2 * c] + s[0] * f.value[2 * c + 1];
@@ -59,7 +57,7 @@ GGSLAM_FORMULA float field_at(const CellField& f, const Ray& ray, float depth) {
 }
 
 // Depth of the surface between two, the field being negative at the second only.
-GGSLAM_FORMULA float crossing_between(const CellField& f, const Ray& ray, float a, float at_a, float b, float at_b) {
+__device__ inline float crossing_between(const CellField& f, const Ray& ray, float a, float at_a, float b, float at_b) {
   float middle = a + (b - a) * at_a / (at_a - at_b);
   for (int i = 0; i < kMostSteps; ++i) {
     const float value = field_at(f, ray, middle);
@@ -73,7 +71,7 @@ GGSLAM_FORMULA float crossing_between(const CellField& f, const Ray& ray, float 
   return middle;
 }
 
-GGSLAM_FORMULA void cell_gradient(const CellField& f, const float s[3], float out[3]) {
+__device__ inline void cell_gradient(const CellField& f, const float s[3], float out[3]) {
   for (int a = 0; a < 3; ++a) {
     const int b = (a + 1) % 3, c = (a + 2) % 3;
     out[a] = 0;
@@ -86,20 +84,20 @@ GGSLAM_FORMULA void cell_gradient(const CellField& f, const float s[3], float ou
 }
 
 // Depth at which a ray leaves a cell of `size` voxels along an axis.
-GGSLAM_FORMULA float cell_boundary(const Ray& ray, int axis, int start, int size) {
+__device__ inline float cell_boundary(const Ray& ray, int axis, int start, int size) {
   const int end = start + (ray.step[axis] > 0 ? size : 0);
   return (static_cast<float>(end) - ray.origin[axis]) * ray.inverse[axis];
 }
 
 // A grid that a ray walks through: where it stands, and the depths at which it crosses the next planes of the grid.
-// Plain numbers, not arrays, so that the compiler keeps them in registers.
+// Plain numbers, not arrays, so that they stay in registers.
 struct RaySteps {
   float next_x, next_y, next_z, stride_x, stride_y, stride_z;
   int x, y, z, step_x, step_y, step_z;
 };
 
 // From the cell of the grid at `start` (lowest corner, in voxels; cells of `size` voxels).
-GGSLAM_FORMULA RaySteps steps_from(const Ray& ray, const int start[3], int size) {
+__device__ inline RaySteps steps_from(const Ray& ray, const int start[3], int size) {
   return {cell_boundary(ray, 0, start[0], size), cell_boundary(ray, 1, start[1], size),
           cell_boundary(ray, 2, start[2], size), size * std::fabs(ray.inverse[0]), size * std::fabs(ray.inverse[1]),
           size * std::fabs(ray.inverse[2]), start[0], start[1], start[2], size * ray.step[0], size * ray.step[1],
@@ -108,7 +106,7 @@ GGSLAM_FORMULA RaySteps steps_from(const Ray& ray, const int start[3], int size)
 
 // Crosses the nearest plane (all of them, where they meet); returns the depth. Without branches: which axis is next
 // cannot be foretold.
-GGSLAM_FORMULA float advance_ray(RaySteps& s) {
+__device__ inline float advance_ray(RaySteps& s) {
   const float depth = smaller_of(s.next_x, smaller_of(s.next_y, s.next_z));
   const int on_x = -(s.next_x <= depth), on_y = -(s.next_y <= depth), on_z = -(s.next_z <= depth);
   s.x += s.step_x & on_x, s.y += s.step_y & on_y, s.z += s.step_z & on_z;
@@ -127,7 +125,7 @@ struct RayKnowledge {
 // Whether a ray meets the surface from its free side in a cell with surface, between two depths; sets `hit`. A ray from a
 // cell without surface enters at a face whose corners are all outside, so that less than 0 can only be the rounding of a
 // 0; or it comes from the unknown.
-GGSLAM_FORMULA bool meets_surface(const CellField& f, const Ray& ray, float depth, float leaves, RayKnowledge& k,
+__device__ inline bool meets_surface(const CellField& f, const Ray& ray, float depth, float leaves, RayKnowledge& k,
                                   float& hit) {
   const float entry = k.known ? k.last : field_at(f, ray, depth), after = field_at(f, ray, leaves);
   const float before = !k.known && entry > -kCloseEnough ? larger_of(entry, 0.0f) : entry;
@@ -139,4 +137,4 @@ GGSLAM_FORMULA bool meets_surface(const CellField& f, const Ray& ray, float dept
   return false;
 }
 
-}  // namespace GGSLAM_FORMULAS
+}  // namespace ggslam::cuda
