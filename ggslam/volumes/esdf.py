@@ -132,6 +132,12 @@ class DistanceField:
         if getattr(self, "_handle", None) is not None:
             self._library.ggslam_esdf_destroy(self._handle)
 
+    @property
+    def handle(self) -> int:
+        """Pointer for the core."""
+        assert self._handle is not None
+        return self._handle
+
     def __len__(self) -> int:
         """Number of blocks."""
         return int(self._library.ggslam_esdf_size(self._handle))

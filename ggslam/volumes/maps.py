@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from ggslam.errors import ConfigError, InputError
+from ggslam.errors import InputError
 from ggslam.scene.frame import Frame
 from ggslam.system.tuning import Tuning
 from ggslam.volumes.cell_export import save_cells
@@ -25,6 +24,7 @@ from ggslam.volumes.cell_field import AnyField, CellField
 from ggslam.volumes.cell_mesh import mesh_cells
 from ggslam.volumes.cell_pager import CellPager
 from ggslam.volumes.cell_rebuild import StoredView
+from ggslam.volumes.device_fusion import DeviceFusion
 from ggslam.volumes.esdf import DistanceField
 from ggslam.volumes.held_distances import HeldDistanceTuning, HeldValues, held_values
 from ggslam.volumes.mesh import Mesh, extract_mesh
@@ -33,7 +33,6 @@ from ggslam.volumes.occupancy import OccupancyMap
 from ggslam.volumes.posed_view import PosedScan, PosedView
 from ggslam.volumes.tsdf import TsdfMap
 from ggslam.volumes.tsdf_file import save_tsdf
-from ggslam.volumes.tsdf_torch import TorchTsdf
 from ggslam.volumes.volume_settings import VolumeSettings
 
 
@@ -108,7 +107,8 @@ class VolumeMaps:
         esdf: whether a distance field is wanted.
         occupancy: edge of the occupancy map's voxels in metres; None: no occupancy map.
         onto: a TSDF to go on in; None: an empty one.
-        device: of torch, on which the TSDF is fused; the other maps follow at the end. None: the compiled core does.
+        device: of torch, on which the TSDF is fused, on CUDA devices with the distance field; the other maps follow at
+            the end. None: the compiled core does.
 
     Raises:
         ConfigError: no such device, or something is wanted that is not done on one.
@@ -123,7 +123,7 @@ class VolumeMaps:
         """What goes to disk; to be set before the first frame, for an empty TSDF of the core."""
         self.pager: CellPager | None = None
         self._goes_on = onto is not None
-        self._on_device = None if device is None else _fusion_on(device, settings, onto, points=esdf)
+        self._on_device = None if device is None else DeviceFusion(device, settings, onto, esdf)
         self.tsdf = TsdfMap(settings.tsdf, points=esdf) if onto is None else onto
         self.context = self.tsdf.context
         self.field = DistanceField(self.tsdf, settings.esdf) if esdf else None
@@ -147,7 +147,7 @@ class VolumeMaps:
             return
         self.settings = replace(self.settings, tsdf=tsdf)
         if self._on_device is not None:
-            self._on_device = TorchTsdf(tsdf, self._on_device.device, self._on_device.points)
+            self._on_device.begin(self.settings)
         self.tsdf = TsdfMap(tsdf, self.context, points=self.tsdf.points)
         self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
 
@@ -198,7 +198,7 @@ class VolumeMaps:
         return len(self.tsdf) + of_disk[0], self.tsdf.dense_blocks + of_disk[1]
 
     @property
-    def _receiver(self) -> TsdfMap | TorchTsdf:
+    def _receiver(self) -> TsdfMap | DeviceFusion:
         return self.tsdf if self._on_device is None else self._on_device
 
     def _occupancy(self, resolution: float) -> OccupancyMap:
@@ -241,11 +241,8 @@ class VolumeMaps:
                 self.pager.decay()
         row["tsdf"] = time.perf_counter() - start - row.get("cells", 0.0)
         every = self.settings.esdf_every
-        if self.field is not None and every and self._on_device is None and number % every == every - 1:
-            start = time.perf_counter()
-            here = images[0].T_world_camera[:3, 3] if images else None
-            self.field.update(self.settings.left_for_field_ms(1e3 * row["tsdf"]), here)
-            row["esdf"] = time.perf_counter() - start
+        if self.field is not None and every and number % every == every - 1:
+            self._update_field(images, row)
         if self.occupancy is not None:
             start = time.perf_counter()
             for view in views:
@@ -258,6 +255,17 @@ class VolumeMaps:
         self.times.blocks.append(len(self._receiver))
         self.times.rows.append(row)
         self.points += sum(view.point_count for view in views)
+
+    def _update_field(self, images: Sequence[PosedView], row: dict[str, float]) -> None:
+        """Brings the distance field up to date with what was fused, near the first image first."""
+        assert self.field is not None
+        start = time.perf_counter()
+        if self._on_device is not None:
+            self._on_device.update_field()
+            return
+        here = images[0].T_world_camera[:3, 3] if images else None
+        self.field.update(self.settings.left_for_field_ms(1e3 * row["tsdf"]), here)
+        row["esdf"] = time.perf_counter() - start
 
     def _bring(self, paging: Paging, images: Sequence[PosedView]) -> float:
         """Brings what is on disk of what images may tell of; returns the seconds that took."""
@@ -283,7 +291,7 @@ class VolumeMaps:
         self.cell_field = None
         self.tsdf.clear()
         if self._on_device is not None:
-            self._on_device = TorchTsdf(self.settings.tsdf, self._on_device.device, self._on_device.points)
+            self._on_device.begin(self.settings)
         if self.occupancy is not None:
             self.occupancy = self._occupancy(self.occupancy.resolution)
         if self.pager is not None:
@@ -308,8 +316,7 @@ class VolumeMaps:
                 self.cell_field = CellField(self.pager, self.settings.esdf)
                 return
         if self._on_device is not None:
-            self.tsdf = self._on_device.to_native(self.context)
-            self.field = None if self.field is None else DistanceField(self.tsdf, self.settings.esdf)
+            self.tsdf, self.field = self._on_device.to_native(self.context)
         if self.field is not None:
             self.times.last_update = self.field.update().milliseconds / 1e3
 
@@ -329,13 +336,3 @@ class VolumeMaps:
             old = self.tsdf.read(at).label
             changed = (table[old] != old).any(1)
             self.tsdf.write(at[changed], label=table[old[changed]])
-
-
-def _fusion_on(device: str, settings: VolumeSettings, onto: TsdfMap | None, points: bool) -> TorchTsdf:
-    if onto is not None or settings.decay_every:
-        raise ConfigError("`device`: on a device a TSDF neither decays nor is one gone on with")
-    try:
-        torch.zeros(1, device=device).cpu()
-        return TorchTsdf(settings.tsdf, device, points)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise ConfigError(f"`device` {device}: {str(error).splitlines()[0]}") from None

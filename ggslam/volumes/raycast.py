@@ -34,6 +34,20 @@ class RenderedSurface:
     labels: np.ndarray
 
 
+def check_view(T_world_camera: np.ndarray, near: float, far: float) -> np.ndarray:
+    """The pose as float64 [4, 4].
+
+    Raises:
+        InputError: it is not finite, or the range of depth is none.
+    """
+    if not 0 < near < far:
+        raise InputError(f"expected 0 < near < far, found near {near} and far {far}")
+    pose = np.asarray(T_world_camera, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise InputError(f"expected a finite pose [4, 4], found {pose.tolist()}")
+    return pose
+
+
 def render_depth(
     tsdf: TsdfMap, camera: Camera, T_world_camera: np.ndarray, near: float = 0.1, far: float = 10.0,
     min_weight: float | None = None,
@@ -54,11 +68,7 @@ def render_depth(
     Raises:
         InputError: a range that is none, or a pose that is not finite.
     """
-    if not 0 < near < far:
-        raise InputError(f"expected 0 < near < far, found near {near} and far {far}")
-    pose = np.asarray(T_world_camera, np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise InputError(f"expected a finite pose [4, 4], found {pose.tolist()}")
+    pose = check_view(T_world_camera, near, far)
     shape = (camera.height, camera.width)
     images = RenderedSurface(
         np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.uint8),

@@ -203,7 +203,7 @@ class TsdfMap:
         limit = MOST_VOXELS * self.settings.voxel
         view = FusionView(depth, camera, self._relative_pose(T_world_camera), color, labels, limit)
         s, stats = self.settings, FusionStats()
-        if within is None and _has_beyond(view.depth, s.max_depth) and (unit := wrong_unit(view.depth)):
+        if within is None and has_beyond(view.depth, s.max_depth) and (unit := wrong_unit(view.depth)):
             raise InputError(unit)
         numbers = FusionSettings(
             s.min_depth, s.max_depth, s.free_share, s.edge_voxels * s.voxel, s.clearing, s.max_free_weight,
@@ -337,7 +337,7 @@ class TsdfMap:
         self._library.ggslam_tsdf_freeze(self.handle, int(frozen))
 
 
-def _has_beyond(depth: np.ndarray, max_depth: float) -> bool:
+def has_beyond(depth: np.ndarray, max_depth: float) -> bool:
     """Whether some of every eighth pixel and row lie beyond the range."""
     return bool((depth[::8, ::8] > max_depth).any())
 

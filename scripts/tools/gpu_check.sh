@@ -7,7 +7,7 @@
 #   FOLDER=...     where the log of each step goes (default: build/gpu_check)
 #   ARCHIVE=...    also puts all of that into one file .tar.gz at the end, whatever happened
 #   STEPS="..."    which steps to run, in this order whatever is said:
-#                    machine build compile tests slam realtime profile loops bench training
+#                    machine build compile tests slam realtime profile loops bench training volumes
 #   SHORT=1        less of everything, for ten minutes in all (tests: those that need the GPU); no step begins or goes
 #                  on after LIMIT seconds
 #   LIMIT=...      seconds; 0: none (default: 0, with SHORT 540)
@@ -16,6 +16,7 @@
 #   SLAM="..."     arguments of scripts/benchmarks/bench_cuda_slam.py, for the steps slam, realtime, profile and loops
 #   BENCH="..."    arguments of scripts/benchmarks/bench_cuda_render.py
 #   TRAINING="..." arguments of scripts/benchmarks/bench_cuda_training.py
+#   VOLUMES="..."  arguments of scripts/benchmarks/bench_cuda_volumes.py
 #   SANITIZE=1     runs a few tests under compute-sanitizer's memcheck, racecheck and synccheck, too (minutes)
 set -u
 cd "$(dirname "$0")/../.."
@@ -27,8 +28,8 @@ mkdir -p "$folder"
 for place in "${DATA:-}" "${GGSLAM_DATA:-}" ../shared/data shared/data build/recordings; do
   [ -z "$place" ] || [ ! -d "$place" ] || { export GGSLAM_DATA=$place && break; }
 done
-wanted=${STEPS:-machine build compile tests slam realtime profile loops bench training}
-export PICK="not slow" SLAM=${SLAM:-} BENCH=${BENCH:-} TRAINING=${TRAINING:-} LOOPS=""
+wanted=${STEPS:-machine build compile tests slam realtime profile loops bench training volumes}
+export PICK="not slow" SLAM=${SLAM:-} BENCH=${BENCH:-} TRAINING=${TRAINING:-} VOLUMES=${VOLUMES:-} LOOPS=""
 limit=${LIMIT:-0}
 if [ -n "${SHORT:-}" ]; then
   limit=${LIMIT:-540}
@@ -114,7 +115,8 @@ CODE
 
 tests() {
   "$python" -m pytest -q -p no:cacheprovider -rs -m "$PICK" -k "not (emulated or downwards or jumping)" --durations=15 --tb=short \
-    --continue-on-collection-errors tests/rendering tests/mapping tests/tracking tests/slam tests/cuda
+    --continue-on-collection-errors tests/rendering tests/mapping tests/tracking tests/slam tests/cuda \
+    tests/volumes/test_cuda_*.py
 }
 
 sanitize() {
@@ -161,9 +163,14 @@ training() {
   "$python" scripts/benchmarks/bench_cuda_training.py $TRAINING
 }
 
-export -f missing machine build compile tests sanitize run_slam slam realtime profile loops bench training
+volumes() {
+  # shellcheck disable=SC2086
+  "$python" scripts/benchmarks/bench_cuda_volumes.py $VOLUMES
+}
+
+export -f missing machine build compile tests sanitize run_slam slam realtime profile loops bench training volumes
 [ -z "${SANITIZE:-}" ] || wanted="$wanted sanitize"
-for name in machine build compile tests sanitize slam realtime profile loops bench training; do
+for name in machine build compile tests sanitize slam realtime profile loops bench training volumes; do
   step "$name" "$name"
 done
 echo "seconds:$times"

@@ -110,9 +110,11 @@ def lines_by_purpose() -> dict[str, int]:
     return dict(found)
 
 
-ONLY_FOR_USERS = {"ggslam.volumes.raycast", "ggslam.driving.dynamic_layer", "ggslam.driving.outlines"}
-"""Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it; what
-moves, for robots that drive while a map is made."""
+ONLY_FOR_USERS = {
+    "ggslam.volumes.raycast", "ggslam.volumes.cuda.raycast", "ggslam.driving.dynamic_layer", "ggslam.driving.outlines",
+}  # fmt: skip
+"""Modules of the library that people call and ggslam itself does not: the surface of a TSDF as a camera sees it, on CPU
+and GPU; what moves, for robots that drive while a map is made."""
 
 
 def is_package(name: str) -> bool:

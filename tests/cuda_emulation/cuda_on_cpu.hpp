@@ -109,6 +109,13 @@ T atomicCAS(T* place, T expected, T value) {
   return before;
 }
 
+template <class T>
+T atomicOr(T* place, T value) {
+  const T before = *place;
+  *place = before | value;
+  return before;
+}
+
 inline void __threadfence() {}  // blocks run one after another
 template <class T>
 T __ldcg(const T* place) {
@@ -122,6 +129,8 @@ inline int __popcll(unsigned long long x) { return __builtin_popcountll(x); }
 inline int __ffs(int x) { return __builtin_ffs(x); }
 inline int __clz(int x) { return x == 0 ? 32 : __builtin_clz(static_cast<unsigned>(x)); }
 inline double rsqrt(double x) { return 1 / std::sqrt(x); }
+inline float rsqrtf(float x) { return 1 / std::sqrt(x); }
+// Without fusing them to one operation.
 inline double sinpi(double x) { return std::sin(3.14159265358979323846 * x); }
 inline double cospi(double x) { return std::cos(3.14159265358979323846 * x); }
 inline float __fdividef(float a, float b) { return a / b; }
@@ -133,6 +142,12 @@ inline float rounded(float x) {
 inline float __fmul_rn(float a, float b) { return rounded(a * b); }
 inline float __fadd_rn(float a, float b) { return rounded(a + b); }
 inline float __fmaf_rn(float a, float b, float c) { return std::fma(a, b, c); }
+// To whole numbers, as a GPU rounds: what is too large becomes the largest, NaN 0.
+inline int saturated(double x) {
+  return std::isnan(x) ? 0 : static_cast<int>(std::min(std::max(x, -2147483648.0), 2147483647.0));
+}
+inline int __float2int_rz(float x) { return saturated(std::trunc(static_cast<double>(x))); }
+inline int __float2int_rd(float x) { return saturated(std::floor(static_cast<double>(x))); }
 inline std::uint32_t __float_as_uint(float x) {
   std::uint32_t bits;
   std::memcpy(&bits, &x, sizeof(bits));

@@ -54,6 +54,18 @@ struct FieldStats {
   double sites_ms, select_ms, transform_ms;
 };
 
+// A distance field that was made elsewhere, of `blocks` blocks with distances and `sites` surface points in all.
+struct FieldParts {
+  int64_t blocks, sites;
+  const int32_t* at;                              // [blocks, 3]
+  const uint64_t *known, *negative, *crossed;     // [blocks, 8], voxel (i, j, k): bit i + 8 j of word k
+  const float* distance;                          // [blocks, 512], metres; NaN: unknown
+  const uint32_t* gradient;                       // [blocks, 512], 10 bits for each of x, y, z: 511 (1 + component)
+  const uint32_t* owner;                          // [blocks, 512], 512 block + voxel of the nearest point; all bits: none
+  const int32_t *site_block, *site_voxel;         // [sites], in this order; numbers of blocks and rows in them
+  const float *site_at, *site_normal, *site_radius;  // [sites, 3], [sites, 3], [sites], voxels from the first one's centre
+};
+
 // Vertices [n, 3] in metres, unit normals [n, 3], colours [n, 3], labels [n]; triangles [m, 3].
 struct MeshArrays {
   float* vertices;
@@ -209,6 +221,9 @@ GGSLAM_EXPORT int64_t ggslam_scan_faces(void* context, const ggslam::volumes::Sc
 GGSLAM_EXPORT void* ggslam_esdf_create(void* tsdf, float max_distance);
 GGSLAM_EXPORT int ggslam_esdf_destroy(void* handle);
 GGSLAM_EXPORT int ggslam_esdf_clear(void* handle);
+
+// Takes over a field of the TSDF as it is now.
+GGSLAM_EXPORT int ggslam_esdf_write(void* handle, const ggslam::volumes::FieldParts* parts);
 GGSLAM_EXPORT int64_t ggslam_esdf_size(void* handle);
 GGSLAM_EXPORT int64_t ggslam_esdf_bytes(void* handle);
 

@@ -239,7 +239,7 @@ def _check(request: VolumesRequest, is_run: bool) -> None:
     if request.overwrite and not request.live:
         raise ConfigError("`overwrite` is for the run that `live` makes; volumes are replaced without it")
     if request.latency and request.device is not None and request.esdf:
-        raise ConfigError("`latency`: with `device` the distance field waits for the end, so its latency is not known")
+        raise ConfigError("`latency`: with `device` nobody waits for the distance field, so its latency is not known")
     if request.occupancy is not None and not 1e-3 <= request.occupancy <= 10:
         raise ConfigError(f"`occupancy`: expected a voxel of 0.001 to 10 m, found {request.occupancy:g}")
     if request.slice_height is not None:

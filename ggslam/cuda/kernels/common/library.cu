@@ -5,6 +5,7 @@
 #include "abi/cuda/sampled_identity.hpp"
 #include "abi/cuda/tracking.hpp"
 #include "abi/cuda/training.hpp"
+#include "abi/cuda/volumes.hpp"
 
 #include "common/platform.cuh"
 

@@ -114,6 +114,8 @@ class Esdf {
   // Computes every block anew from the sites that the field holds.
   FieldStats recompute(Context& context);
   void clear();
+  // Takes over a field of the TSDF as it is now. esdf_parts.cpp
+  void take(const FieldParts& parts);
   std::size_t size() const { return blocks_.size(); }
   std::size_t bytes() const;
   const BlockTable& table() const { return table_; }

@@ -37,6 +37,24 @@ GGSLAM_EXPORT int ggslam_esdf_clear(void* handle) try {
   return 0;
 } GGSLAM_CATCH_ALL
 
+GGSLAM_EXPORT int ggslam_esdf_write(void* handle, const FieldParts* parts_) try {
+  const FieldParts& parts = object_of<FieldParts>(parts_);
+  const void* const arrays[] = {parts.at, parts.known, parts.negative, parts.crossed, parts.distance, parts.gradient,
+                                parts.owner};
+  for (const void* array : arrays) check_array("blocks", array, parts.blocks);
+  const void* const of_sites[] = {parts.site_block, parts.site_voxel, parts.site_at, parts.site_normal,
+                                  parts.site_radius};
+  for (const void* array : of_sites) check_array("sites", array, parts.sites);
+  for (int64_t s = 0; s < parts.sites; ++s) {
+    check_range("site_block", parts.site_block[s], s > 0 ? parts.site_block[s - 1] : 0, static_cast<int32_t>(parts.blocks) - 1);
+    check_range("site_voxel", parts.site_voxel[s], 0, kVoxels - 1);
+  }
+  for (int64_t v = 0; v < kVoxels * parts.blocks; ++v)
+    if (parts.owner[v] != kNobody) check_range("owner", static_cast<int64_t>(parts.owner[v]), int64_t{0}, kVoxels * parts.blocks - 1);
+  field(handle).take(parts);
+  return 0;
+} GGSLAM_CATCH_ALL
+
 GGSLAM_EXPORT int64_t ggslam_esdf_size(void* handle) try {
   return static_cast<int64_t>(field(handle).size());
 } GGSLAM_CATCH_ALL

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstring>
 
+#include "native/formulas/surface_sites.hpp"
 #include "volumes/esdf.hpp"
 
 GGSLAM_DECLARE_KERNEL(int esdf_crossings(const int16_t* values, ggslam::volumes::Site* out, uint64_t* known,
@@ -11,9 +12,6 @@ GGSLAM_DECLARE_KERNEL(int esdf_crossings(const int16_t* values, ggslam::volumes:
 
 namespace ggslam::volumes {
 namespace {
-
-// A site keeps its place until its disc has moved by this, voxels.
-constexpr float kHeld = 1.0f / 16;
 
 constexpr BlockCoordinates kFaces[6] = {{-1, 0, 0}, {1, 0, 0}, {0, -1, 0}, {0, 1, 0}, {0, 0, -1}, {0, 0, 1}};
 
@@ -50,13 +48,6 @@ void copy_values(const Tsdf& map, int64_t row, const Box3i& box, BlockCoordinate
     }
 }
 
-// How far two discs are from each other at most, voxels.
-float distance_between(const Site& a, const Site& b) {
-  const Vec3f moved = Vec3f::from(a.at) - Vec3f::from(b.at), turned = Vec3f::from(a.normal) - Vec3f::from(b.normal);
-  return std::sqrt(dot(moved, moved)) + std::max(a.radius, b.radius) * std::sqrt(dot(turned, turned)) +
-         std::fabs(a.radius - b.radius);
-}
-
 // Takes over the sites of a block. One that hardly moved stays where it was: the rounding of values would move half of
 // them with every view, and voxels without number with them. Returns how many came, went or moved.
 int64_t take_sites(FieldBlock& block, std::vector<Site>& now, std::vector<Site>& came) {
@@ -70,7 +61,7 @@ int64_t take_sites(FieldBlock& block, std::vector<Site>& now, std::vector<Site>&
     for (; b < block.sites.size() && block.sites[b].voxel < site.voxel; ++b) lose(block.sites[b]);
     if (b < block.sites.size() && block.sites[b].voxel == site.voxel) {
       const Site& held = block.sites[b++];
-      if (distance_between(held, site) <= kHeld) {
+      if (plain::disc_shift(held.at, held.normal, held.radius, site.at, site.normal, site.radius) <= kHeld) {
         site = held;
         continue;
       }

@@ -4,18 +4,11 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "native/formulas/site_rules.hpp"
 #include "volumes/tsdf.hpp"
 
 namespace ggslam::volumes {
 
-constexpr int kHalo = kSide + 2;         // side of a block with one voxel around it
-constexpr int16_t kUnseen = -32768;      // among values of the TSDF
-
-// The surface of a site is taken to be its tangent disc, which reaches half way to the next sites: a larger one would
-// stand out of what is curved.
-constexpr float kDiscRadius = 0.7f;
-// Gradients are those of discs larger by this, so that they do not turn in the gaps between discs.
-constexpr float kSmoothRim = 0.25f;
 // Half the diagonal of a block: from its middle to the centres of its corner voxels.
 constexpr float kBlockReach = 6.0622f;
 // Voxels of a part of a block along an edge, and half the diagonal of a part.

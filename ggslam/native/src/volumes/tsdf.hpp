@@ -7,14 +7,10 @@
 #include <memory>
 #include <vector>
 
+#include "native/formulas/tsdf_rules.hpp"
 #include "volumes/block_table.hpp"
 
 namespace ggslam::volumes {
-
-constexpr int kSide = 8;
-constexpr int kVoxels = kSide * kSide * kSide;
-constexpr int16_t kFreeValue = 32767;
-constexpr uint16_t kFullWeight = 65535;
 
 // Voxel (i, j, k) of a block stands at row i + 8 j + 64 k.
 struct alignas(64) VoxelBlock {
@@ -27,15 +23,9 @@ struct alignas(64) VoxelBlock {
 
 // The measured points of a block, of maps that count them.
 struct alignas(64) PointBlock {
-  uint8_t hits[kVoxels];     // evidence of measured points in the voxel, see below
+  uint8_t hits[kVoxels];     // evidence of measured points in the voxel, see tsdf_rules.hpp
   uint8_t octants[kVoxels];  // where in the voxel they lie: octant (x, y, z) is bit x + 2 y + 4 z
 };
-
-// A voxel's distance tells of surfaces that are larger than it; what is thin is averaged away. Points are counted beside
-// it, as OctoMap counts them: log-odds in steps, clamped, of hits (the view has a point in the voxel) and misses (it looks
-// past the voxel's centre by more than a voxel). These are those of OccupancySettings.with_raised_odds, 23.6 steps a unit.
-constexpr int kNeverSeen = 0, kOccupied = 128;  // occupied from this value on
-constexpr int kHit = 41, kMiss = 20, kLeastHits = kOccupied - 47, kMostHits = kOccupied + 83;
 
 // (i, j, k) of a row.
 static inline Vec3i voxel_of(int row) { return {{row % kSide, row / kSide % kSide, row / (kSide * kSide)}}; }

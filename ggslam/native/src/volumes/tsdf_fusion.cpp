@@ -7,6 +7,7 @@
 #include <limits>
 
 #include "common/context.hpp"
+#include "volumes/tsdf_candidates.hpp"
 #include "volumes/tsdf_listed_blocks.hpp"
 #include "volumes/tsdf_rays.hpp"
 

@@ -14,10 +14,6 @@ struct Context;
 
 namespace ggslam::volumes {
 
-constexpr int kTile = 4;        // pixels along an edge of the depth pyramid's smallest tiles
-constexpr int kErosion = 2;     // pixels: what is looked through must be so in this neighbourhood
-constexpr float kNear = 0.02f;  // metres; what is nearer is not projected
-
 // Smallest and largest depth in tiles of kTile x 2^level pixels; (inf, 0) where there is none.
 struct DepthTile {
   float low, high;
@@ -73,58 +69,6 @@ struct CandidateCount {
  private:
   static constexpr std::size_t kMost = std::size_t{1} << 23, kMostWithVoxels = std::size_t{1} << 20;
   [[noreturn]] static void refuse_view(std::size_t most, const char* what);
-};
-
-// Blocks that the view tells about: those with a surface, those that are free, and those of which parts are, unless
-// they are known to be free.
-class CandidateSearch {
- public:
-  CandidateSearch(const Tsdf& map, const FusionInput& input, const FusionSettings& settings,
-                  const FusionImages& images);
-
-  // Cubes of many blocks that enclose what is in view.
-  std::size_t cells() const { return static_cast<std::size_t>(count_[0]) * count_[1] * count_[2]; }
-  // Appends the candidates of a cell.
-  void search(std::size_t cell, CandidateCount& count, std::vector<Candidate>& out) const;
-
- private:
-  static constexpr int kMostCells = 4096;
-  struct Footprint {
-    int u0, v0, u1, v1;  // tiles, inclusive
-    bool whole;          // nothing is cut off at the image's border or near the camera
-  };
-  struct Cube {
-    Vec3f centre;     // in the camera's frame
-    float near, far;  // depth of its nearest and farthest corner
-    Vec3f offset;     // centre from the camera along the map's axes
-    float half;       // of the edge
-  };
-  const Tsdf& map_;
-  const FusionInput& in_;
-  const FusionSettings& settings_;
-  const FusionImages& images_;
-  double block_;         // edge, metres
-  int cell_ = 4;         // edge of a cell in blocks
-  float extent_[3];      // half extents of a block along the camera's axes
-  Mat3d rotation_;       // of T_camera_map
-  Vec3d translation_;
-  Vec3d position_;       // of the camera
-  Mat3f axes_;           // of the camera in the map
-  float spread_[3];      // along the map's axes at z = 1, of one pixel
-  Vec3i first_, count_;
-
-  void descend(BlockCoordinates at, int side, CandidateCount& count, std::vector<Candidate>& out) const;
-  // Whether a cube of side^3 blocks has some that are looked at.
-  bool wanted(BlockCoordinates at, int side) const;
-  void emit(BlockCoordinates at, Sight sight, CandidateCount& count, std::vector<Candidate>& out) const;
-  void emit_free(BlockCoordinates at, int side, CandidateCount& count, std::vector<Candidate>& out) const;
-  Cube cube(BlockCoordinates at, int side) const;
-  bool footprint(const Cube& cube, int side, Footprint& out) const;
-  bool meets(int level, int u, int v, const Cube& cube, float& z0, float& z1) const;
-  unsigned look(int level, int u, int v, const Footprint& area, const Cube& cube) const;
-  unsigned look_at_pixels(int u, int v, float low, float high) const;
-  unsigned look_beyond(int u, int v, float low, float high) const;
-  float valid_share(const Footprint& area) const;
 };
 
 // What happened to a block's voxels; bits.

@@ -10,11 +10,6 @@
 namespace ggslam::volumes {
 namespace {
 
-// Rays that pass a voxel's centre farther away than this, in metres, tell of another place: the surface may bend between.
-// Found on a generated room with a Kinect's noise, voxels of 1 to 10 cm; another room agrees. Where depth is exact rays
-// gain nothing.
-constexpr double kRadius = 0.02;
-
 // What all rays of a view have in common; lengths in voxels from the first voxel of the corner's block.
 struct View {
   Mat3d axes;       // of the camera in the map
@@ -33,7 +28,7 @@ View view_of(const Tsdf& map, const FusionInput& in) {
   view.position = position - static_cast<double>(kSide) * cast<double>(view.corner);
   view.depth_row = view.axes.column(2);
   view.depth_offset = -dot(view.depth_row, view.position);
-  view.truncation = map.truncation / map.voxel, view.radius = kRadius / map.voxel;
+  view.truncation = map.truncation / map.voxel, view.radius = kRayRadius / map.voxel;
   return view;
 }
 

@@ -11,7 +11,7 @@ namespace ggslam::volumes {
 // What rays told a voxel within the truncation: the sum of its distances to the depth along the optical axis, in kUnits
 // to the truncation, and their number.
 struct RaySum {
-  static constexpr int kUnits = 2048;  // 2^20 rays may add up
+  static constexpr int kUnits = kRayUnits;
   int32_t distance = 0, count = 0;
 };
 

@@ -1,8 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Which discs may be the nearest of the voxels around a place. Two bounds: a disc is farther from a voxel than from the
-// middle of some voxels less the way between them; and, as the distance of a convex body is convex, not nearer than it is
-// from the middle with its slope there. The second tells far discs apart that the first cannot: nearly all that is far away
-// is nearly as far.
+// Functions of the formulas in native/formulas/disc_bounds.hpp, and which nodes may hold the nearest disc of a place.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -23,12 +20,6 @@ static inline Float inverse_root(Float a) {
 #endif
 }
 
-// The root of a number that is not negative, less up to a thousandth of it.
-static inline Float root_below(Float a) {
-  const Float positive = maximum(a, broadcast(1e-12f));
-  return positive * inverse_root(positive) * 0.9995f;
-}
-
 // a b + c, in bounds only, where it does not matter how it is rounded.
 static inline Float product_sum(Float a, Float b, Float c) {
 #if defined(__AVX512F__)
@@ -40,46 +31,14 @@ static inline Float product_sum(Float a, Float b, Float c) {
 #endif
 }
 
-// What the square of the distance from a disc of some thickness is at least. `from` leads from its middle to the place.
-static inline Float least_square(const Float from[3], const Float normal[3], Float radius, Float half) {
-  const Float height = product_sum(from[0], normal[0], product_sum(from[1], normal[1], from[2] * normal[2]));
-  const Float square = product_sum(from[0], from[0], product_sum(from[1], from[1], from[2] * from[2]));
-  const Float above = maximum(absolute(height) - half, Float{});
-  const Float aside = maximum(root_below(product_sum(-height, height, square)) - radius, Float{});
-  return product_sum(above, above, aside * aside);
-}
+// A number that is not negative, with the sign of another.
+static inline Float signed_as(Float a, Float b) { return (Float)((Int)a | ((Int)b & broadcast_int(INT32_MIN))); }
 
-// What is known of the nearest discs of some voxels: none of them is farther from its own than
-// `most` + slope (voxel - middle).
-struct Reach {
-  float middle[3], half[3];  // of the voxels
-  float slope[3];
-  float most;
-};
+}  // namespace ggslam::GGSLAM_ISA
 
-// Which of kLanes discs of some thickness may be nearer to one of the voxels than what that has; `from` leads from their
-// middles to that of the voxels.
-static inline Mask may_be_nearer(const Reach& reach, const Float from[3], const Float normal[3], Float radius,
-                                 Float half) {
-  const Float height = product_sum(from[0], normal[0], product_sum(from[1], normal[1], from[2] * normal[2]));
-  const Float square = product_sum(from[0], from[0], product_sum(from[1], from[1], from[2] * from[2]));
-  const Float above = maximum(absolute(height) - half, Float{});
-  const Float aside_square = maximum(product_sum(-height, height, square), broadcast(1e-12f));
-  const Float aside_inverse = inverse_root(aside_square);
-  const Float beyond = maximum(aside_square * aside_inverse * 0.9995f - radius, Float{});
-  const Float distance_square = maximum(product_sum(above, above, beyond * beyond), broadcast(1e-12f));
-  const Float inverse = inverse_root(distance_square), distance = distance_square * inverse * 0.9995f;
-  const Float along = beyond * aside_inverse * inverse;
-  const Float signed_above = (Float)((Int)above | ((Int)height & broadcast_int(INT32_MIN)));
-  const Float across = signed_above * inverse - height * along;
-  Float least = distance;
-  for (int a = 0; a < 3; ++a) {
-    const Float slope = product_sum(from[a], along, normal[a] * across);
-    least = product_sum(absolute(slope - reach.slope[a]), broadcast(-reach.half[a]), least);
-  }
-  // The slopes are rounded, too.
-  return greater_equal(broadcast(reach.most + 0.01f), least);
-}
+#include "native/formulas/disc_bounds.hpp"
+
+namespace ggslam::GGSLAM_ISA {
 
 // Nodes that may hold the nearest site of a place within `reach` of `middle`, if none is farther from its nearest site
 // than `most`: the nearest first, and the others; returns their number. `scratch` has room for all and a full vector.

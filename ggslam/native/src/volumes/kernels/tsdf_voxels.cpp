@@ -4,6 +4,7 @@
 #include <cstring>
 
 #include "volumes/kernels/voxel_vectors.hpp"
+#include "native/formulas/tsdf_voxel.hpp"
 #include "volumes/tsdf_scratch.hpp"
 
 namespace ggslam::GGSLAM_ISA {
@@ -15,25 +16,6 @@ using volumes::kSide;
 using volumes::kVoxels;
 using volumes::VoxelBlock;
 using volumes::VoxelUpdate;
-
-constexpr float kSurprise = 0.5f;           // of the truncation: how far depth must contradict a voxel to clear it
-constexpr float kDoubt = 0.03f;             // of a voxel's depth: passing it by so little more proves nothing
-constexpr float kDoubtfulShare = 0.03f;     // of the voxel's weight that what proves nothing counts at most
-constexpr float kFreeFrom = 0.98f * kFreeValue;  // a voxel seen as free counts as free from this value on
-constexpr float kRangeSlack = 1.00001f;     // of the range: rounding when depth is added up again
-constexpr float kLabelVoxels = 2.0f;        // labels are told to voxels this near to the surface
-constexpr float kColorShare = 0.125f;       // of a new colour at least: less would be rounded away
-
-static inline Float rounded(Float v) { return to_float(truncate(v + 0.5f)); }
-
-// What is known of a block's voxels, step by step. Groups of kLanes voxels that need a step are listed without a
-// branch: whether they do is anyone's guess, and the next groups need not wait for it.
-struct Group {
-  Float z, inverse, u, v;
-  Float distance;  // to the surface along the optical axis, positive in front; kNothing: unknown
-  Float share;     // of the new measurement in the voxel's mean; 0 beyond the truncation
-  Int pixel;       // the nearest; 0 outside the image
-};
 
 constexpr int kGroups = kVoxels / kLanes;
 
@@ -47,16 +29,9 @@ struct List {
 };
 
 struct Work {
-  Group groups[kGroups];
+  Sighted groups[kGroups];
   List near, seen, band;
 };
-
-constexpr float kNothing = -1e30f;
-
-// Distance within which interpolation, which moves the depth by less than `edge` or 2 %, can matter.
-static inline Float reach(const VoxelUpdate& t, Float depth) {
-  return t.truncation + maximum(broadcast(t.edge), depth * 0.02f);
-}
 
 // Projects the voxels and compares them with the nearest pixel.
 void project(const VoxelUpdate& t, Work& w) {
@@ -64,51 +39,17 @@ void project(const VoxelUpdate& t, Work& w) {
   for (int a = 0; a < 3; ++a)
     for (int lane = 0; lane < kLanes; ++lane)
       offset[a][lane] = (lane & 7) * t.step[0][a] + (lane >> 3) * t.step[1][a];
-  const Float near = broadcast(volumes::kNear), left = broadcast(-0.5f), nothing = broadcast(kNothing);
-  const Float right = broadcast(t.width - 0.5f), bottom = broadcast(t.height - 0.5f);
-  const Float max_depth = broadcast(t.max_depth);
   for (int n = 0; n < kGroups; ++n) {
     const int first = n * kLanes;
     const float i = first & 7, j = first >> 3 & 7, k = first >> 6;
     Float p[3];
     for (int a = 0; a < 3; ++a)
       p[a] = offset[a] + (t.origin[a] + i * t.step[0][a] + j * t.step[1][a] + k * t.step[2][a]);
-    const Float inverse = 1.0f / maximum(p[2], near);
-    const Float u = t.fx * (p[0] * inverse) + t.cx, v = t.fy * (p[1] * inverse) + t.cy;
-    const Mask inside = both(both(greater(p[2], near), both(greater_equal(u, left), greater(right, u))),
-                             both(greater_equal(v, left), greater(bottom, v)));
-    const Int pixel = truncate(zero_unless(inside, v + 0.5f)) * t.width + truncate(zero_unless(inside, u + 0.5f));
-    const Float depth = gather(t.depth, pixel);
-    // Depth beyond the range is no surface's: it tells of what lies before it alone.
-    const Float gap = depth - p[2], least = select(greater(depth, max_depth), Float{}, nothing);
-    const Mask told = both(both(inside, greater(depth, Float{})), greater_equal(gap, least));
-    const Float distance = select(told, gap, nothing);
-    const Float band = reach(t, depth);
-    const Mask seen = greater_equal(distance, -band);
-    w.groups[n] = {p[2], inverse, u, v, distance, Float{}, pixel};
-    w.near.add(n, any(both(seen, greater(band, distance))));
+    Mask seen, near;
+    w.groups[n] = compared(t, p, seen, near);
+    w.near.add(n, any(near));
     w.seen.add(n, any(seen));
   }
-}
-
-// Takes the depth between the four pixels around a voxel, where they are all there, in range, and differ little.
-void interpolate(const VoxelUpdate& t, Group& g) {
-  const Float u = g.u, v = g.v;
-  const Mask inside =
-      both(both(greater_equal(u, Float{}), greater(broadcast(static_cast<float>(t.width - 1)), u)),
-           both(greater_equal(v, Float{}), greater(broadcast(static_cast<float>(t.height - 1)), v)));
-  const Mask wanted = both(inside, greater(g.distance, broadcast(kNothing)));
-  const Int u0 = truncate(zero_unless(wanted, u)), v0 = truncate(zero_unless(wanted, v));
-  const Int at = v0 * t.width + u0;
-  Float a, b, c, d;
-  gather_pairs(t.depth, at, a, b), gather_pairs(t.depth + t.width, at, c, d);
-  const Float low = minimum(minimum(a, b), minimum(c, d)), high = maximum(maximum(a, b), maximum(c, d));
-  const Float allowed = maximum(broadcast(t.edge), low * 0.02f);
-  const Mask within = both(greater(low, Float{}), greater_equal(broadcast(t.max_depth), high));
-  const Mask smooth = both(wanted, both(within, greater_equal(allowed, high - low)));
-  const Float x = u - to_float(u0), y = v - to_float(v0);
-  const Float top = a + x * (b - a), bottom = c + x * (d - c);
-  g.distance = select(smooth, top + y * (bottom - top) - g.z, g.distance);
 }
 
 // Takes the mean of what rays told the voxels, which is then forgotten. Where the nearest pixel looks past a voxel, or
@@ -116,7 +57,7 @@ void interpolate(const VoxelUpdate& t, Group& g) {
 void gather_rays(const VoxelUpdate& t, Work& w) {
   const float unit = t.truncation / volumes::RaySum::kUnits;
   for (int n = 0; n < kGroups; ++n) {
-    Group& g = w.groups[n];
+    Sighted& g = w.groups[n];
     volumes::RaySum* const sums = t.rays + n * kLanes;
     for (int lane = 0; lane < kLanes; ++lane) {
       const volumes::RaySum sum = sums[lane];
@@ -129,16 +70,6 @@ void gather_rays(const VoxelUpdate& t, Work& w) {
     }
     std::fill(sums, sums + kLanes, volumes::RaySum{});
   }
-}
-
-// Clears voxels that the view surely looks through, with all pixels around and by more than the depth is wrong: they lose a
-// share of their weight. At edges and by less, poses and depth may be at fault as well: the measurement counts little.
-void clear(const VoxelUpdate& t, const Group& g, Mask through, Float& weight, Float& measured) {
-  const Float needed = g.z * (1 + kDoubt) + t.truncation;
-  const Mask sure = both(through, greater_equal(gather(t.eroded, g.pixel), needed));
-  const Float little = minimum(measured, maximum(broadcast(1.0f), rounded(weight * kDoubtfulShare)));
-  measured = select(neither_of(through, sure), little, measured);
-  weight = select(sure, rounded(weight * (1 - t.clearing)), weight);
 }
 
 typedef std::uint8_t Bytes __attribute__((vector_size(4 * kLanes), aligned(1), may_alias));
@@ -188,81 +119,35 @@ bool count_points(const VoxelUpdate& t, const Work& w) {
 // Averages values and weights.
 void average(const VoxelUpdate& t, Work& w, int n, VoxelBlock& block, Mask& changed) {
   const int first = n * kLanes;
-  Group& g = w.groups[n];
-  const Float truncation = broadcast(t.truncation), one = broadcast(1.0f), full = broadcast(kFreeValue);
-  const Float distance = g.distance;
-  const Float drop = minimum((distance + t.truncation) * (1.0f / (t.truncation - t.voxel)), one);
-  Float measured = minimum(rounded(t.weight_scale * g.inverse * g.inverse * drop), broadcast(kFullWeight));
-  const Int old_value = load_widened(block.value + first), old_weight = load_widened(block.weight + first);
-  const Float value = to_float(old_value);
-  Float weight = to_float(old_weight);
-  // Depth beyond the range makes known what is free up to the range. What a surface in range left nearer to it, or behind
-  // the range, goes with that surface.
-  const Mask in_range = greater_equal(broadcast(t.max_depth * kRangeSlack), distance + g.z);
-  const Mask before = both(greater_equal(distance, truncation), greater_equal(broadcast(t.max_depth), g.z));
-  const Mask told = either(greater(weight, Float{}), either(in_range, before));
-  const Mask valid = both(told, both(greater_equal(distance, -truncation), greater_equal(measured, one)));
-
-  const Mask behind = both(valid, greater_equal(distance, truncation));  // the surface is: the voxel is free
-  const Float scaled = (kFreeValue / t.truncation) * distance;
-  const Mask surface = both(greater(weight, Float{}), greater(broadcast(kFreeFrom), value));
-  const Mask through = both(both(behind, surface), greater(scaled - value, full * kSurprise));
-  if (t.eroded != nullptr && any(through)) clear(t, g, through, weight, measured);
-
-  const Float total = weight + measured, share = measured / total;
-  Float mean = value + share * (minimum(scaled, full) - value);
-  mean = select(both(behind, greater_equal(mean, broadcast(kFreeFrom))), full, mean);
-  const Float most = select(greater_equal(mean, full), broadcast(t.max_free_weight), broadcast(kFullWeight));
-  // Elsewhere the mean may be anything, infinite and NaN included.
-  const Int new_value = truncate(select(valid, mean, value) + 32768.5f) - 32768;
-  // A weight above the limit of free space shrinks by no more than what was measured.
-  const Float grown = select(valid, minimum(total, maximum(most, weight - measured)), to_float(old_weight));
-  store_narrowed(block.value + first, new_value);
-  store_narrowed(block.weight + first, truncate(grown));
-
-  const Mask unseen = greater(one, to_float(old_weight));
-  const Float moved = absolute(to_float(new_value - old_value));
-  changed = either(changed, both(valid, either(unseen, greater(moved, Float{}))));
-  const Mask band = neither_of(valid, behind);
-  g.share = zero_unless(band, share);
-  w.band.add(n, any(band));
-}
-
-static inline Int blended(Int old, Int now, Float share) {
-  const Float from = to_float(old);
-  return truncate(from + share * (to_float(now) - from) + 0.5f);
+  Sighted& g = w.groups[n];
+  const Averaged now = averaged(t, g, load_widened(block.value + first), load_widened(block.weight + first));
+  store_narrowed(block.value + first, now.value);
+  store_narrowed(block.weight + first, now.weight);
+  changed = either(changed, now.changed);
+  w.band.add(n, any(now.band));
 }
 
 // Colours of voxels within the truncation.
-void paint(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block) {
+void paint(const VoxelUpdate& t, const Sighted& g, int first, VoxelBlock& block) {
   const Int color = gather_int(t.color, g.pixel);
   const Int red = load_widened(block.red + first), green = load_widened(block.green + first),
             blue = load_widened(block.blue + first);
-  // Black stands for a voxel that has no colour yet.
-  const Mask bare = greater_equal_int(Int{}, red | green | blue);
-  const Float wanted = select(bare, broadcast(1.0f), maximum(g.share, broadcast(kColorShare)));
-  const Float share = zero_unless(greater(g.share, Float{}), wanted);
+  const Float share = color_share(greater_equal_int(Int{}, red | green | blue), g.share);
   store_narrowed(block.red + first, blended(red, color & 255, share));
   store_narrowed(block.green + first, blended(green, color >> 8 & 255, share));
   store_narrowed(block.blue + first, blended(blue, color >> 16 & 255, share));
 }
 
 // Votes of voxels at the surface for a label; whether one changed its label.
-bool vote(const VoxelUpdate& t, const Group& g, int first, VoxelBlock& block) {
+bool vote(const VoxelUpdate& t, const Sighted& g, int first, VoxelBlock& block) {
   bool changed = false;
-  const Float most = broadcast(kLabelVoxels * t.voxel);
+  const Float most = broadcast(volumes::kLabelVoxels * t.voxel);
   const Mask near = both(greater(g.share, Float{}), greater_equal(most, absolute(g.distance)));
   for (std::uint32_t lanes = bits(near); lanes; lanes &= lanes - 1) {
     const int lane = __builtin_ctz(lanes), k = first + lane;
     const std::uint16_t label = t.labels[g.pixel[lane]];
     if (label == 0) continue;
-    if (label == block.label[k]) {
-      if (block.votes[k] < 255) ++block.votes[k];
-    } else if (block.votes[k] == 0) {
-      block.label[k] = label, block.votes[k] = 1, changed = true;
-    } else {
-      --block.votes[k];
-    }
+    changed |= vote_for(label, block.label[k], block.votes[k]);
   }
   return changed;
 }
