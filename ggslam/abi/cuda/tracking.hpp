@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "abi/core/tracking.hpp"
+#include "abi/cuda/sight.hpp"
 #include "abi/export.hpp"
 
 namespace ggslam::cuda {
@@ -124,6 +125,7 @@ struct TrackJob {
   GreyJob reference, greys;
   VoxelLevelJob fine, coarse;
   AlignJob align;
+  const MoverEvidenceJob* evidence;  // on the host; wanted of the same depth at the pose found; null: not wanted
   double* results;  // [kAlignResults] in page-locked memory of the host, a copy of those of `align`
   std::int32_t makes_points, makes_reference, makes_greys, makes_levels;
   // Whether to tell of the matched points how many they are, and the medians of their squared distances and of their

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from ggslam.abi.cuda import AlignJob, AlignResult, TrackJob
+from ggslam.abi.cuda import AlignJob, AlignResult, MoverEvidenceJob, TrackJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.scene.camera import Camera
@@ -79,6 +79,7 @@ class CudaTrackingEngine:
         self._found = self._arrived.numpy()
         self._job = TrackJob(results=self._arrived.data_ptr())
         self._reference = ctypes.byref(self._job)
+        self._evidence: MoverEvidenceJob | None = None
         guess = np.frombuffer(self._job, np.float64, 12, _GUESS)
         self._guess_rotation, self._guess_translation = guess[:9].reshape(3, 3), guess[9:]
         job = self._job
@@ -151,6 +152,18 @@ class CudaTrackingEngine:
     def expect_target(self, target: GicpTarget) -> None:
         """See `Tracker.expect_target`."""
         self._target.stage(target)
+
+    def depth_address(self, depth: np.ndarray) -> int | None:
+        """Where a frame's depth is on the device, if this very array was sent last."""
+        return self._depth.address if self._depth.holds(depth) else None
+
+    def bring_evidence(self, job: MoverEvidenceJob | None) -> None:
+        """Has each alignment from now on make this evidence as well, of the depth on the device at the pose that it
+        finds: it is there when `align` returns. None: no more."""
+        self._evidence = job  # the kernels read it
+        if job is not None:
+            job.depth, job.pose = self._depth.address, self._results.data_ptr()
+        self._job.evidence = None if job is None else ctypes.addressof(job)
 
     # --- parts -------------------------------------------------------------------------------------------------------
 

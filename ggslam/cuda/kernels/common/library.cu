@@ -2,6 +2,7 @@
 #include "abi/cuda/common.hpp"
 #include "abi/cuda/mapping.hpp"
 #include "abi/cuda/rendering.hpp"
+#include "abi/cuda/sight.hpp"
 #include "abi/cuda/tracking.hpp"
 
 #include "common/platform.cuh"
