@@ -12,6 +12,7 @@ import torch
 from device_watch import DeviceWatch
 
 from ggslam.abi.cuda import MoverEvidenceJob
+from ggslam.cuda.library import library_and_device
 from ggslam.movers.cuda.evidence import CudaEvidence
 from ggslam.movers.cuda.views import CudaView
 from ggslam.movers.detector import DetectorTuning, MoverDetector
@@ -22,6 +23,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import se3_exp
 from ggslam.sight.margin import Margin
+from ggslam.sight.places import CoarseView
 
 if TYPE_CHECKING:
     from ggslam.cuda.library import CudaLibrary
@@ -57,27 +59,32 @@ def frame(n: int, box_at: float | None) -> Frame:
 class Tracking:
     """Has the depth of no frame."""
 
-    job: MoverEvidenceJob | None = None
+    wanted = False
+
+    def __init__(self) -> None:
+        self.evidence = MoverEvidenceJob()
 
     def depth_address(self, depth: np.ndarray) -> int | None:
         return None
 
-    def bring_evidence(self, job: MoverEvidenceJob | None) -> None:
-        self.job = job
+    def bring_evidence(self, wanted: bool) -> None:
+        self.wanted = wanted
 
 
 class Aligning(Tracking):
     """Has the depth, and makes the evidence at some pose."""
 
     def __init__(self, library: CudaLibrary) -> None:
+        super().__init__()
         self._library = library
 
     def locate(self, frame: Frame, T: np.ndarray) -> None:
-        self.depth, self.on_device = frame.depth, torch.from_numpy(frame.depth.copy())
-        self.pose = torch.from_numpy(np.concatenate([T[:3, :3].ravel(), T[:3, 3]]))
-        if self.job is not None:
-            self.job.depth, self.job.pose = self.on_device.data_ptr(), self.pose.data_ptr()
-            self._library.call("mover_evidence_wait", self.job)
+        device = self._library.whole_device(None)
+        self.depth, self.on_device = frame.depth, torch.from_numpy(frame.depth.copy()).to(device)
+        self.pose = torch.from_numpy(np.concatenate([T[:3, :3].ravel(), T[:3, 3]])).to(device)
+        if self.wanted:
+            self.evidence.depth, self.evidence.pose = self.on_device.data_ptr(), self.pose.data_ptr()
+            self._library.functions.ggslam_cuda_mover_evidence_wait(self.evidence)
 
     def depth_address(self, depth: np.ndarray) -> int | None:
         return self.on_device.data_ptr() if depth is self.depth else None
@@ -100,7 +107,7 @@ class Recorded:
 def detector_of(library: CudaLibrary | None, tracking: Tracking | None = None) -> MoverDetector:
     detector = MoverDetector(SETTINGS)
     if library is not None:
-        detector.source = CudaEvidence(tracking or Tracking(), library, torch.device("cpu"))
+        detector.source = CudaEvidence(tracking or Tracking(), library, library.whole_device(None))
     return detector
 
 
@@ -161,8 +168,13 @@ def test_evidence_of_the_alignment_is_taken_if_it_is_of_this_frame(
     """At another pose, of another depth, with another margin or after a correction it is made anew."""
     tracking, core = Aligning(cuda_library), detector_of(None)
     mine = detector_of(cuda_library, tracking)
-    made = []
-    monkeypatch.setattr(CudaEvidence, "_make", lambda self, *a, make=CudaEvidence._make: (made.append(1), make(self, *a)))
+    made, make = [], CudaEvidence._make
+
+    def note(self: CudaEvidence, *arguments: object) -> None:
+        made.append(1)
+        make(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(CudaEvidence, "_make", note)
     for n in range(20):
         now, margin, T = frame(n, None if n < 14 else 0.0), MARGIN, pose(n)
         shown = now
@@ -184,21 +196,38 @@ def test_evidence_of_the_alignment_is_taken_if_it_is_of_this_frame(
     assert mine.found is not None
 
 
-def test_an_ordinary_frame_costs_no_wait_of_its_own(cuda_library: CudaLibrary) -> None:
-    """Nor an allocation or an upload: what is found comes with the alignment."""
+def test_an_ordinary_frame_costs_nothing_of_its_own() -> None:
+    """No wait, upload or call: what is found comes with the alignment. Views are read when asked
+    for."""
     with DeviceWatch() as watch:
-        library = cuda_library
-        tracking = Aligning(library)
-        detector = MoverDetector(SETTINGS)
-        detector.source = CudaEvidence(tracking, library, torch.device("cuda", 0))
+        library, device = library_and_device()
+        tracking, detector = Aligning(library), MoverDetector(SETTINGS)
+        detector.source = CudaEvidence(tracking, library, device)
         for n in range(5):
             now = frame(n, None)
-            if n > 1:
-                watch.forget()
             detector.prepare(now, MARGIN)
             tracking.locate(now, pose(n))
+            watch.forget()
             detector.look(now, pose(n), MARGIN, CONTEXT)
-        assert not watch.waits and not watch.uploads
-        assert len(detector.views) == 5 and detector.views[-1].T_world_camera.shape == (4, 4)
-        assert not watch.waits
-        assert detector.views[-1].fits() and len(watch.waits) == 1
+            assert not watch.waits and not watch.uploads and not watch.calls, n
+        view = detector.views[-1]
+        assert len(detector.views) == 5 and view.T_world_camera.shape == (4, 4) and not watch.waits
+        assert view.fits() and view.smooth.any() and len(watch.waits) == 1
+
+
+def test_a_run_saves_what_the_host_would(cuda_library: CudaLibrary) -> None:
+    """Views that were read hold what `CoarseView` does; a detector goes on from views of the host."""
+    mine, core = detector_of(cuda_library), detector_of(None)
+    for n in range(4):
+        for detector in (mine, core):
+            detector.look(frame(n, None), pose(n), MARGIN, CONTEXT)
+    kept = [CoarseView(v.camera, v.T_world_camera, *(getattr(v, name) for name in IMAGES)) for v in mine.views]
+    again = detector_of(cuda_library)
+    again.views = kept
+    for n in range(4, 8):
+        for detector in (again, core):
+            detector.prepare(frame(n, 0.0), MARGIN)
+            detector.look(frame(n, 0.0), pose(n), MARGIN, CONTEXT)
+        assert (again.mask is None) == (core.mask is None)
+        assert again.mask is None or np.array_equal(again.mask, core.mask)  # by the core
+    assert core.mask is not None

@@ -125,9 +125,9 @@ struct TrackJob {
   GreyJob reference, greys;
   VoxelLevelJob fine, coarse;
   AlignJob align;
-  const MoverEvidenceJob* evidence;  // on the host; wanted of the same depth at the pose found; null: not wanted
+  MoverEvidenceJob evidence;
   double* results;  // [kAlignResults] in page-locked memory of the host, a copy of those of `align`
-  std::int32_t makes_points, makes_reference, makes_greys, makes_levels;
+  std::int32_t makes_points, makes_reference, makes_greys, makes_levels, makes_evidence;
   // Whether to tell of the matched points how many they are, and the medians of their squared distances and of their
   // depths.
   std::int32_t looks;

@@ -10,7 +10,7 @@ evidence is made anew, for which the host waits.
 from __future__ import annotations
 
 import ctypes
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -39,11 +39,14 @@ class CudaEvidenceTuning(Tuning):
 class FrameOnDevice(Protocol):
     """Tracking, which has a frame's depth on the device and finds its pose there."""
 
+    evidence: MoverEvidenceJob
+    """Of its alignments, see `bring_evidence`."""
+
     def depth_address(self, depth: np.ndarray) -> int | None:
         """Where this very array is on the device; None: another one is there."""
 
-    def bring_evidence(self, job: MoverEvidenceJob | None) -> None:
-        """Each alignment from now on makes this evidence, of its depth at its pose; None: none."""
+    def bring_evidence(self, wanted: bool) -> None:
+        """Whether each alignment from now on makes `evidence`, of its depth at its pose."""
 
 
 class CudaEvidence:
@@ -58,40 +61,39 @@ class CudaEvidence:
     def __init__(self, tracking: FrameOnDevice, library: CudaLibrary, device: torch.device) -> None:
         self._tracking, self._library, self._device = tracking, library, device
         self._memory, self._host = GrowingMemory(device), HostEvidence()
-        self._upload, self._ring = Upload(device), None
+        self._upload = Upload(device)
+        self._ring: ViewRing | None = None
         self._found = torch.zeros(ctypes.sizeof(MoverEvidenceFound), dtype=torch.uint8, device=device)
         pinned = torch.zeros(self._found.numel(), dtype=torch.uint8, pin_memory=device.type == "cuda")
         self._arrived = pinned
         self._pose = pinned.numpy()[:96].view(np.float64)
         self._novel = pinned.numpy()[96:100].view(np.int32)
-        self._job = job = MoverEvidenceJob(found=self._found.data_ptr(), arrived=pinned.data_ptr())
-        job.device = device.index or 0
+        self._job = job = tracking.evidence
+        job.found, job.arrived, job.device = self._found.data_ptr(), pinned.data_ptr(), device.index or 0
         self._T_earlier = self._of_job("T_camera_world", np.float64).reshape(MOST_EARLIER, 12)
         self._slots, self._parts = self._of_job("slots", np.int32), self._of_job("parts", np.int32)
         self._given = self._of_job("given_pose", np.float64)
         self._margin: Margin | None = None
         self._prepared: EvidenceRequest | None = None
 
-    _ring: ViewRing | None
-
     def prepare(self, request: EvidenceRequest) -> None:
         """See `EvidenceSource`."""
         self._prepared = None
-        self._tracking.bring_evidence(None)
+        self._tracking.bring_evidence(False)
         if self._is_for_the_host(request):
             return
         self._fill(request)
         self._job.moved = None
         self._pose[0] = np.nan
         self._prepared = request
-        self._tracking.bring_evidence(self._job)
+        self._tracking.bring_evidence(True)
 
     def look(
         self, request: EvidenceRequest, T_world_camera: np.ndarray, moved: np.ndarray | None, context: NativeContext
     ) -> tuple[CoarseView, Evidence | None]:
         """See `EvidenceSource`."""
         prepared, self._prepared = self._prepared, None
-        self._tracking.bring_evidence(None)
+        self._tracking.bring_evidence(False)
         if self._is_for_the_host(request):
             return self._host.look(request, T_world_camera, moved, context)
         job, address = self._job, self._tracking.depth_address(request.depth)
@@ -183,3 +185,4 @@ class CudaEvidence:
         self._given[:9], self._given[9:] = T_world_camera[:3, :3].ravel(), T_world_camera[:3, 3]
         job.stream = self._library.stream(self._device)
         self._library.call("mover_evidence_wait", ctypes.byref(job))
+        job.depth = job.moved = None

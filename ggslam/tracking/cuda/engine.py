@@ -79,7 +79,8 @@ class CudaTrackingEngine:
         self._found = self._arrived.numpy()
         self._job = TrackJob(results=self._arrived.data_ptr())
         self._reference = ctypes.byref(self._job)
-        self._evidence: MoverEvidenceJob | None = None
+        self.evidence: MoverEvidenceJob = self._job.evidence
+        """What is asked of an alignment that brings evidence of what moves, but for depth and pose."""
         guess = np.frombuffer(self._job, np.float64, 12, _GUESS)
         self._guess_rotation, self._guess_translation = guess[:9].reshape(3, 3), guess[9:]
         job = self._job
@@ -157,13 +158,12 @@ class CudaTrackingEngine:
         """Where a frame's depth is on the device, if this very array was sent last."""
         return self._depth.address if self._depth.holds(depth) else None
 
-    def bring_evidence(self, job: MoverEvidenceJob | None) -> None:
-        """Has each alignment from now on make this evidence as well, of the depth on the device at the pose that it
-        finds: it is there when `align` returns. None: no more."""
-        self._evidence = job  # the kernels read it
-        if job is not None:
-            job.depth, job.pose = self._depth.address, self._results.data_ptr()
-        self._job.evidence = None if job is None else ctypes.addressof(job)
+    def bring_evidence(self, wanted: bool) -> None:
+        """Whether each alignment from now on makes `evidence` as well, of the depth on the device at the pose that it
+        finds: it is there when `align` returns."""
+        if wanted:
+            self.evidence.depth, self.evidence.pose = self._depth.address, self._results.data_ptr()
+        self._job.makes_evidence = wanted
 
     # --- parts -------------------------------------------------------------------------------------------------------
 

@@ -92,8 +92,8 @@ GGSLAM_EXPORT int ggslam_cuda_track_wait(const TrackJob* job) {
     if (job->makes_greys) launch_greys(job->greys, stream);
     launch_alignment(job->align, stream);
     if (job->looks) launch(residual_medians_kernel, 2, kMedianThreads, stream, job->align);
-    if (job->evidence != nullptr) {
-      const cudaError_t found = launch_mover_evidence(*job->evidence, stream);
+    if (job->makes_evidence) {
+      const cudaError_t found = launch_mover_evidence(job->evidence, stream);
       if (found != cudaSuccess) return found;
     }
     const cudaError_t copied = cudaMemcpyAsync(job->results, job->align.results, kAlignResults * sizeof(double),
