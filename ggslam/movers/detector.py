@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from ggslam.geometry.moved_depth import largest_shift
+from ggslam.movers.evidence import EvidenceRequest, EvidenceSource, HostEvidence
 from ggslam.movers.segments import Gathering, gather, grow_places
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.trail import Trail
@@ -23,7 +24,7 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
 from ggslam.sight.margin import Margin
-from ggslam.sight.places import CoarseView, compare, thin_out
+from ggslam.sight.places import CoarseView, thin_out
 from ggslam.system.array_forms import Form, Mask
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
@@ -43,7 +44,7 @@ class DetectorTuning(Tuning):
     """Fewest rows and columns of the reduced images."""
 
 
-@savable(not_saved="settings")
+@savable(not_saved="settings source")
 @dataclass
 class MoverDetector:
     """Detects movers in located frames. It gets each frame once, in order.
@@ -57,6 +58,7 @@ class MoverDetector:
         found: small mask of what moves, or may, in the latest frame...
         small: ...and of what does, as `mask`.
         things: int32 [H, W], number of the moving thing at each pixel, 0 without one, not grown; None: nothing.
+        source: compares the frames.
         expected: bool [H, W], what the next frame is located without: all of `found` that will be about there.
     """
 
@@ -69,12 +71,18 @@ class MoverDetector:
     expected: Mask | None = None
     segments: frozenset[int] = frozenset()
     trail: Trail = field(default_factory=Trail)
+    source: EvidenceSource = field(default_factory=HostEvidence)
 
     def expect(self, frame: Frame) -> Frame:
         """The frame to locate: without depth where something is expected to move."""
         if self.expected is None or self.expected.shape != frame.depth.shape:
             return frame
         return replace(frame, depth=np.where(self.expected, np.float32(0), frame.depth))
+
+    def prepare(self, frame: Frame, margin: Margin) -> None:
+        """A frame will be located next, and looked at with this margin as far as is known."""
+        if self.found is None and self.expected is None:
+            self.source.prepare(self._request(frame, margin))
 
     def look(
         self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, context: NativeContext,
@@ -95,30 +103,20 @@ class MoverDetector:
         if T_world_camera is None:
             self.views, self.found, self.small, self.expected, self.segments = [], None, None, None, frozenset()
             return
-        s, factor = self.settings, coarse_factor(frame.camera, self.settings)
-        view = CoarseView.of(frame.depth, frame.camera, factor, T_world_camera, margin, context)
+        s, request = self.settings, self._request(frame, margin)
+        view, evidence = self.source.look(request, T_world_camera, self.small, context)
         earlier, self.views = self.views, [*self.views[-DetectorTuning.ages[-1] :], *([] if swift else [view])]
-        passed, clearly, surely, same = np.zeros((4, *view.depth.shape), np.int8)
-        known, stayed, left = np.zeros((3, *view.depth.shape), bool)
-        ages = [age for age in DetectorTuning.ages if age <= len(earlier)]
-        found_by = compare(view, [earlier[-age] for age in ages], margin, context, self.small)
-        for age, evidence in zip(ages, found_by, strict=True):
-            passed += evidence.passed
-            clearly += evidence.clearly
-            surely += evidence.surely
-            same += evidence.same
-            known |= evidence.same | evidence.otherwise
-            if age <= s.rest_frames:
-                left |= evidence.otherwise
-                if 2 * age >= s.rest_frames:
-                    stayed |= evidence.same
         before, moved, moving = self.found, self.small, self.segments
         self.segments = frozenset()
         self.found = self.small = self.expected = None
+        if evidence is None:
+            return
+        passed, clearly, surely, same = evidence.passed, evidence.clearly, evidence.surely, evidence.same
+        known, stayed, left, factor = evidence.known, evidence.stayed, evidence.left, request.factor
         novel = passed + surely >= s.min_passed
         if moved is not None:
             novel |= (passed > 0) & grow_places(moved)
-        if novel.sum() < min(s.min_pixels, 3) and not moving:
+        if novel.sum() < request.fewest and not moving:
             return
         rests, judged, shape = stayed & ~left, stayed | left, frame.depth.shape
         places = Gathering(novel, passed > 0, known, rests, judged, view.depth, same > passed, factor, shape)
@@ -139,6 +137,10 @@ class MoverDetector:
             self.trail.add(view, self.small)
         likely = found.full > 0 if earlier and _stays_in_place(view, earlier[-1], found.small) else seen_twice
         self.expected = None if likely is None else grow(likely, DetectorTuning.prediction_margin)
+
+    def _request(self, frame: Frame, margin: Margin) -> EvidenceRequest:
+        factor, ages = coarse_factor(frame.camera, self.settings), DetectorTuning.ages
+        return EvidenceRequest(frame.depth, frame.camera, factor, self.views, ages, margin, self.settings)
 
     def clean(self, frame: Frame) -> Frame:
         """The frame at hand without depth where something moves, which `Frame.moving` tells."""

@@ -87,12 +87,8 @@ class CoarseView:
         context: NativeContext,
     ) -> CoarseView:  # fmt: skip
         """Of a depth image float32 [H, W]; rows and columns left over are cut."""
-        h, w = camera.height // factor, camera.width // factor
-        middle = (factor - 1) / 2
-        small = Camera(
-            w, h, camera.fx / factor, camera.fy / factor, (camera.cx - middle) / factor, (camera.cy - middle) / factor
-        )
-        around, window = np.ones((3, 3), np.uint8), _window(factor)
+        small = small_camera(camera, factor)
+        around, window = np.ones((3, 3), np.uint8), window_of(factor)
         nearest, farthest, least, count, total, squares = _depth_places(depth, factor, window // 2, context)
         mean = total / np.maximum(count, 1)
         spread = squares / np.maximum(count, 1) - mean * mean
@@ -119,7 +115,16 @@ def thin_out(image: np.ndarray, factor: int) -> np.ndarray:
     return np.ascontiguousarray(image[factor // 2 : rows : factor, factor // 2 : columns : factor])
 
 
-def _window(factor: int) -> int:
+def small_camera(camera: Camera, factor: int) -> Camera:
+    """The camera of an image's places; rows and columns left over are cut."""
+    middle = (factor - 1) / 2
+    return Camera(
+        camera.width // factor, camera.height // factor, camera.fx / factor, camera.fy / factor,
+        (camera.cx - middle) / factor, (camera.cy - middle) / factor,
+    )  # fmt: skip
+
+
+def window_of(factor: int) -> int:
     """Pixels across what is averaged: odd."""
     return 2 * round(5 / 6 * factor - 0.5) + 1
 

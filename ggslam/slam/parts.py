@@ -18,6 +18,8 @@ from ggslam.mapping.cpu.mapper import CpuMapper
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.mapper import CudaMapper
 from ggslam.mapping.mapper import Mapper
+from ggslam.movers.cuda.evidence import CudaEvidence
+from ggslam.movers.evidence import EvidenceSource, HostEvidence
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
@@ -51,6 +53,7 @@ class RunParts:
         context: threads of the CPU.
         masks: of objects.
         tracker: locates frames.
+        evidence: compares them to find what moves.
         mapper: builds the map.
         surface: what frames are aligned to.
         pager: keeps the run within its limit of memory; None without one.
@@ -62,6 +65,7 @@ class RunParts:
     context: NativeContext
     masks: ObjectMasks
     tracker: Tracker
+    evidence: EvidenceSource
     mapper: Mapper
     surface: MeasuredSurface
     pager: MapPager | None
@@ -94,7 +98,8 @@ def make_parts(
     mapper = make_mapper(config, masks.active, context, library, compact)
     if pager is not None:
         pager.serve(mapper)
-    return RunParts(context, masks, tracker, mapper, surface, pager, loops, library is not None, notes)
+    evidence = make_evidence(tracker, library)
+    return RunParts(context, masks, tracker, evidence, mapper, surface, pager, loops, library is not None, notes)
 
 
 def run_library(config: Config) -> tuple[CudaLibrary | None, str | None]:
@@ -163,6 +168,14 @@ def make_tracker(camera: Camera, config: Config, context: NativeContext, library
         return FeatureTracker(camera, config.tracking, config.edges_planes, context)
     engine = None if library is None else CudaTrackingEngine(camera, library.whole_device(None), library)
     return GicpTracker(camera, config.tracking, context, engine=engine)
+
+
+def make_evidence(tracker: Tracker, library: CudaLibrary | None) -> EvidenceSource:
+    """What compares frames to find what moves: where the tracker has their depth."""
+    engine = tracker.engine if isinstance(tracker, GicpTracker) else None
+    if library is None or not isinstance(engine, CudaTrackingEngine):
+        return HostEvidence()
+    return CudaEvidence(engine, library, engine.device)
 
 
 def make_pager(camera: Camera, config: Config, folder: Path | None) -> MapPager | None:

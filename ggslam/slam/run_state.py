@@ -76,6 +76,7 @@ class RunState:
         """Filters of the frames, by `Frame.camera_number`."""
         self.filters = FilterChain.join(self.chains)
         """All of them, each once."""
+        self.movers.detector.source = parts.evidence
         self.locator = self._make_locator(parts)
         self.schedule: Schedule = BesideTraining() if parts.on_device else Schedule()
         self.corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)

@@ -9,7 +9,7 @@ import numpy as np
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
 from ggslam.sight.margin import Margin
-from ggslam.sight.places import CoarseView, PairEvidence, PlaceTuning, _window, thin_out
+from ggslam.sight.places import CoarseView, PairEvidence, PlaceTuning, thin_out, window_of
 
 
 def coarse_view(
@@ -22,7 +22,7 @@ def coarse_view(
         w, h, camera.fx / factor, camera.fy / factor, (camera.cx - middle) / factor, (camera.cy - middle) / factor
     )
     own, around = np.ones((factor, factor), np.uint8), np.ones((3, 3), np.uint8)
-    window = _window(factor)
+    window = window_of(factor)
     near = thin_out(cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), own), factor)
     far, least = thin_out(cv2.dilate(depth, own), factor), thin_out(cv2.erode(depth, own), factor)
     count, total, squares = (

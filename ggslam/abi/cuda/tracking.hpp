@@ -6,6 +6,7 @@
 #include <cstdint>
 
 #include "abi/core/tracking.hpp"
+#include "abi/cuda/sight.hpp"
 #include "abi/export.hpp"
 
 namespace ggslam::cuda {
@@ -124,8 +125,9 @@ struct TrackJob {
   GreyJob reference, greys;
   VoxelLevelJob fine, coarse;
   AlignJob align;
+  MoverEvidenceJob evidence;
   double* results;  // [kAlignResults] in page-locked memory of the host, a copy of those of `align`
-  std::int32_t makes_points, makes_reference, makes_greys, makes_levels;
+  std::int32_t makes_points, makes_reference, makes_greys, makes_levels, makes_evidence;
   // Whether to tell of the matched points how many they are, and the medians of their squared distances and of their
   // depths.
   std::int32_t looks;

@@ -98,7 +98,10 @@ class MoverFilter(FrameFilter):
 
     def expect(self, frame: Frame) -> Frame:
         """The frame to locate: without depth where something is expected to move."""
-        return self.detector.expect(frame) if self.active else frame
+        if not self.active:
+            return frame
+        self.detector.prepare(frame, self._margin)
+        return self.detector.expect(frame)
 
     def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None

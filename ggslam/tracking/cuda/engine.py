@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from ggslam.abi.cuda import AlignJob, AlignResult, TrackJob
+from ggslam.abi.cuda import AlignJob, AlignResult, MoverEvidenceJob, TrackJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.scene.camera import Camera
@@ -79,6 +79,8 @@ class CudaTrackingEngine:
         self._found = self._arrived.numpy()
         self._job = TrackJob(results=self._arrived.data_ptr())
         self._reference = ctypes.byref(self._job)
+        self.evidence: MoverEvidenceJob = self._job.evidence
+        """What is asked of an alignment that brings evidence of what moves, but for depth and pose."""
         guess = np.frombuffer(self._job, np.float64, 12, _GUESS)
         self._guess_rotation, self._guess_translation = guess[:9].reshape(3, 3), guess[9:]
         job = self._job
@@ -151,6 +153,17 @@ class CudaTrackingEngine:
     def expect_target(self, target: GicpTarget) -> None:
         """See `Tracker.expect_target`."""
         self._target.stage(target)
+
+    def depth_address(self, depth: np.ndarray) -> int | None:
+        """Where a frame's depth is on the device, if this very array was sent last."""
+        return self._depth.address if self._depth.holds(depth) else None
+
+    def bring_evidence(self, wanted: bool) -> None:
+        """Whether each alignment from now on makes `evidence` as well, of the depth on the device at the pose that it
+        finds: it is there when `align` returns."""
+        if wanted:
+            self.evidence.depth, self.evidence.pose = self._depth.address, self._results.data_ptr()
+        self._job.makes_evidence = wanted
 
     # --- parts -------------------------------------------------------------------------------------------------------
 

@@ -42,5 +42,9 @@ class FrameUpload:
 
     def have(self, image: np.ndarray) -> None:
         """The same, unless this very array was sent last."""
-        if self._image is not image:
+        if not self.holds(image):
             self.send(image)
+
+    def holds(self, image: np.ndarray) -> bool:
+        """Whether this very array was sent last."""
+        return self._image is image

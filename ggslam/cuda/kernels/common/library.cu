@@ -3,6 +3,7 @@
 #include "abi/cuda/mapping.hpp"
 #include "abi/cuda/rendering.hpp"
 #include "abi/cuda/sampled_identity.hpp"
+#include "abi/cuda/sight.hpp"
 #include "abi/cuda/tracking.hpp"
 #include "abi/cuda/training.hpp"
 #include "abi/cuda/volumes.hpp"

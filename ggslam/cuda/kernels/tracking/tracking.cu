@@ -2,6 +2,7 @@
 // The C interface of tracking: points of a depth image, the voxels of a target, grey values, alignment; and all of it in
 // one call. Work is started on the caller's stream. Functions return 0 or a cudaError_t.
 #include "common/host.cuh"
+#include "sight/mover_evidence_launch.cuh"
 #include "tracking/alignment_kernels.cuh"
 #include "tracking/depth_points.cuh"
 #include "tracking/grey_images.cuh"
@@ -91,6 +92,10 @@ GGSLAM_EXPORT int ggslam_cuda_track_wait(const TrackJob* job) {
     if (job->makes_greys) launch_greys(job->greys, stream);
     launch_alignment(job->align, stream);
     if (job->looks) launch(residual_medians_kernel, 2, kMedianThreads, stream, job->align);
+    if (job->makes_evidence) {
+      const cudaError_t found = launch_mover_evidence(job->evidence, stream);
+      if (found != cudaSuccess) return found;
+    }
     const cudaError_t copied = cudaMemcpyAsync(job->results, job->align.results, kAlignResults * sizeof(double),
                                                cudaMemcpyDeviceToHost, stream);
     return copied != cudaSuccess ? copied : cudaStreamSynchronize(stream);
