@@ -144,7 +144,7 @@ class CudaEvidence:
             job.margin = SightMargin(m.least, m.share, m.sigmas, m.constant, m.square)
         ages, earlier = ages_and_parts(request), request.earlier
         n = job.count = len(ages)
-        job.slot, job.fewest_passed = self._ring.following(earlier), request.settings.min_passed
+        job.slot, job.fewest_passed = self._ring.next_slot(earlier), request.settings.min_passed
         # The newest is in the slot before: views lie one after the other.
         slots = [(job.slot - age) % self._ring.slots for age, _, _ in ages]
         self._slots[:n] = slots

@@ -34,7 +34,7 @@ class ViewRing:
         self.T_camera_world = np.zeros((slots, 12))
         """Rows of [R t] of the view in each slot."""
 
-    def following(self, views: list[CoarseView]) -> int:
+    def next_slot(self, views: list[CoarseView]) -> int:
         """The slot after that of the newest of these; those of `slots` - 1 views stay as they are."""
         return (views[-1].slot + 1) % self.slots if views and isinstance(views[-1], CudaView) else 0
 

@@ -73,9 +73,11 @@ struct WindowSums {
 __device__ inline WindowSums window_sums(const MoverEvidenceJob& job, int u, int v) {
   double total = 0, squares = 0;
   float count = 0;
+#pragma unroll 1
   for (int x = u - job.reach; x <= u + job.reach; ++x) {
     const int column = mirrored_far(x, job.width);
     double column_total = 0, column_squares = 0;
+#pragma unroll 1
     for (int y = v - job.reach; y <= v + job.reach; ++y) {
       const float z = job.depth[static_cast<std::int64_t>(mirrored_far(y, job.height)) * job.width + column];
       column_total += static_cast<double>(z), column_squares += static_cast<double>(__fmul_rn(z, z));
