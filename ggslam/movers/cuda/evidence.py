@@ -117,9 +117,18 @@ class CudaEvidence:
         return np.frombuffer(self._job, dtype, count, field.offset)
 
     def _is_for_the_host(self, request: EvidenceRequest) -> bool:
-        """Whether there are views that are not on the device, or more of them than one is compared with."""
-        earlier = request.earlier
-        return len(request.ages) > MOST_EARLIER or (bool(earlier) and not isinstance(earlier[-1], CudaView))
+        """Whether there are views that are not in the ring, or more of them than one is compared with."""
+        if len(request.ages) > MOST_EARLIER:
+            return True
+        if not request.earlier:
+            return False
+        newest = request.earlier[-1]
+        return not (isinstance(newest, CudaView) and newest.ring is self._ring and self._has_room(request))
+
+    def _has_room(self, request: EvidenceRequest) -> bool:
+        """Whether memory is for frames of this size."""
+        job, camera = self._job, request.camera
+        return (job.width, job.height, job.factor) == (camera.width, camera.height, request.factor)
 
     def _is_made(self, request: EvidenceRequest, prepared: EvidenceRequest | None, T: np.ndarray) -> bool:
         """Whether the last alignment made what is asked for."""
@@ -134,9 +143,7 @@ class CudaEvidence:
     def _fill(self, request: EvidenceRequest) -> None:
         """Sets what is asked of the kernels but for depth and pose."""
         job = self._job
-        if self._ring is None or (job.width, job.height, job.factor) != (
-            request.camera.width, request.camera.height, request.factor
-        ):  # fmt: skip
+        if self._ring is None or not self._has_room(request):
             self._make_room(request.camera, request.factor, request.ages[-1] + 2)
         assert self._ring is not None
         if self._margin != request.margin:
