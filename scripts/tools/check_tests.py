@@ -70,7 +70,7 @@ FAULTS = (
           "corrections[node] = self.covariances[k] @ push", ("loops/test_pose_graph.py",)),
     Fault("codec", "ggslam/native/src/codec/kernels/quantiser.hpp", "return (q * step_[component] + 128) >> 8;",
           "return (q * step_[component]) >> 8;", ("coding/test_golden_streams.py", "coding/test_attribute_coder.py")),
-    Fault("tsdf", "ggslam/native/src/volumes/kernels/tsdf_voxels.cpp",
+    Fault("tsdf", "ggslam/native/formulas/tsdf_voxel.hpp",
           "const Float total = weight + measured, share = measured / total;",
           "const Float total = weight + measured, share = weight / total;", ("volumes/test_tsdf_fusion.py",)),
     Fault("association", "ggslam/objects/association.py",

@@ -39,7 +39,7 @@ ALLOWED = {
     "ggslam.objects.onnx_sessions:_open_session": "onnxruntime takes names only; the door looks first",
     "ggslam.formats.gaussian_usd_reading:read_gaussian_usd": "usd-core takes names only; the door looks first",
     "ggslam.slam.color_poses:_decode": "JPEGs that this process made, in memory",
-    "ggslam.mapping.between_frames:view": "JPEGs that this process made, in memory",
+    "ggslam.mapping.between_frames:decode": "JPEGs that this process made, in memory",
     "ggslam.system.process_memory:peak_memory_bytes": "/proc",
     "ggslam.system.process_memory:resident_bytes": "/proc",
     "ggslam.system.process_memory:most_memory_bytes": "/sys",
