@@ -29,7 +29,7 @@ class Said:
     """
 
     def __init__(self, command: list[str]) -> None:
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "300"}
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "300", "PYTHONFAULTHANDLER": "1"}
         environment.pop("CYCLONEDDS_URI", None)
         self.process = subprocess.Popen(
             command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -75,7 +75,12 @@ class Said:
         return self.wait(seconds)
 
     def wait(self, seconds: float) -> int:
-        status = self.process.wait(seconds)
+        try:
+            status = self.process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.process.send_signal(signal.SIGABRT)  # it tells what its threads are at
+            self._reader.join(5)
+            raise TimeoutError(f"did not end in {seconds:g} s:\n" + "\n".join(self.lines[-80:])) from None
         self._reader.join(5)
         return status
 

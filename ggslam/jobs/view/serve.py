@@ -128,7 +128,7 @@ def wait_for_interrupt(announce: Callable[[], None]) -> None:
     """Says what is waited for, and returns at Ctrl-C, also if it comes while that is said."""
     try:
         announce()
-        while True:
-            time.sleep(3600)
+        while True:  # a signal that another thread of the process gets does not end a sleep of this one
+            time.sleep(1.0)
     except KeyboardInterrupt:
         pass
