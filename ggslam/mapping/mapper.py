@@ -543,15 +543,18 @@ class Mapper(ABC):
             times.loss += watch.lap()
         step = self._rasterizer.backward_step(
             self.map, loss.d_image, loss.d_depth, loss.d_alpha, grad_features,
-            optimizer=self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles),
+            optimizer=self._optimizer(rate_factor, settles),
             detach_features=identity is None or identity.settings.detach,
         )  # fmt: skip
-        share = 1 if grid.is_whole else 1 / MapperTuning.noisy_steps  # fewer pixels tell less of where the camera was
-        pose_rate = 0.0 if self.is_world(keyframe) else share * pose_factor * self._pose_rate
-        self._finish_step(keyframe, step.twist, loss, pose_rate)
+        self._finish_step(keyframe, step.twist, loss, self._pose_rate_of(keyframe, grid, pose_factor))
         times.backward += watch.lap()
         times.steps += 1
         keyframe.iterations += 1
+
+    def _pose_rate_of(self, keyframe: Keyframe, grid: PixelGrid, pose_factor: float) -> float:
+        """Size of a step of a keyframe's pose, metres and radians; 0: it stays."""
+        share = 1 if grid.is_whole else 1 / MapperTuning.noisy_steps  # fewer pixels tell less of where the camera was
+        return 0.0 if self.is_world(keyframe) else share * pose_factor * self._pose_rate
 
     def _count_iteration(self) -> None:
         self.times.iterations += 1
@@ -690,6 +693,9 @@ class Mapper(ABC):
         view = self._render(keyframe, features=False)
         for _ in range(steps):
             self.identity.step(self.map, self._rasterizer, keyframe, view, rate_factor)
+
+    def _optimizer(self, rate_factor: float, settles: bool) -> AdamSettings:
+        return self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles)
 
     def _standard_adam(self, settles: bool = False) -> AdamSettings:
         """Made once: every step asks for it."""

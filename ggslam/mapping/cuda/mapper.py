@@ -26,6 +26,7 @@ from ggslam.mapping.cuda.between_view import CudaBetweenView
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceKeyframe, ImageStore
+from ggslam.mapping.cuda.keyframe_look import KeyframeLook
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
 from ggslam.mapping.cuda.shown_gaussians import mark_shown
@@ -36,7 +37,7 @@ from ggslam.mapping.extra_loss import new_faults, refuse_faults
 from ggslam.mapping.identity import MaskOnGrid
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.keyframe_exposures import KeyframeExposures
-from ggslam.mapping.labelling import Labeller, MapLabels
+from ggslam.mapping.labelling import Labeller
 from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, MapperTuning
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
@@ -44,7 +45,7 @@ from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
-from ggslam.rendering.exposure import ExposureTuning, SeenAgain, identity_exposure
+from ggslam.rendering.exposure import identity_exposure
 from ggslam.rendering.types import LOW_PASS, RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -183,7 +184,7 @@ class CudaMapper(ComparingMapper):
         begin_others()
         assert isinstance(keyframe, CudaKeyframe)
         labels = self.identity is not None and labeller is not None
-        look = _Look(self, keyframe, T_world_camera, labels, self.settings.exposure.compensate)
+        look = KeyframeLook(self, keyframe, T_world_camera, labels, self.settings.exposure.compensate)
         color = self._colors(keyframe, look.view())
         if color is not keyframe.color:
             look.select_again(upload(color, self.device))
@@ -364,9 +365,7 @@ class CudaMapper(ComparingMapper):
             self._start_steps()
         images, shown = keyframe.device_images(), self._comparable_on_device(keyframe, grid)
         rate_factor, pose_factor = factors
-        optimizer = self._standard_adam(settles) if rate_factor == 1 else self._adam(rate_factor, settles)
-        fixed = keyframe.index == self._all_numbers[0] or (keyframe.instant is not None and self.is_world(keyframe))
-        pose_rate = 0.0 if fixed else pose_factor * self._pose_rate
+        optimizer, pose_rate = self._optimizer(rate_factor, settles), self._pose_rate_of(keyframe, grid, pose_factor)
         training.add(kind, keyframe.index, images, keyframe.depth_unit, shown, optimizer, pose_rate)
         if lessons is not None:
             training.teach_last(lessons, self.map, keyframe)
@@ -397,77 +396,3 @@ class CudaMapper(ComparingMapper):
             keyframe.index, twist, loss.results, self._rasterizer.last_overflowed, pose_rate,
             self.settings.exposure if steps_exposure else None,
         )  # fmt: skip
-
-
-_SOME = (..., slice(None, None, ExposureTuning.stride), slice(None, None, ExposureTuning.stride))
-_LABEL_STRIDE = 2
-
-
-class _Look:
-    """At the map from a new keyframe, and at what it lacks there. Everything is started at once, and the host waits
-    once for what it has to know. If the rendering found no room for a part of the map, it is all done again with room.
-
-    Args:
-        mapper: whose map it is.
-        keyframe: the new one.
-        T_world_camera: [4, 4], its pose.
-        with_labels: whether what the map shows of the objects will be asked for.
-        with_colors: whether its colours will be.
-    """
-
-    def __init__(
-        self, mapper: CudaMapper, keyframe: CudaKeyframe, T_world_camera: np.ndarray, with_labels: bool,
-        with_colors: bool,
-    ) -> None:  # fmt: skip
-        self._mapper, self._keyframe, self._T = mapper, keyframe, T_world_camera
-        self._with_labels, self._with_colors = with_labels, with_colors
-        self.shows = mapper.map.count > 0
-        """Whether there is a map to look at."""
-        self._count: int | None = None
-        self._found: list[np.ndarray] = []
-        self._start(with_room=False)
-
-    def _start(self, with_room: bool) -> None:
-        mapper, keyframe, self._with_room = self._mapper, self._keyframe, with_room
-        alpha = depth = None
-        self._wanted: list[torch.Tensor] = []
-        if self.shows:
-            view = mapper.render_keyframe(keyframe, with_room)
-            alpha, depth = view.alpha, view.expected_depth
-            if self._with_labels:
-                self._wanted += [*mapper.labels_on_grid(alpha, _LABEL_STRIDE), depth]
-            if self._with_colors:
-                self._wanted += [image[_SOME].contiguous() for image in (view.image, alpha, depth)]
-        self._explained = mapper.find_explained(keyframe, alpha, depth)
-        self.selection = mapper.selection(keyframe.device_images().color, keyframe, self._explained, self._T)
-
-    def select_again(self, color: torch.Tensor) -> None:
-        """Chooses pixels of the keyframe with other colours, uint8 [H, W, 3] on the device."""
-        self.count()  # by now it is known whether there was room
-        self._color = color  # it has to stay
-        self.selection = self._mapper.selection(color, self._keyframe, self._explained, self._T)
-        self._count = int(download(self.selection.total)[0][0])
-
-    def labels(self) -> MapLabels:
-        """What the map shows of the objects, looked at on every `_LABEL_STRIDE`-th pixel and row; on the host."""
-        self.count()
-        ids, share, depth = self._found[:3]
-        return MapLabels.from_grid(ids, share, depth, _LABEL_STRIDE)
-
-    def view(self) -> SeenAgain | None:
-        """What the map shows where the keyframe looks; None: nothing, or colours were not asked for."""
-        if not (self.shows and self._with_colors):
-            return None
-        self.count()
-        image, alpha, depth = self._found[-3:]
-        return SeenAgain(image, alpha, depth, self._keyframe.depth_m()[_SOME], thinned=True)
-
-    def count(self) -> int:
-        """Of the Gaussians to insert."""
-        while self._count is None:
-            *self._found, total, short = download(*self._wanted, self.selection.total, self._mapper.room_was_short)
-            if short[0] and self.shows and not self._with_room:
-                self._start(with_room=True)
-            else:
-                self._count = int(total[0])
-        return self._count
