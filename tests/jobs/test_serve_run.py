@@ -67,15 +67,16 @@ def test_a_run_is_published(room_run: RunFolder) -> None:
 
 def test_nothing_is_made_that_nobody_listens_to_and_who_joins_gets_all(room_run: RunFolder) -> None:
     outlet = KeptOutlet(everybody=0)
+    tiles = len(np.unique(tile_of(surface_points(room_run, None).points), axis=0))
     with served(room_run, outlet) as (_, publisher):
         time.sleep(0.1)
         assert not outlet.sent and publisher.newest(c.POINT_TILES) == []
         outlet.join(c.POINT_TILES.name)
-        until(lambda: outlet.of(c.POINT_TILES.name))
-        publisher.wait_idle(5.0)
-        first = len(outlet.of(c.POINT_TILES.name))
+        until(lambda: len(outlet.of(c.POINT_TILES.name)) >= tiles)  # idle between two tiles is not the end of them
+        assert publisher.wait_idle(5.0) and len(outlet.of(c.POINT_TILES.name)) == tiles
         outlet.join(c.POINT_TILES.name)  # a second one: all tiles again
-        until(lambda: len(outlet.of(c.POINT_TILES.name)) == 2 * first)
+        until(lambda: len(outlet.of(c.POINT_TILES.name)) >= 2 * tiles)
+        assert publisher.wait_idle(5.0) and len(outlet.of(c.POINT_TILES.name)) == 2 * tiles
         assert not outlet.of(c.POINTS.name)
 
 
