@@ -15,7 +15,6 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from ggslam.abi.core import SightMargin
 from ggslam.abi.cuda import EVIDENCE_PLANES, MOST_EARLIER, EvidencePart, MoverEvidenceFound, MoverEvidenceJob
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
@@ -147,8 +146,7 @@ class CudaEvidence:
             self._make_room(request.camera, request.factor, request.ages[-1] + 2)
         assert self._ring is not None
         if self._margin != request.margin:
-            m = self._margin = request.margin
-            job.margin = SightMargin(m.least, m.share, m.sigmas, m.constant, m.square)
+            self._margin, job.margin = request.margin, request.margin.native()
         ages, earlier = ages_and_parts(request), request.earlier
         n = job.count = len(ages)
         job.slot, job.fewest_passed = self._ring.next_slot(earlier), request.settings.min_passed
