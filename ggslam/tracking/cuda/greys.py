@@ -96,9 +96,10 @@ class CudaGreys:
         self, view: FeatureView, reference: FeatureView, settings: PhotometricSettings, shrink: int, least: int
     ) -> CudaPhotometricPart | None:
         """The photometric part of a frame; None if an alignment has told that it has not enough texture."""
-        if self._part is None or not self._part.is_of(view, reference, settings, shrink):
-            self._part = CudaPhotometricPart(view, reference, settings, shrink, least)
-        return self._part if self._part.has_texture else None
+        if self._part is not None and self._part.is_of(view, reference, settings, shrink):
+            return self._part if self._part.has_texture else None
+        self._part = CudaPhotometricPart(view, reference, settings, shrink, least)
+        return self._part
 
     def prepare(self, part: CudaPhotometricPart) -> tuple[GreyJob | None, GreyJob | None]:
         """What has to be made before the part is used, of the reference and of the frame; None: it is there. Images

@@ -83,7 +83,8 @@ class CudaPoints:
     @property
     def median_depth(self) -> float:
         """Median depth in metres, 0 without points. Waits for the device if the points were not aligned yet."""
-        return self._known_header()[1]
+        header = self._header
+        return self._known_header()[1] if header is None else header[1]
 
     def median_depth_if_known(self) -> float | None:
         """Median depth in metres; None before the points were aligned."""
