@@ -33,8 +33,9 @@ class Marker:
 
     def wait_if_ahead(self) -> None:
         """As `wait`, for a place that the device has mostly passed long ago."""
-        if not self.is_passed():
-            self.wait()
+        event = self._event
+        if event is not None and not event.query():
+            event.synchronize()
 
 
 def _allocate_page_locked(size: int, device: torch.device) -> torch.Tensor:

@@ -71,9 +71,9 @@ def count_comparisons(
         if image.shape != shape:
             raise ValueError(f"views: expected depth {shape}, found {image.shape}")
         view.depth, view.T_world_camera[:] = address(image), pose[:3].ravel().tolist()
+    second, least_shift = ctypes.addressof(views) + ctypes.sizeof(LocatedDepth), FixedTuning.min_shift * camera.width
     job = FixedToCameraJob(
-        views[0], ctypes.addressof(views) + ctypes.sizeof(LocatedDepth), len(earlier), camera.height, camera.width,
-        camera.fx, camera.fy, camera.cx, camera.cy, _SAME.native(), _PAST.native(), FixedTuning.min_shift * camera.width,
-        address(counts),
+        views[0], second, len(earlier), *shape, camera.fx, camera.fy, camera.cx, camera.cy, _SAME.native(),
+        _PAST.native(), least_shift, address(counts),
     )  # fmt: skip
     load_library().ggslam_fixed_to_camera(job)

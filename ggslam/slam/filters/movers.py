@@ -47,7 +47,7 @@ DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
 
 
-@savable(not_saved="_reads_masks _margin context")
+@savable(not_saved="_reads_masks _noise _margin context")
 class MoverFilter(FrameFilter):
     """Detects movers in each located frame, if the settings ask for it.
 
@@ -68,6 +68,7 @@ class MoverFilter(FrameFilter):
         """What was found in the frames so far."""
         self.tracks = MoverTracks()
         """The movers one by one."""
+        self._noise: DepthNoise | None = None
         self._margin = _margin(settings, DepthNoise())
         self._before = None
         """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
@@ -98,7 +99,7 @@ class MoverFilter(FrameFilter):
 
     def expect(self, frame: Frame) -> Frame:
         """The frame to locate: without depth where something is expected to move."""
-        if not self.active:
+        if not self.detector.settings.enabled:
             return frame
         self.detector.prepare(frame, self._margin)
         return self.detector.expect(frame)
@@ -108,15 +109,15 @@ class MoverFilter(FrameFilter):
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The frame without depth where something moves, which `Frame.moving` tells, and the result without points
         of it."""
-        if not self.active:
+        if not self.detector.settings.enabled:
             return frame, result
         result = self._look(frame, result, noise)
         return self.detector.clean(frame), result
 
     def _look(self, frame: Frame, result: TrackingResult, noise: DepthNoise | None) -> TrackingResult:
         """Finds what moves in a frame that was located; returns the result without points of it."""
-        noise = noise or DepthNoise()
-        self._margin = _margin(self.detector.settings, noise)
+        if noise is not self._noise:
+            self._noise, self._margin = noise, _margin(self.detector.settings, noise or DepthNoise())
         known = result.status not in DOUBTFUL
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
         T_world_camera = result.T_world_camera if known else None

@@ -35,14 +35,14 @@ class FrameUpload:
     def send(self, image: np.ndarray) -> None:
         """Starts to send an image; the host waits only if the last one is still on its way."""
         self._sent.wait_if_ahead()
-        np.copyto(self.staged, image)
+        self.staged[...] = image
         self._memory.copy_(self._staged, non_blocking=True)
         self._sent.set()
         self._image = image
 
     def have(self, image: np.ndarray) -> None:
         """The same, unless this very array was sent last."""
-        if not self.holds(image):
+        if self._image is not image:
             self.send(image)
 
     def holds(self, image: np.ndarray) -> bool:
