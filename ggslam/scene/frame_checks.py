@@ -70,9 +70,11 @@ def check_frame(frame: Frame, camera: Camera) -> None:
         raise SequenceError(f"frame {frame.source_index}: depth has negative, infinite or NaN values; 0 means none")
     if not math.isfinite(frame.timestamp):
         raise SequenceError(f"frame {frame.source_index}: its time is {frame.timestamp}, expected seconds")
-    T = frame.T_world_camera
-    if T is not None and (np.shape(T) != (4, 4) or not np.isfinite(T).all()):
-        found = "numbers that are not finite" if np.shape(T) == (4, 4) else f"shape {list(np.shape(T))}"
+    if frame.T_world_camera is None:
+        return
+    T = np.asarray(frame.T_world_camera)
+    if T.shape != (4, 4) or not np.logical_and.reduce(np.isfinite(T), axis=None):
+        found = "numbers that are not finite" if T.shape == (4, 4) else f"shape {list(T.shape)}"
         raise SequenceError(
             f"frame {frame.source_index}: T_world_camera has {found}, expected a finite 4x4 matrix or None"
         )

@@ -57,11 +57,6 @@ class PoseJudge:
         """Features that the frame shares with the last located ones."""
         return SharedFeatures(self.view, self.motion.views, self.camera, self.settings.features)
 
-    @property
-    def has_matched(self) -> bool:
-        """Whether features were asked for."""
-        return "features" in self.__dict__
-
     # --- starts ------------------------------------------------------------------------------------------------------
 
     def first_start(self) -> tuple[np.ndarray, bool]:
@@ -108,7 +103,7 @@ class PoseJudge:
 
     def is_vouched(self, found: AlignmentResult) -> bool:
         """Whether features, if they were asked, vouch for a pose."""
-        if found.status is AlignmentStatus.LOST or not self.has_matched:
+        if found.status is AlignmentStatus.LOST or "features" not in self.__dict__:
             return False
         return self.features.vouch(found.T_world_camera)
 
@@ -137,7 +132,9 @@ class PoseJudge:
 
     def jump(self, T_world_camera: np.ndarray) -> str:
         """Why the path jumps at a pose [4, 4], as far as features were asked; empty if it does not."""
-        return self.features.contradict(T_world_camera, SharedFeatureTuning.jump_slack) if self.has_matched else ""
+        if "features" not in self.__dict__:
+            return ""
+        return self.features.contradict(T_world_camera, SharedFeatureTuning.jump_slack)
 
     def _matches_what_was_seen(self, found: AlignmentResult, points: PointSource) -> bool:
         """Whether the overlap is convincing for so much as the last views show of the frame: a fast turn leaves

@@ -143,8 +143,8 @@ def _is_all_over(rows: np.ndarray, columns: np.ndarray, stays: np.ndarray, shape
     still = np.bincount(cells[stays], minlength=StillTuning.cells**2)
     counted = textured >= StillTuning.min_cell_pixels
     stay = counted & (still >= StillTuning.min_still_share * textured)
-    count = np.count_nonzero(counted)
-    return bool(count >= StillTuning.cells and np.count_nonzero(stay) >= StillTuning.min_still_cells * count)
+    count = np.add.reduce(counted)
+    return bool(count >= StillTuning.cells and np.add.reduce(stay) >= StillTuning.min_still_cells * count)
 
 
 def _stays_each_way(x: np.ndarray, y: np.ndarray, stays: np.ndarray) -> bool:

@@ -102,7 +102,7 @@ class MoverFilter(FrameFilter):
         if not self.detector.settings.enabled:
             return frame
         self.detector.prepare(frame, self._margin)
-        return self.detector.expect(frame)
+        return frame if self.detector.expected is None else self.detector.expect(frame)
 
     def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
@@ -112,7 +112,7 @@ class MoverFilter(FrameFilter):
         if not self.detector.settings.enabled:
             return frame, result
         result = self._look(frame, result, noise)
-        return self.detector.clean(frame), result
+        return frame if self.detector.mask is None else self.detector.clean(frame), result
 
     def _look(self, frame: Frame, result: TrackingResult, noise: DepthNoise | None) -> TrackingResult:
         """Finds what moves in a frame that was located; returns the result without points of it."""
