@@ -10,12 +10,21 @@ import numpy as np
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 
+_WHERE_IT_WAS = np.eye(4)
+
 
 def largest_shift(T_new_old: np.ndarray, camera: Camera, depth_m: float) -> float:
     """About how many pixels what is seen at a depth (metres) shifts in the image when the camera makes a motion
     [4, 4]."""
+    return shift_between(_WHERE_IT_WAS, T_new_old, camera, depth_m)
+
+
+def shift_between(T_world_new: np.ndarray, T_world_old: np.ndarray, camera: Camera, depth_m: float) -> float:
+    """The same when it moves from one pose [4, 4] to another."""
+    back = T_world_new[:3, :3].T
     # Numbers: arrays of four corners cost several times as much.
-    (a, b, c, tx), (d, e, f, ty), (g, h, i, tz), _ = T_new_old.tolist()
+    (a, b, c), (d, e, f), (g, h, i) = (back @ T_world_old[:3, :3]).tolist()
+    tx, ty, tz = (back @ (T_world_old[:3, 3] - T_world_new[:3, 3])).tolist()
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     largest, z = 0.0, depth_m
     for u in (0, camera.width - 1):

@@ -14,7 +14,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from ggslam.geometry.moved_depth import largest_shift
+from ggslam.geometry.moved_depth import shift_between
 from ggslam.movers.evidence import EvidenceRequest, EvidenceSource, HostEvidence
 from ggslam.movers.segments import Gathering, gather, grow_places
 from ggslam.movers.settings import MoverSettings
@@ -22,10 +22,10 @@ from ggslam.movers.trail import Trail
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse
 from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView, thin_out
 from ggslam.system.array_forms import Form, Mask
+from ggslam.system.medians import median
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 
@@ -165,8 +165,7 @@ def _stays_in_place(view: CoarseView, before: CoarseView, places: np.ndarray) ->
     seen = view.depth[places & (view.depth > 0)]
     if not len(seen):
         return False
-    T_new_old = inverse(view.T_world_camera) @ before.T_world_camera
-    shift = largest_shift(T_new_old, view.camera, float(np.median(seen)))
+    shift = shift_between(view.T_world_camera, before.T_world_camera, view.camera, median(seen))
     return shift * 320 <= 2 * DetectorTuning.prediction_margin * view.camera.width
 
 

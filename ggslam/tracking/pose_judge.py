@@ -10,9 +10,8 @@ from functools import cached_property
 import numpy as np
 
 from ggslam.features.orb import FeatureView
-from ggslam.geometry.moved_depth import largest_shift
+from ggslam.geometry.moved_depth import shift_between
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.feature_hold import hold_to_features
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus
@@ -89,7 +88,7 @@ class PoseJudge:
     def _shift(self, T_one: np.ndarray, T_other: np.ndarray) -> float:
         """By what share of its width the image shifts between two poses [4, 4]."""
         depth_m = min(self.depth_m or JudgeTuning.near_m, JudgeTuning.near_m)
-        return largest_shift(inverse(T_one) @ T_other, self.camera, depth_m) / self.camera.width
+        return shift_between(T_one, T_other, self.camera, depth_m) / self.camera.width
 
     # --- witnesses ---------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ggslam.geometry.moved_depth import largest_shift
+from ggslam.geometry.moved_depth import shift_between
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor, grow
 from ggslam.movers.recent import RecentFrame
@@ -17,7 +17,6 @@ from ggslam.movers.tracks import MoverTracks
 from ggslam.movers.trail import gone_since
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView
@@ -138,7 +137,7 @@ class MoverFilter(FrameFilter):
         before, self._before = self._before, None if T_world_camera is None else (frame.timestamp, T_world_camera)
         if before is None or T_world_camera is None or not frame.timestamp > before[0]:
             return False
-        shift = largest_shift(inverse(T_world_camera) @ before[1], frame.camera, depth_m)
+        shift = shift_between(T_world_camera, before[1], frame.camera, depth_m)
         return shift > MoverFilterTuning.max_shift_per_s * frame.camera.width * (frame.timestamp - before[0])
 
     def after_insertion(self, removal: MapRemoval, newest: Frame) -> None:

@@ -148,7 +148,7 @@ class CudaTrackingEngine:
         found = self._found.copy()
         source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
         if isinstance(photometric, CudaPhotometricPart):
-            self.greys.arrived()
+            self.greys.color.arrived()
             photometric.textured = int(found[AlignResult.TEXTURED])
         return cuda_alignment(found, matched, max(1, room), source.looks, settings)
 

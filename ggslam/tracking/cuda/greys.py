@@ -80,7 +80,8 @@ class CudaGreys:
     def __init__(self, library: CudaLibrary, device: torch.device, camera: Camera, depth: FrameUpload) -> None:
         self._library, self._device, self._camera = library, device, camera
         self._depth = depth
-        self._color = FrameUpload((camera.height, camera.width, 3), np.uint8, device)
+        self.color = FrameUpload((camera.height, camera.width, 3), np.uint8, device)
+        """Where the frame's colour is sent to."""
         self._others: tuple[FrameUpload, FrameUpload] | None = None
         self._memory = GrowingMemory(device)
         self._images: list[_Image] = []
@@ -120,19 +121,13 @@ class CudaGreys:
             job.makes_reference = 1
         if self._made is not part:
             image = self._image_of(part.view, part.shrink) or self._place_for(part.view, part.shrink, part.reference)
-            job.greys = self._job_for(part.view, image, self._color, self._depth, chooses=True)
+            job.greys = self._job_for(part.view, image, self.color, self._depth, chooses=True)
             job.makes_greys = 1
             self._made = part
         self._set_reference(reference, part.reference)
         align = job.align
         align.photometric_points, align.textured = self.points, self._job.count
         align.reference, align.least_textured = self.reference, part.least
-
-    def arrived(self) -> None:
-        """The host has waited for the stream that images were sent on."""
-        self._color.arrived()
-        for upload in self._others or ():
-            upload.arrived()
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
