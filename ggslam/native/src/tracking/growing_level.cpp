@@ -15,7 +15,12 @@ constexpr std::size_t kKnownVersions = 64;  // whose changes are kept
 constexpr uint32_t kNewest = ~uint32_t{0};
 
 std::size_t count_of(uint64_t occupied) { return static_cast<std::size_t>(__builtin_popcountll(occupied)); }
-std::size_t units_of(uint64_t occupied) { return (count_of(occupied) + kPlaceUnit - 1) / kPlaceUnit; }
+std::size_t units_for(uint64_t occupied) { return (count_of(occupied) + kPlaceUnit - 1) / kPlaceUnit; }
+
+// Of the place that a block leaves. The first ones lie close together.
+std::size_t units_of(const VoxelBlock& block) {
+  return block.version == kFirstVersion ? count_of(block.occupied) / kPlaceUnit : units_for(block.occupied);
+}
 
 // Voxels of a block that are at its side in direction (x, y, z), each of -1, 0, 1.
 uint64_t side(int x, int y, int z) {
@@ -80,17 +85,21 @@ void GrowingLevel::make_room(std::size_t more) {
 }
 
 uint32_t GrowingLevel::take_place(uint64_t occupied) {
-  const std::size_t units = units_of(occupied);
+  const std::size_t units = units_for(occupied);
   std::vector<uint32_t>& free = free_places_[units];
   if (!free.empty()) {
     const uint32_t place = free.back();
     free.pop_back();
     return place;
   }
+  return append_place(kPlaceUnit * units);
+}
+
+uint32_t GrowingLevel::append_place(std::size_t voxels) {
   const std::size_t place = places_;
-  if (place + kPlaceUnit * units > static_cast<std::size_t>(std::numeric_limits<int32_t>::max()))
+  if (place + voxels > static_cast<std::size_t>(std::numeric_limits<int32_t>::max()))
     refuse("target: expected at most %d voxels", std::numeric_limits<int32_t>::max());
-  places_ += kPlaceUnit * units;
+  places_ += voxels;
   voxels_.reserve(place, places_);
   moments_.reserve(place, places_);
   return static_cast<uint32_t>(place);
@@ -122,11 +131,10 @@ void GrowingLevel::publish(uint64_t key, int32_t block) {
   if (is_new) __atomic_store_n(&slot_key_.get()[slot], key, __ATOMIC_RELEASE);
 }
 
-void GrowingLevel::append(uint64_t key, uint64_t occupied, const VoxelMoments* moments, const Voxel* voxels,
-                          uint32_t version) {
+void GrowingLevel::append(uint64_t key, uint64_t occupied, const VoxelMoments* moments, const Voxel* voxels) {
   make_room(1);
-  const uint32_t first = take_place(occupied);
-  const int32_t block = new_block(key, {occupied, first, version}, -1);
+  const uint32_t first = append_place(count_of(occupied));
+  const int32_t block = new_block(key, {occupied, first, kFirstVersion}, -1);
   std::copy_n(moments, count_of(occupied), moments_.get() + first);
   if (voxels) std::copy_n(voxels, count_of(occupied), voxels_.get() + first);
   shaped_[static_cast<std::size_t>(block)] = voxels != nullptr;
@@ -203,7 +211,7 @@ void GrowingLevel::collect(uint32_t version) {
   for (; !replaced_.empty() && replaced_.front().version <= version; replaced_.pop_front()) {
     const int32_t block = replaced_.front().block;
     const VoxelBlock& old = blocks_.get()[block];
-    free_places_[units_of(old.occupied)].push_back(old.first);
+    if (units_of(old) > 0) free_places_[units_of(old)].push_back(old.first);
     free_blocks_.push_back(block);
     shaped_[static_cast<std::size_t>(block)] = 1;  // nobody will ask
   }

@@ -12,6 +12,8 @@
 
 namespace ggslam {
 
+constexpr uint32_t kFirstVersion = 1;
+
 // An array that is longer from time to time while others read it: those go on reading the one that they were handed.
 template <typename T>
 class SharedArray {
@@ -67,8 +69,8 @@ class GrowingLevel {
   // Puts the blocks at new places as of `version`, and with `spread` those beside them whose voxels touch changed ones.
   std::vector<PlacedBlock> place(const std::vector<ChangedBlock>& changed, bool spread, uint32_t version);
 
-  // As a new block; for the contents of another target. The voxels have their shapes if `shaped`.
-  void append(uint64_t key, uint64_t occupied, const VoxelMoments* moments, const Voxel* voxels, uint32_t version);
+  // As a new block of the first version, behind those that are there; `voxels` is null if they have no shapes.
+  void append(uint64_t key, uint64_t occupied, const VoxelMoments* moments, const Voxel* voxels);
 
   // The newest version, which is `version`.
   HeldLevel hold(uint32_t version) const;
@@ -105,6 +107,7 @@ class GrowingLevel {
   void make_room(std::size_t more);
   void make_table(std::size_t keys);
   uint32_t take_place(uint64_t occupied);
+  uint32_t append_place(std::size_t voxels);
   int32_t new_block(uint64_t key, const VoxelBlock& block, int32_t previous);
   void publish(uint64_t key, int32_t block);
   VoxelLevelView newest() const;

@@ -102,13 +102,16 @@ uint64_t new_target_number() {
 }
 
 GrowingTarget::GrowingTarget(const GicpTarget& base, const TargetSettings& settings)
-    : number(new_target_number()), fine(settings.voxel), coarse(4 * settings.voxel) {
+    : number(new_target_number()),
+      origin(base.grown ? 0 : base.number),
+      fine(settings.voxel),
+      coarse(4 * settings.voxel) {
   const bool shaped = base.is_finished();
   for (const int level : {0, 1}) {
     GrowingLevel& to = level ? coarse : fine;
     const LevelContents from = base.contents(level);
     from.for_each_block([&](uint64_t key, const VoxelBlock& block) {
-      to.append(key, block.occupied, from.moments + block.first, shaped ? from.view.voxels + block.first : nullptr, newest);
+      to.append(key, block.occupied, from.moments + block.first, shaped ? from.view.voxels + block.first : nullptr);
     });
   }
 }

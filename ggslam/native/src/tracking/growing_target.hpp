@@ -20,7 +20,8 @@ class GrowingTarget {
 
   std::mutex mutex;  // is held by callers of all that follows
   const uint64_t number;  // of no other target
-  uint32_t newest = 1;
+  const uint64_t origin;  // number of the target whose blocks and voxels are those of the first version, place by place; or 0
+  uint32_t newest = kFirstVersion;
 
   void hold(uint32_t version) { held_.insert(version); }
   void release(uint32_t version) { held_.erase(held_.find(version)); }

@@ -42,9 +42,10 @@ bool changed_keys(const GicpTarget& target, const TargetCopy& copy, bool finishe
   if (!target.grown) return copy.number == target.number;
   GrowingTarget& of = *target.grown->of;
   const uint32_t version = target.grown->fine.version;
-  if (copy.number != of.number || copy.version > version) return false;
+  const uint32_t before = copy.number == of.origin ? kFirstVersion : copy.version;
+  if ((copy.number != of.number && copy.number != of.origin) || before > version) return false;
   const std::lock_guard<std::mutex> lock(of.mutex);
-  return of.fine.changes(copy.version, version, keys[0]) && of.coarse.changes(copy.version, version, keys[1]);
+  return of.fine.changes(before, version, keys[0]) && of.coarse.changes(before, version, keys[1]);
 }
 
 // Lays a level out behind `begin`; returns its end.
