@@ -144,6 +144,7 @@ class CudaTrackingEngine:
         align.stream = self.library.stream(self.device)
         self.library.call("track_wait", self._reference)
         self._depth.arrived()
+        self._target.note_made()
         source.note_extracted()
         found = self._found.copy()
         source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
