@@ -65,7 +65,7 @@ _Coded = Annotated[np.ndarray, Form("u1", None)]
 _Kept = tuple[int, float, _Coded, _Coded]
 
 
-@savable(not_saved="mapper poses state coder", growing="images", save="saved")
+@savable(not_saved="mapper poses state coder", growing="images", save="state_to_save")
 @dataclass
 class ColorPoses:
     """Aligns located frames to the map as it is, where that is due, and to the map as it is at the end.
@@ -135,7 +135,7 @@ class ColorPoses:
             self.images.append(self.coder.take())
             self.held_bytes += self.images[-1][2].nbytes + self.images[-1][3].nbytes
 
-    def saved(self) -> dict[str, Any]:
+    def state_to_save(self) -> dict[str, Any]:
         """What is saved."""
         self._take_coded()
         return vars(self)

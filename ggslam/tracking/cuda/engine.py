@@ -143,13 +143,13 @@ class CudaTrackingEngine:
         job.looks = source.looks
         align.stream = self.library.stream(self.device)
         self.library.call("track_wait", self._reference)
-        self._depth.arrived()
+        self._depth.note_arrival()
         self._target.note_made()
         source.note_extracted()
         found = self._found.copy()
         source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
         if isinstance(photometric, CudaPhotometricPart):
-            self.greys.color.arrived()
+            self.greys.color.note_arrival()
             photometric.textured = int(found[AlignResult.TEXTURED])
         return cuda_alignment(found, matched, max(1, room), source.looks, settings)
 

@@ -35,7 +35,7 @@ class FrameUpload:
         """The very array that was sent last."""
 
     def send(self, image: np.ndarray) -> None:
-        """Starts to send an image. The host waits for the last one, unless it is known to have `arrived`."""
+        """Starts to send an image. The host waits for the last one, unless `note_arrival` told that it is there."""
         if self._under_way:
             self._sent.set()
             self._sent.wait_if_ahead()
@@ -43,7 +43,7 @@ class FrameUpload:
         self._memory.copy_(self._staged, non_blocking=True)
         self._under_way, self.image = True, image
 
-    def arrived(self) -> None:
+    def note_arrival(self) -> None:
         """The host has waited for the stream that the last image was sent on."""
         self._under_way = False
 
