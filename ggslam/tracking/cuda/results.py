@@ -16,6 +16,7 @@ _PLACES = np.zeros((6, 6), np.intp)
 """Where entry (i, j) of a symmetric matrix is in its upper triangle, row by row."""
 _PLACES[np.triu_indices(6)] = range(21)
 _PLACES += np.triu(_PLACES, 1).T
+_STILL = np.eye(4)
 _TOTAL = AlignResult.SPREAD_TOTAL
 _CENTROID = slice(AlignResult.CENTROID, AlignResult.RADIUS)
 
@@ -59,7 +60,7 @@ def cuda_alignment(
         looks: whether the kernels told the medians of the matched points.
         settings: that it was made with.
     """
-    T = np.eye(4)
+    T = _STILL.copy()
     T[:3, :3], T[:3, 3] = found[:9].reshape(3, 3), found[9:12]
     information = found[AlignResult.INFORMATION :][_PLACES]
     value = found.tolist()
