@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Copies between host and device by way of page-locked memory, for which the host waits as little as can be: once
-(`upload`, `download`), or again and again through the same memory (`Upload`, `Download`, `HostMirror`)."""
+(`upload`, `download`), or again and again through the same memory (`Upload`, `Staging`, `Download`, `HostMirror`)."""
 
 from __future__ import annotations
 
 import threading
+from collections import deque
 
 import numpy as np
 import torch
@@ -64,6 +65,31 @@ class Upload:
         """Starts the copy of what was filled in to the beginning of it, as long as `out`, uint8 [n]."""
         out.copy_(self._buffer[: out.numel()], non_blocking=True)
         self._sent.set()
+
+
+class Staging:
+    """Sends arrays of one shape to the device, again and again, by turns through a few places. The host waits only if
+    the one that went through the same place is still on its way.
+
+    Args:
+        shape: of an array.
+        dtype: of its numbers.
+        device: where to.
+        places: how many may be on their way.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, places: int = 2) -> None:
+        made = [torch.empty(shape, dtype=dtype, pin_memory=device.type == "cuda") for _ in range(places)]
+        self._places = deque((place, place.numpy(), Marker(device)) for place in made)
+
+    def send(self, array: np.ndarray, out: torch.Tensor) -> None:
+        """Starts a copy of an array to `out`, both of the shape; the array may be changed afterwards."""
+        place, on_host, sent = self._places[0]
+        self._places.rotate(-1)
+        sent.wait_if_ahead()
+        np.copyto(on_host, array)
+        out.copy_(place, non_blocking=True)
+        sent.set()
 
 
 class Download:

@@ -162,7 +162,7 @@ class IdentityLearner(ABC):
     def due(self, keyframe: MaskedKeyframe) -> bool:
         """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
         self._iterations += 1
-        return keyframe.mask is not None and self.table.count > 0 and self._iterations % self.settings.every == 0
+        return self._iterations % self.settings.every == 0 and keyframe.mask is not None and self.table.count > 0
 
     # --- a map that is partly on disk ---------------------------------------------------------------------------------
 

@@ -63,6 +63,10 @@ class KeyframeSampler:
         """One of the keyframes with these numbers, in the order of the recording."""
         return numbers[self.draw(len(numbers))]
 
+    def choose_many(self, numbers: Sequence[int], times: int) -> list[int]:
+        """As `choose`, so many times."""
+        return [self.choose(numbers) for _ in range(times)]
+
     def arrive(self, keyframes: Sequence[Keyframe]) -> None:
         """The last of the keyframes is new."""
 

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ggslam.abi.arrays import address
+from ggslam.abi.cuda import KeyframeChoice, TargetImages, TrainingStep
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.streams import Pace, SideStream
 from ggslam.cuda.transfers import HostMirror, download, upload
@@ -25,12 +27,14 @@ from ggslam.mapping.cuda.between_coder import BetweenCoder
 from ggslam.mapping.cuda.between_view import CudaBetweenView
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
-from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceKeyframe, ImageStore
+from ggslam.mapping.cuda.image_store import ImageStore
+from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceKeyframe
 from ggslam.mapping.cuda.keyframe_look import KeyframeLook
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
 from ggslam.mapping.cuda.shown_gaussians import mark_shown
-from ggslam.mapping.cuda.training import CudaTraining, StepKind
+from ggslam.mapping.cuda.step_rows import StepKind, StepKinds, StepRow, row_of
+from ggslam.mapping.cuda.training import CudaTraining
 from ggslam.mapping.cuda.usable_pixels import UsablePixels
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.extra_loss import new_faults, refuse_faults
@@ -44,6 +48,7 @@ from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
 from ggslam.mapping.settings import MapperSettings
 from ggslam.mapping.votes import vote_labels
 from ggslam.native.loader import NativeContext
+from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.exposure import identity_exposure
 from ggslam.rendering.types import LOW_PASS, RenderBuffers
@@ -83,13 +88,14 @@ class CudaMapper(ComparingMapper):
         self._loss = CudaImageLoss(self.device, library, leaves_saturated=True)
         self._insertion = CudaInsertion(self.device, library)
         self._states = KeyframeStates(self.device, library)
-        self._images = ImageStore(self.device)
+        self._images = ImageStore(self.device, is_awaited=lambda: self._training.count > 0)
         self._rasterizer.overflows = self._states.report[6:].view(torch.int64)
         self._report = HostMirror(self._states.report)
         self._pace = Pace(self.device)
         self._repeated = 0
         self._training = CudaTraining(self._rasterizer, self._loss, self._states)
         self._gathers = False  # steps that are started together
+        self._kinds = StepKinds()
         self._exposures = KeyframeExposures(settings.exposure)
         self._anchors: list[np.ndarray] = []  # of the keyframes' exposures, as the device has them
         self._usable = UsablePixels(self.device)
@@ -131,10 +137,20 @@ class CudaMapper(ComparingMapper):
             keyframe.T_camera_world = inverse(T @ inverse(pose))
         move_with_keyframes(self.map, T_new_old)
 
+    def leave_out(self, numbers: set[int]) -> None:
+        super().leave_out(numbers)
+        for keyframe in self.keyframes:  # another one may be the world now
+            assert isinstance(keyframe, CudaKeyframe)
+            keyframe.rows.clear()
+
     def run(self, iterations: int) -> None:
+        iterations += self._count_missed()
         self._gathers = True
         try:
-            super().run(iterations + self._count_missed())
+            if self._knows_all_steps:
+                self._run_steps(iterations)
+            else:
+                super().run(iterations)
         finally:
             self._gathers = False
             self._start_steps()
@@ -349,28 +365,79 @@ class CudaMapper(ComparingMapper):
             return self._usable.nowhere(keyframe, grid)
         return self._valid_on_device(keyframe, grid)
 
+    @property
+    def _knows_all_steps(self) -> bool:
+        """Whether the library makes all steps of `run` by one call."""
+        if self.residency is not None or not self._training.is_ready or self._needs_all_pixels:
+            return False
+        return self.identity is None or self.identity.lessons.takes(self.map, self.keyframes[-1])
+
+    def _run_steps(self, iterations: int) -> None:
+        training, optimizer, pose_rate = self._training, self._optimizer(1.0, False), self._pose_rate
+        for number in self._sampler.choose_many(self._trainable(), iterations):
+            keyframe = self.keyframes[number]
+            assert isinstance(keyframe, CudaKeyframe)
+            self._gather(keyframe, ALL_PIXELS, optimizer, pose_rate, self._is_identity_due(keyframe))
+            self.times.iterations += 1
+            if self.times.iterations % MapperTuning.bound_every == 0:
+                training.bound_last()
+
     def _step(
         self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
     ) -> None:
-        training, lessons = self._training, self.identity.lessons if learns and self.identity is not None else None
-        plain = grid.is_whole and self.extra_loss is None and (lessons is None or lessons.takes(self.map, keyframe))
-        if not plain or not training.is_ready or not isinstance(keyframe, CudaKeyframe):
+        assert isinstance(keyframe, DeviceKeyframe)
+        rate_factor, pose_factor = factors
+        if not self._is_known(keyframe, grid, learns):
             self._start_steps()
             super()._step(keyframe, factors, grid, learns, settles)
             return
-        exposed = self._exposures.is_exposed(keyframe)
-        filters = grid.low_pass(LOW_PASS), self.settings.close_below
-        kind = StepKind(keyframe.camera, self.settings, self._loss_settings(keyframe), exposed, *filters)
-        if not training.fits(kind):
+        pose_rate = self._pose_rate_of(keyframe, grid, pose_factor)
+        self._gather(keyframe, grid, self._optimizer(rate_factor, settles), pose_rate, learns)
+
+    def _is_known(self, keyframe: DeviceKeyframe, grid: PixelGrid, learns: bool) -> bool:
+        """Whether the library makes such steps by one call."""
+        if self.extra_loss is not None or not self._training.is_ready:
+            return False
+        if not learns or self.identity is None:
+            return True
+        return grid.is_whole and self.identity.lessons.takes(self.map, keyframe)
+
+    def _gather(
+        self, keyframe: DeviceKeyframe, grid: PixelGrid, optimizer: AdamSettings, pose_rate: float, learns: bool
+    ) -> None:
+        """A step joins those that are started together; as `_step`, `pose_rate` being that of a keyframe that is not
+        the world."""
+        training = self._training
+        row = row_of(keyframe, grid, self._row_sources(keyframe), self._make_row)
+        self._images.use(row.images)
+        while not training.add(row, optimizer, 0.0 if row.is_world else pose_rate):
             self._start_steps()
-        images, shown = keyframe.device_images(), self._comparable_on_device(keyframe, grid)
-        rate_factor, pose_factor = factors
-        optimizer, pose_rate = self._optimizer(rate_factor, settles), self._pose_rate_of(keyframe, grid, pose_factor)
-        training.add(kind, keyframe.index, images, keyframe.depth_unit, shown, optimizer, pose_rate)
-        if lessons is not None:
-            training.teach_last(lessons, self.map, keyframe)
+        if learns and isinstance(keyframe, CudaKeyframe) and self.identity is not None:
+            training.teach_last(self.identity.lessons, self.map, keyframe)
         self.times.steps += 1
         keyframe.iterations += 1
+
+    def _row_sources(self, keyframe: DeviceKeyframe) -> tuple[object, ...]:
+        """What a keyframe's row is made from: it holds while these are the same objects."""
+        own, number, exposures = vars(keyframe), keyframe.index, self._exposures
+        return (
+            own.get("depth"), own.get("moving"), self._valid.get(keyframe.camera_number), exposures.blind[number],
+            exposures.optimizers[number].anchor, self._states.table, self.settings, self.has_soft_outlines,
+            number in self._beside, self._usable.kept_since,
+        )  # fmt: skip
+
+    def _make_row(self, keyframe: DeviceKeyframe, grid: PixelGrid) -> StepRow:
+        images, shown = keyframe.device_images(grid), self._comparable_on_device(keyframe, grid)
+        exposed, number = self._exposures.is_exposed(keyframe), keyframe.index
+        camera = keyframe.camera if grid.is_whole else grid.camera(keyframe.camera)
+        filters = grid.low_pass(LOW_PASS), self.settings.close_below
+        kind = StepKind(camera, self.settings, self._loss_settings(keyframe), exposed, *filters)
+        step = TrainingStep(lesson=-1, T_camera_keyframe=address(keyframe.hanging_on))
+        step.images = TargetImages(
+            address(images.color), address(images.depth), address(shown), keyframe.depth_unit, False
+        )  # fmt: skip
+        step.keyframe = KeyframeChoice(self._states.address(number), 0.0, exposed and number > 0)
+        return StepRow(self._kinds.only(kind), step, images, shown, self.is_world(keyframe))
 
     def _start_steps(self) -> None:
         """Starts the steps that were gathered."""
