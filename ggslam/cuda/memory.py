@@ -10,15 +10,14 @@ import torch
 
 from ggslam.system.tuning import Tuning
 
+_Kind, _Made = TypeVar("_Kind"), TypeVar("_Made")
 
-_Made = TypeVar("_Made")
 
-
-class SizeTuning(Tuning):
-    """Memory that is kept for images of several sizes."""
+class KindTuning(Tuning):
+    """Memory that is kept for work of several kinds."""
 
     kept = 4
-    """Sizes: steps on pictures of other sizes than the recording's take turns with those of its own."""
+    """Kinds: steps on pictures of other sizes than the recording's take turns with those of its own."""
 
 
 class SlotTuning(Tuning):
@@ -51,25 +50,26 @@ class GrowingMemory:
         return block
 
 
-class BySize(Generic[_Made]):
-    """What is made once for images of a size, kept for the sizes that were asked for last.
+class ByKind(Generic[_Kind, _Made]):
+    """What is made once for images of a size, or for another kind of work, kept for the kinds that were asked for last.
 
     Args:
-        make: makes it for height and width.
+        make: makes it.
     """
 
-    def __init__(self, make: Callable[[int, int], _Made]) -> None:
+    def __init__(self, make: Callable[[_Kind], _Made]) -> None:
         self._make = make
-        self._made: dict[tuple[int, int], _Made] = {}
+        self._made: dict[_Kind, _Made] = {}
 
-    def of(self, height: int, width: int) -> _Made:
-        """That of a size."""
-        size = height, width
-        made = self._made.pop(size, None)
-        self._made[size] = self._make(height, width) if made is None else made  # the one used last stands last
-        if len(self._made) > SizeTuning.kept:
+    def of(self, kind: _Kind) -> _Made:
+        """That of a kind."""
+        made = self._made.pop(kind, None)
+        if made is None:
+            made = self._make(kind)
+        self._made[kind] = made  # the one used last stands last
+        if len(self._made) > KindTuning.kept:
             del self._made[next(iter(self._made))]
-        return self._made[size]
+        return made
 
 
 class Slots:

@@ -93,25 +93,32 @@ class Staging:
 
 
 class Download:
-    """Fetches float64 [count] from the device.
+    """Fetches numbers from the device, again and again.
 
     Args:
-        count: numbers.
+        count: of them.
         device: where from.
+        dtype: of them.
     """
 
-    def __init__(self, count: int, device: torch.device) -> None:
-        self.source = torch.zeros(count, dtype=torch.float64, device=device)
-        """On the device."""
-        self._copy = _allocate_page_locked(8 * count, device).view(torch.float64)
+    def __init__(self, count: int, device: torch.device, dtype: torch.dtype = torch.float64) -> None:
+        self.source = torch.zeros(count, dtype=dtype, device=device)
+        """On the device, [count]."""
+        self._copy = torch.zeros(count, dtype=dtype, pin_memory=device.type == "cuda")
+        self.newest = self._copy.numpy()
+        """On the host, as of the last `fetch`, which changes it in place."""
         self._done = Marker(device)
 
-    def wait(self) -> np.ndarray:
-        """What `source` is when everything started before is done: the host's one wait."""
+    def fetch(self) -> np.ndarray:
+        """What `source` is when everything started before is done, in `newest`: the host's one wait."""
         self._copy.copy_(self.source, non_blocking=True)
         self._done.set()
         self._done.wait()
-        return self._copy.numpy().copy()
+        return self.newest
+
+    def wait(self) -> np.ndarray:
+        """As `fetch`; the numbers stay as they are."""
+        return self.fetch().copy()
 
 
 def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
@@ -147,10 +154,11 @@ class HostMirror:
     def __init__(self, source: torch.Tensor) -> None:
         self._source = source
         self._arriving = torch.zeros(source.shape, dtype=source.dtype, pin_memory=source.device.type == "cuda")
+        self._arriving_numbers = self._arriving.numpy()
         self._sent = Marker(source.device)
         self._under_way = False
         self._lock = threading.Lock()
-        self._newest = self._arriving.numpy().copy()
+        self._newest = self._arriving_numbers.copy()
 
     def send(self) -> None:
         """Starts a copy on the current stream, unless one is still under way."""
@@ -170,5 +178,5 @@ class HostMirror:
 
     def _take(self) -> None:
         if self._under_way and self._sent.is_passed():
-            self._newest = self._arriving.numpy().copy()
+            self._newest = self._arriving_numbers.copy()
             self._under_way = False

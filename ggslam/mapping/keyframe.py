@@ -106,9 +106,9 @@ class Keyframe:
         """The refined pose, camera to world."""
         return inverse(self.T_camera_world)
 
-    def depth_m(self) -> np.ndarray:
-        """Depth in metres, float32 [H, W]."""
-        return self.depth.astype(np.float32) / np.float32(1 / self.depth_unit)
+    def depth_m(self, of: np.ndarray | None = None) -> np.ndarray:
+        """Depth in metres, float32 [H, W]; `of`: of a part of the depth image."""
+        return (self.depth if of is None else of).astype(np.float32) / np.float32(1 / self.depth_unit)
 
 
 def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
@@ -127,8 +127,8 @@ def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyfr
 def depth_unit_for(depth: np.ndarray) -> float:
     """Unit for depth, float [H, W], in metres: `DEPTH_UNIT`, doubled until at most `DepthRangeTuning.far_share` of the
     pixels with depth are beyond its range."""
-    known, unit = depth[depth > 0], DEPTH_UNIT
-    while len(known) and np.mean(known > _MOST_UNITS * unit) > DepthRangeTuning.far_share:
+    known, unit = np.count_nonzero(depth > 0), DEPTH_UNIT
+    while known and np.count_nonzero(depth > _MOST_UNITS * unit) / known > DepthRangeTuning.far_share:
         unit *= 2
     return unit
 

@@ -17,7 +17,7 @@ from ggslam.mapping.between_frames import BetweenFrame, BetweenTuning, code_fram
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
-from ggslam.mapping.identity import IdentityLearner, MaskOnGrid
+from ggslam.mapping.identity import IdentityLearner, MaskOnGrid, ids_of
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
@@ -684,7 +684,7 @@ class Mapper(ABC):
         mask = keyframe.mask
         if mask is None:
             return np.zeros(0, np.int64)
-        ids = np.unique(self.identity.current(np.flatnonzero(np.bincount(mask.reshape(-1)))))
+        ids = np.unique(self.identity.current(ids_of(mask)))
         return ids[ids > 0].astype(np.int64)
 
     def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:

@@ -19,6 +19,7 @@ import torch
 from ggslam.abi.arrays import address
 from ggslam.abi.cuda import KeyframeChoice, TargetImages, TrainingStep
 from ggslam.cuda.library import CudaLibrary
+from ggslam.cuda.memory import ByKind
 from ggslam.cuda.streams import Pace, SideStream
 from ggslam.cuda.transfers import HostMirror, download, upload
 from ggslam.mapping.between_frames import BetweenFrame
@@ -26,11 +27,12 @@ from ggslam.mapping.comparing_mapper import ComparingMapper
 from ggslam.mapping.cuda.between_coder import BetweenCoder
 from ggslam.mapping.cuda.between_view import CudaBetweenView
 from ggslam.mapping.cuda.identity import CudaIdentityLearner
-from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
 from ggslam.mapping.cuda.image_store import ImageStore
+from ggslam.mapping.cuda.insertion import CudaInsertion, Selection
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceKeyframe
-from ggslam.mapping.cuda.keyframe_look import KeyframeLook
+from ggslam.mapping.cuda.keyframe_look import Explained, KeyframeLook
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
+from ggslam.mapping.cuda.look_memory import LookMemory
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
 from ggslam.mapping.cuda.shown_gaussians import mark_shown
 from ggslam.mapping.cuda.step_rows import StepKind, StepKinds, StepRow, row_of
@@ -46,7 +48,6 @@ from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.mapper import LossSums, MapperTuning
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
 from ggslam.mapping.settings import MapperSettings
-from ggslam.mapping.votes import vote_labels
 from ggslam.native.loader import NativeContext
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
@@ -99,6 +100,8 @@ class CudaMapper(ComparingMapper):
         self._exposures = KeyframeExposures(settings.exposure)
         self._anchors: list[np.ndarray] = []  # of the keyframes' exposures, as the device has them
         self._usable = UsablePixels(self.device)
+        self.looks = ByKind(lambda kind: LookMemory(self._rasterizer, kind))
+        """Where new keyframes look at the map, a `LookMemory` for each `LookKind`."""
         self._coder = BetweenCoder()
         self._views: dict[int, CudaBetweenView] = {}  # by frame
         self._given_context = context
@@ -206,14 +209,11 @@ class CudaMapper(ComparingMapper):
             look.select_again(upload(color, self.device))
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, look.labels if look.shows else None))
-        new = self._insertion.build(look.selection, look.count())
-        opacity = self.settings.insertion.opacity
-        logit = torch.full_like(new.means[:, 0], float(np.log(opacity / (1 - opacity))))
-        rows = self.map.insert(
-            new.means, new.quaternions, new.log_scales, logit, new.rgb, birth_keyframe=keyframe.index
+        new = self._insertion.insert(
+            look.selection, look.count(), self.map, self.settings.insertion.opacity, keyframe.index
         )
         if self.identity is not None:
-            self.identity.begin(self.map, rows, self.identity.labels_at(keyframe, new.pixels))
+            self.identity.begin_at(self.map, keyframe, new)
 
     @property
     def _densification(self) -> str:
@@ -269,41 +269,16 @@ class CudaMapper(ComparingMapper):
                 self._states.write_anchor(number, anchor)
                 self._anchors[number] = anchor.copy()
 
-    @property
-    def room_was_short(self) -> torch.Tensor:
-        """int32 [1] on the device: 1 if the last rendering lacks a part of what is in view."""
-        return self._rasterizer.last_overflowed
-
     def selection(
-        self, color: torch.Tensor, keyframe: CudaKeyframe, explained: tuple[torch.Tensor | None, torch.Tensor | None],
-        T_world_camera: np.ndarray,
+        self, color: torch.Tensor, keyframe: CudaKeyframe, explained: Explained, T_world_camera: np.ndarray,
+        total: torch.Tensor,
     ) -> Selection:  # fmt: skip
-        """Starts to choose the pixels of a keyframe, whose colours are those given, that the map does not explain,
-        rendered as alpha and depth of `explained`, which has to stay."""
+        """Starts to choose the pixels of a keyframe, whose colours are those given, that the map does not explain;
+        `explained` has to stay. Their number goes to `total`, int32 [1] on the device."""
         return self._insertion.select(
             color, keyframe.device_images().depth, keyframe.depth_unit, *explained, keyframe.camera, T_world_camera,
-            self._insertion_settings,
+            self._insertion_settings, total,
         )  # fmt: skip
-
-    def find_explained(
-        self, keyframe: CudaKeyframe, alpha: torch.Tensor | None, depth: torch.Tensor | None
-    ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-        """What the map shows from a keyframe, alpha and depth [H, W]; where images show nothing there is nothing to
-        explain."""
-        valid = self._valid_on_device(keyframe)
-        if valid is None:
-            return alpha, depth
-        if alpha is None:
-            return (~valid).float(), torch.zeros(valid.shape, device=self.device)
-        return torch.where(valid, alpha, 1.0), depth
-
-    def labels_on_grid(self, alpha: torch.Tensor, stride: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Object that the last rendering shows on every `stride`-th pixel and row, int32 [h, w], and its share."""
-        height, width = alpha.shape
-        pixels = torch.arange(height * width, dtype=torch.int32, device=self.device).view(height, width)
-        grid = pixels[::stride, ::stride]
-        ids, share = self._rasterizer.pixel_terms(grid.reshape(-1)).labels(vote_labels(self.map))
-        return ids.view(grid.shape), share.view(grid.shape) * (alpha[::stride, ::stride] > 0.5)
 
     # --- optimisation ------------------------------------------------------------------------------------------------
 
@@ -354,7 +329,7 @@ class CudaMapper(ComparingMapper):
         target = LossTarget(images.color, images.depth, keyframe.depth_unit, exposure, shown)
         return self._loss.evaluate(view, target, self._loss_settings(keyframe))
 
-    def _valid_on_device(self, keyframe: Keyframe, grid: PixelGrid = ALL_PIXELS) -> torch.Tensor | None:
+    def valid_on_device(self, keyframe: Keyframe, grid: PixelGrid = ALL_PIXELS) -> torch.Tensor | None:
         """`valid_of` at a grid's pixels."""
         sources = (self._valid.get(keyframe.camera_number), keyframe.moving)
         return self._usable.valid(keyframe, sources, lambda: self.valid_of(keyframe), grid)
@@ -363,7 +338,7 @@ class CudaMapper(ComparingMapper):
         """`_comparable` at a grid's pixels, but for saturated ones, which the loss leaves out."""
         if self._exposures.blind[keyframe.index]:
             return self._usable.nowhere(keyframe, grid)
-        return self._valid_on_device(keyframe, grid)
+        return self.valid_on_device(keyframe, grid)
 
     @property
     def _knows_all_steps(self) -> bool:
@@ -373,14 +348,15 @@ class CudaMapper(ComparingMapper):
         return self.identity is None or self.identity.lessons.takes(self.map, self.keyframes[-1])
 
     def _run_steps(self, iterations: int) -> None:
-        training, optimizer, pose_rate = self._training, self._optimizer(1.0, False), self._pose_rate
+        optimizer, pose_rate, identity = self._optimizer(1.0, False), self._pose_rate, self.identity
         for number in self._sampler.choose_many(self._trainable(), iterations):
             keyframe = self.keyframes[number]
             assert isinstance(keyframe, CudaKeyframe)
-            self._gather(keyframe, ALL_PIXELS, optimizer, pose_rate, self._is_identity_due(keyframe))
+            learns = identity is not None and identity.due(keyframe)
+            self._gather(keyframe, ALL_PIXELS, optimizer, pose_rate, learns)
             self.times.iterations += 1
             if self.times.iterations % MapperTuning.bound_every == 0:
-                training.bound_last()
+                self._training.bound_last()
 
     def _step(
         self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False

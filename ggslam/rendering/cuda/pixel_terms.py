@@ -81,8 +81,12 @@ class CudaPixelTerms:
                 f"pixels: expected a contiguous torch.int32 [P], found {pixels.dtype} {list(pixels.shape)}"
             )
         terms = CudaPixelTerms.empty(len(pixels), capacity, library, pixels.device)
-        terms._call("collect", rendering, address(pixels), min_weight)
+        terms.collect(rendering, pixels, min_weight)
         return terms
+
+    def collect(self, rendering: Rendering, pixels: torch.Tensor, min_weight: float) -> None:
+        """In terms that are `empty`, or those of other renderings, writes those of a rendering; see `of_rendering`."""
+        self._call("collect", rendering, address(pixels), min_weight)
 
     def append(self, other: CudaPixelTerms) -> CudaPixelTerms:
         """These pixels followed by those of `other`, which must have the same capacity."""
@@ -128,8 +132,12 @@ class CudaPixelTerms:
         self._check("gaussian_labels", gaussian_labels, torch.int32, (len(gaussian_labels),))
         ids = torch.empty(len(self), dtype=torch.int32, device=self.device)
         shares = torch.empty(len(self), dtype=torch.float32, device=self.device)
-        self._call("label", address(gaussian_labels), len(gaussian_labels), address(ids), address(shares))
+        self.label(gaussian_labels, ids, shares)
         return ids, shares
+
+    def label(self, gaussian_labels: torch.Tensor, ids: torch.Tensor, shares: torch.Tensor) -> None:
+        """As `labels`, to memory of the caller's."""
+        self._call("label", address(gaussian_labels), len(gaussian_labels), address(ids), address(shares))
 
     # --- at the Gaussians --------------------------------------------------------------------------------------------
 
