@@ -188,7 +188,7 @@ class ComparingMapper(Mapper):
             few = len(own) < HiddenGaussianTuning.few_keyframes
             self._render_all(keyframe, ALL_PIXELS if few else grid_of_turn(keyframe.index, keyframe.camera))
             self._mark_shown(stays, least)
-        self.map.keep(stays)
+        self._keep(stays)
 
     # --- terms of the loss, and insertion ----------------------------------------------------------------------------
 

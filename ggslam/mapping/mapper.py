@@ -242,7 +242,7 @@ class Mapper(ABC):
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
             self._densify()
             if self.settings.pruning.enabled:
-                prune(self.map, self.settings.pruning)
+                self._prune()
         if self._is_noisy and not self.is_live and is_look_due(len(self.keyframes)):
             self.drop_hidden()
         self.times.insertion += time.perf_counter() - start
@@ -316,7 +316,7 @@ class Mapper(ABC):
         """Takes the Gaussians of some keyframes out of the map, which is all in memory, and trains on these no more."""
         self.left_out |= numbers
         gone = torch.tensor(sorted(self.left_out), dtype=self.map.birth_keyframe.dtype, device=self.map.device)
-        self.map.keep(~torch.isin(self.map.birth_keyframe, gone))
+        self._keep(~torch.isin(self.map.birth_keyframe, gone))
 
     def retrain_loop_ends(self, kept: list[int], doubted: list[int], iterations: int) -> None:
         """After the keyframes were moved so that two ends of a loop meet: drops what the newer end had mapped again,
@@ -347,6 +347,14 @@ class Mapper(ABC):
 
     def _densify(self) -> None:  # noqa: B027
         """Clones and splits Gaussians if `MapperSettings.densification` says so; on the CPU."""
+
+    def _prune(self) -> None:
+        """Drops useless Gaussians."""
+        prune(self.map, self.settings.pruning)
+
+    def _keep(self, stays: torch.Tensor) -> None:
+        """Drops Gaussians where `stays`, bool [N] where the map is, is False."""
+        self.map.keep(stays)
 
     def _take_labels(self, keyframe: Keyframe, labels: KeyframeLabels) -> None:
         """The keyframe's objects become its mask. What was rendered last is the map as the keyframe sees it, if

@@ -352,14 +352,18 @@ class GaussianMap:
         self.reorder(index)
         return removed
 
+    def shorten(self, kept: int) -> None:
+        """The first rows stay, so many: the caller has moved there what stays, rows of all arrays in their order."""
+        self.count = kept
+        self.version += 1
+        self.order += 1
+
     def reorder(self, index: torch.Tensor) -> None:
         """Makes row i the former row index[i] (int64 [M]); rows not named are dropped. Moments move along."""
         kept, index = index.shape[0], index.to(self.device)  # once, not for each array
         for array in self._storage.values():
             array[:kept] = torch.index_select(array[: self.count], 0, index)  # a third of what array[index] takes
-        self.count = kept
-        self.version += 1
-        self.order += 1
+        self.shorten(kept)
 
     def move(self, rows: torch.Tensor, T_new_old: torch.Tensor) -> None:
         """Moves Gaussians of `rows` (bool [N] or int64 [M]) rigidly by `T_new_old` [4, 4]: means and rotations.

@@ -80,6 +80,33 @@ struct NewClassJob {
   float weights[kMostNewWeights];
 };
 
+// Which Gaussians are of use.
+struct PruneJob {
+  const float *means, *log_scales, *opacity_logits;  // [count, 3], [count, 3], [count]
+  std::uint8_t* stays;                               // [count], 0 where they are transparent, huge or nowhere
+  void* stream;
+  std::int64_t count;
+  float least_logit, largest_log_scale;  // beyond these
+  std::int32_t device;
+};
+
+// An array of rows of whole words of 4 bytes.
+struct RowArray {
+  std::uint32_t* rows;
+  std::int64_t words;  // of a row
+};
+
+// Rows that go; those that stay move to the front, in their order.
+struct RowsJob {
+  const std::uint8_t* stays;  // [count], 0: the row goes
+  std::int32_t* kept;         // [1], how many stay
+  RowArray arrays[kMostArrays];
+  void* workspace;
+  void* stream;
+  std::int64_t count;
+  std::int32_t device, array_count;
+};
+
 }  // namespace ggslam::cuda
 
 GGSLAM_EXPORT int ggslam_cuda_fill_words(const ggslam::cuda::FillJob* job);
@@ -95,3 +122,15 @@ GGSLAM_EXPORT int ggslam_cuda_birth_labels(const ggslam::cuda::BirthLabelJob* jo
 
 // Writes rows, ids and numbers of the new classes.
 GGSLAM_EXPORT int ggslam_cuda_new_classes(const ggslam::cuda::NewClassJob* job);
+
+// Fills `stays`.
+GGSLAM_EXPORT int ggslam_cuda_prune(const ggslam::cuda::PruneJob* job);
+
+// Bytes of memory that rows move by way of. Asks for count and arrays.
+GGSLAM_EXPORT std::int64_t ggslam_cuda_rows_bytes(const ggslam::cuda::RowsJob* job);
+
+// Numbers the rows that stay, and fills `kept`.
+GGSLAM_EXPORT int ggslam_cuda_choose_rows(const ggslam::cuda::RowsJob* job);
+
+// Moves the rows chosen by the call before it with the same job, of which `kept` is the number.
+GGSLAM_EXPORT int ggslam_cuda_move_rows(const ggslam::cuda::RowsJob* job, std::int64_t kept);

@@ -70,6 +70,11 @@ class CudaClassTable:
         return self._rows, *self._moments, self._steps
 
     @property
+    def places(self) -> tuple[int, int]:
+        """Of the training arrays: others as soon as they move, or there are more or fewer classes."""
+        return self._rows.data_ptr(), self._numbers.count
+
+    @property
     def weight(self) -> torch.Tensor:
         """float32 [count, F]; a view."""
         return self.rows[:, :-1]

@@ -80,7 +80,9 @@ class CudaInsertion:
         self.library, self.device = library_and_device(device, library)
         self._memory = GrowingMemory(self.device)
         self._total = torch.empty(1, dtype=torch.int32, device=self.device)
-        self._rows = MapRows(self.library, self.device.index or 0)
+        self._sizes: dict[tuple[int, ...], int] = {}  # of the workspace, for the last images and settings
+        self.rows = MapRows(self.device, self.library)
+        """Of maps that are inserted to."""
 
     def new_gaussians(self, *arguments: Any, **named: Any) -> NewGaussians[torch.Tensor]:
         """`select` and `build`. Waits for the device once, for the number of Gaussians."""
@@ -124,8 +126,10 @@ class CudaInsertion:
         job.alpha, job.rendered_depth = address(alpha), address(expected_depth)
         total = self._total if total is None else total
         job.total = total.data_ptr()
-        size = self.library.functions.ggslam_cuda_insertion_bytes(ctypes.byref(job))
-        job.workspace = self._memory.block("insertion", size).data_ptr()
+        key = (camera.height, camera.width, settings.fill_stride)
+        if key not in self._sizes:
+            self._sizes = {key: self.library.functions.ggslam_cuda_insertion_bytes(ctypes.byref(job))}
+        job.workspace = self._memory.block("insertion", self._sizes[key]).data_ptr()
         self.library.call("insertion_select", ctypes.byref(job))
         return Selection(job, total)
 
@@ -144,10 +148,10 @@ class CudaInsertion:
         self, selection: Selection, count: int, gaussians: GaussianMap, opacity: float, keyframe: int
     ) -> NewRows:
         """The Gaussians of a selection, as of `build`, in a map: of one opacity, born at keyframe number `keyframe`."""
-        rows = self._rows.append(gaussians, count, float(np.log(opacity / (1 - opacity))), keyframe)
+        rows = self.rows.append(gaussians, count, float(np.log(opacity / (1 - opacity))), keyframe)
         if count == 0:
             return NewRows(rows, 0)
-        job, places = selection.job, self._rows.places(gaussians, rows.start)
+        job, places = selection.job, self.rows.places(gaussians, rows.start)
         job.count = count
         for name in _SHAPES:
             setattr(job, name, places[name])

@@ -9,7 +9,6 @@ summed in another order.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import torch
@@ -22,7 +21,6 @@ from ggslam.mapping.cuda.pixel_pool import PixelDrawer
 from ggslam.mapping.identity import IdentityTimes, IdentityTuning, MaskOnGrid
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
-from ggslam.rendering.cuda.finished import MapState
 from ggslam.rendering.cuda.pixel_terms import feature_step
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.pixel_terms import FeatureAdamSettings
@@ -99,17 +97,6 @@ class Learner(Protocol):
     def note_losses(self, losses: torch.Tensor, known: torch.Tensor) -> None: ...
 
 
-@dataclass(frozen=True)
-class _Filled:
-    """What the job was filled from: as long as it is equal, so is the job."""
-
-    map: MapState
-    classes: tuple[int, int]
-    parts: int | None
-    size: tuple[int, int]
-    memory: int
-
-
 class CudaLessons:
     """Fills in the steps of a learner.
 
@@ -120,7 +107,7 @@ class CudaLessons:
     def __init__(self, learner: Learner) -> None:
         self._learner, self._device = learner, learner.device
         self._job, self._step = IdentityJob(), IdentityStep()
-        self._filled: _Filled | None = None
+        self._filled: tuple[object, ...] = ()  # what the job was filled from: as long as it is equal, so is the job
         self._named: tuple[object, ...] = ()
         self._memory = GrowingMemory(learner.device)
         self._known = torch.zeros(1, dtype=torch.int32, device=learner.device)
@@ -175,18 +162,19 @@ class CudaLessons:
     def _fill_job(self, gaussians: GaussianMap, size: tuple[int, int]) -> None:
         learner = self._learner
         table, shown = learner.table, learner.labels_for_parts(gaussians)
-        classes, parts = (table.training_arrays[0].data_ptr(), table.count), None if shown is None else shown.data_ptr()
-        wanted = _Filled(MapState.of(gaussians), classes, parts, size, self._memory.allocations)
-        if wanted != self._filled:
+        parts = None if shown is None else shown.data_ptr()
+        wanted = (gaussians, gaussians.version, gaussians.allocations, table.places, parts, size)
+        if (*wanted, self._memory.allocations) != self._filled:
             self._fill_in(gaussians, size, shown)
-            self._filled = _Filled(wanted.map, wanted.classes, wanted.parts, size, self._memory.allocations)
+            self._filled = (*wanted, self._memory.allocations)
 
     def _fill_in(self, gaussians: GaussianMap, size: tuple[int, int], shown: torch.Tensor | None) -> None:
         job, learner, s = self._job, self._learner, self._learner.settings
         table, near, count = learner.table, learner.settings.neighbours, len(gaussians)
-        job.means, job.gaussians = gaussians.means.data_ptr(), count
+        storage = gaussians.storage
+        job.means, job.gaussians = storage["means"].data_ptr(), count
         job.adam = feature_step(gaussians, FeatureAdamSettings(rate=0.0))
-        job.vote_ids, job.vote_weights = gaussians.vote_ids.data_ptr(), gaussians.vote_weights.data_ptr()
+        job.vote_ids, job.vote_weights = storage["vote_ids"].data_ptr(), storage["vote_weights"].data_ptr()
         job.alias, job.class_of = learner.device_alias.data_ptr(), table.class_of.data_ptr()
         job.whole_of = None if shown is None else learner.device_whole_of.data_ptr()
         job.shown = None if shown is None else shown.data_ptr()

@@ -215,6 +215,12 @@ class CudaMapper(ComparingMapper):
         if self.identity is not None:
             self.identity.begin_at(self.map, keyframe, new)
 
+    def _prune(self) -> None:
+        self._insertion.rows.prune(self.map, self.settings.pruning)
+
+    def _keep(self, stays: torch.Tensor) -> None:
+        self._insertion.rows.keep(self.map, stays)
+
     @property
     def _densification(self) -> str:
         return "never"

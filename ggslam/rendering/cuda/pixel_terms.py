@@ -15,11 +15,11 @@ from typing import Final
 import torch
 
 from ggslam.abi.arrays import address
-from ggslam.abi.core import AdamArrays
 from ggslam.abi.cuda import AdamStep, PixelTerms, Rendering, TermsByGaussian
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
 from ggslam.rendering.adam import ADAM_GROUPS
+from ggslam.rendering.cuda.adam import adam_arrays
 from ggslam.rendering.pixel_terms import MAX_CHANNELS, FeatureAdamSettings
 from ggslam.scene.gaussian_map import VOTE_SLOTS, GaussianMap
 
@@ -154,7 +154,7 @@ class CudaPixelTerms:
         """
         channels = self._checked_channels(gaussians)
         self._check("gradient", gradient, torch.float32, (len(self), channels))
-        if not gaussians.moments:
+        if not gaussians.with_moments:
             raise RenderError("step: the map was made without moments")
         adam = feature_step(gaussians, optimizer)
         self._call("step", self._by_gaussian(len(gaussians)), address(gradient), channels, adam)
@@ -241,10 +241,9 @@ def feature_step(gaussians: GaussianMap, optimizer: FeatureAdamSettings) -> Adam
     def logarithm(factor: float) -> float:
         return math.log(factor) if factor > 0 else -math.inf
 
-    first, second = gaussians.moments["features"]
     step = AdamStep(
-        features=AdamArrays(address(gaussians.features), address(first), address(second)),
-        updates=address(gaussians.feature_updates), decayed_groups=0, log_decay=0.0, decay_floor=1.0,
+        features=adam_arrays(gaussians, "features"),
+        updates=address(gaussians.storage["feature_updates"]), decayed_groups=0, log_decay=0.0, decay_floor=1.0,
         beta1=optimizer.beta1, beta2=optimizer.beta2, log_beta1=logarithm(optimizer.beta1),
         log_beta2=logarithm(optimizer.beta2), epsilon=optimizer.epsilon,
     )  # fmt: skip
