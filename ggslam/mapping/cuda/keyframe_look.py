@@ -14,7 +14,7 @@ from ggslam.mapping.cuda.insertion import Selection
 from ggslam.mapping.cuda.keyframe import CudaKeyframe
 from ggslam.mapping.cuda.look_memory import LABEL_STRIDE, LookKind, LookMemory
 from ggslam.mapping.labelling import MapLabels
-from ggslam.rendering.exposure import ExposureTuning, SeenAgain
+from ggslam.rendering.exposure import ExposureTuning, Seen, SeenAgain
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -70,7 +70,8 @@ class KeyframeLook:
         valid = mapper.valid_on_device(keyframe)
         self._explained: Explained = _explained_by_nothing(valid)
         if self.shows:
-            self._memory.see(mapper.map, mapper.render_keyframe(keyframe, with_room), valid)
+            self._view = mapper.render_keyframe(keyframe, with_room)
+            self._memory.see(mapper.map, self._view, keyframe.device_images(), keyframe.depth_unit, valid)
             self._explained = self._memory.explained
         self._select(keyframe.device_images().color)
 
@@ -90,13 +91,22 @@ class KeyframeLook:
         ids, share, depth = self._memory.labels()
         return MapLabels.from_grid(ids, share, depth.copy(), LABEL_STRIDE)
 
-    def view(self) -> SeenAgain | None:
+    def view(self) -> Seen | None:
         """What the map shows where the keyframe looks; None: nothing, or colours were not asked for. Good until the
-        next keyframe."""
-        if not (self.shows and self._memory.kind.with_colors):
-            return None
+        next rendering."""
+        return self if self.shows and self._memory.kind.with_colors else None
+
+    def measure(self, color: np.ndarray) -> np.ndarray | None:
+        """The keyframe's exposure, see `Seen`."""
         self.count()
-        return SeenAgain(*self._memory.thinned(), self._keyframe.depth_m(self._keyframe.depth[_SOME]), thinned=True)
+        return self._memory.exposure()
+
+    def pictures(self) -> SeenAgain:
+        """See `Seen`. Waits."""
+        self.count()
+        shown = (self._view.image, self._view.alpha, self._memory.explained[1])
+        pictures = download(*(image[_SOME].contiguous() for image in shown))
+        return SeenAgain(*pictures, self._keyframe.depth_m(self._keyframe.depth[_SOME]), thinned=True)
 
     def count(self) -> int:
         """Of the Gaussians to insert."""

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a new keyframe sees of the map, and the first values of what it brings: rows, votes, identity vectors, classes.
+// The first values of what a keyframe brings to the map: rows, votes, identity vectors, classes; and labels by votes.
 #pragma once
 #include "abi/cuda/growth.hpp"
 #include "common/platform.cuh"
@@ -7,8 +7,6 @@
 namespace ggslam::cuda {
 
 constexpr int kGrowthThreads = 256;
-constexpr float kLeastAlpha = 1e-3f;   // of a pixel that shows some depth, as RenderBuffers.expected_depth
-constexpr float kLabelAlpha = 0.5f;    // below it a pixel shows no object
 constexpr float kLeastLength = 1e-12f;  // of a class's weights
 
 __device__ inline std::int64_t growth_thread() {
@@ -31,30 +29,6 @@ __global__ void __launch_bounds__(kGrowthThreads) vote_labels_kernel(VoteLabelJo
   for (int k = 1; k < job.slots; ++k)
     if (weights[k] > weights[best]) best = k;
   job.labels[i] = weights[best] > 0.0f ? job.vote_ids[i * job.slots + best] : 0;
-}
-
-// A thread for each pixel.
-__global__ void __launch_bounds__(kGrowthThreads) keyframe_look_kernel(KeyframeLookJob job) {
-  const std::int64_t i = growth_thread(), pixels = static_cast<std::int64_t>(job.height) * job.width;
-  if (i == 0) *job.was_short = *job.overflowed;
-  if (i >= pixels) return;
-  const float alpha = job.alpha[i];
-  const float depth = alpha >= kLeastAlpha ? job.depth[i] / alpha : 0.0f;
-  job.explained_alpha[i] = job.valid != nullptr && job.valid[i] == 0 ? 1.0f : alpha;
-  job.explained_depth[i] = depth;
-  const int row = static_cast<int>(i / job.width), column = static_cast<int>(i % job.width);
-  if (job.thinned != nullptr && row % job.thin_stride == 0 && column % job.thin_stride == 0) {
-    const std::int64_t wide = (job.width + job.thin_stride - 1) / job.thin_stride;
-    const std::int64_t plane = wide * ((job.height + job.thin_stride - 1) / job.thin_stride);
-    float* out = job.thinned + row / job.thin_stride * wide + column / job.thin_stride;
-    for (int k = 0; k < 3; ++k) out[k * plane] = job.image[k * pixels + i];
-    out[3 * plane] = alpha;
-    out[4 * plane] = depth;
-  }
-  if (job.shares != nullptr && row % job.label_stride == 0 && column % job.label_stride == 0 && !(alpha > kLabelAlpha)) {
-    const std::int64_t wide = (job.width + job.label_stride - 1) / job.label_stride;
-    job.shares[row / job.label_stride * wide + column / job.label_stride] = 0.0f;
-  }
 }
 
 // A thread for each new Gaussian.
