@@ -10,7 +10,8 @@ import torch
 
 from ggslam.system.tuning import Tuning
 
-_Kind, _Made = TypeVar("_Kind"), TypeVar("_Made")
+_Kind = TypeVar("_Kind")
+_Made = TypeVar("_Made")
 
 
 class KindTuning(Tuning):

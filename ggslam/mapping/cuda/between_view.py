@@ -65,7 +65,7 @@ class CudaBetweenView(DeviceKeyframe):
         return torch.mm(self._T_camera_keyframe, self._keyframe.exact_device_pose)[:3].float().view(12)
 
     @property
-    def hanging_on(self) -> torch.Tensor | None:
+    def T_camera_keyframe_on_device(self) -> torch.Tensor | None:
         return self._T_camera_keyframe
 
     @property

@@ -30,6 +30,12 @@ class ImageSource(Protocol):
     mask: np.ndarray | None
 
     @property
+    def color(self) -> np.ndarray: ...
+
+    @property
+    def depth(self) -> np.ndarray: ...
+
+    @property
     def image_key(self) -> Hashable: ...
 
     @property

@@ -34,7 +34,7 @@ class DeviceKeyframe(Keyframe):
         """First three rows of its T_camera_world, float32 [12]. Nobody changes it before the next keyframe or step."""
 
     @property
-    def hanging_on(self) -> torch.Tensor | None:
+    def T_camera_keyframe_on_device(self) -> torch.Tensor | None:
         """Its T_camera_keyframe on the device, float64 [4, 4], if its pose hangs on that of a keyframe."""
         return None
 

@@ -68,7 +68,7 @@ class KeyframeLook:
     def _start(self, with_room: bool) -> None:
         mapper, keyframe, self._with_room = self._mapper, self._keyframe, with_room
         valid = mapper.valid_on_device(keyframe)
-        self._explained: Explained = _explained_by_nothing(valid)
+        self._explained: Explained = _nothing_explained(valid)
         if self.shows:
             self._view = mapper.render_keyframe(keyframe, with_room)
             self._memory.see(mapper.map, self._view, keyframe.device_images(), keyframe.depth_unit, valid)
@@ -105,8 +105,9 @@ class KeyframeLook:
         """See `Seen`. Waits."""
         self.count()
         shown = (self._view.image, self._view.alpha, self._memory.explained[1])
-        pictures = download(*(image[_SOME].contiguous() for image in shown))
-        return SeenAgain(*pictures, self._keyframe.depth_m(self._keyframe.depth[_SOME]), thinned=True)
+        image, alpha, rendered_depth = download(*(picture[_SOME].contiguous() for picture in shown))
+        measured = self._keyframe.depth_m(self._keyframe.depth[_SOME])
+        return SeenAgain(image, alpha, rendered_depth, measured, thinned=True)
 
     def count(self) -> int:
         """Of the Gaussians to insert."""
@@ -119,7 +120,7 @@ class KeyframeLook:
         return self._count
 
 
-def _explained_by_nothing(valid: torch.Tensor | None) -> Explained:
+def _nothing_explained(valid: torch.Tensor | None) -> Explained:
     """What is explained without a map: where a keyframe shows nothing, bool [H, W] on a device being False, there is
     nothing to explain."""
     if valid is None:

@@ -77,7 +77,7 @@ class LookMemory:
 
     def __init__(self, rasterizer: CudaRasterizer, kind: LookKind) -> None:
         self._rasterizer, self.kind, device = rasterizer, kind, rasterizer.device
-        size, grid = kind.size, _thinned(kind.size, LABEL_STRIDE)
+        size, grid = kind.size, _grid_size(kind.size, LABEL_STRIDE)
         wanted = 4 + _RATIO_WORDS + kind.with_labels * (size[0] * size[1] + 2 * grid[0] * grid[1])
         block = _Block(wanted, device)
         self._fetch = block.fetch
@@ -86,14 +86,14 @@ class LookMemory:
         self._short, self._was_short = block.part(torch.int32, 3)
         self._ratios, on_host = block.part(torch.int32, _RATIO_WORDS)
         self._found = BrightnessRatios.from_buffer(on_host)
-        thin = _thinned(size, ExposureTuning.stride)
+        thin = _grid_size(size, ExposureTuning.stride)
         self._compared = thin[0] * thin[1]
         self._pixel_ratios = torch.empty(3 * self._compared * kind.with_colors, device=device)
         depth = torch.empty(0 if kind.with_labels else size, device=device)
         if kind.with_labels:
             depth, self._depth = block.part(torch.float32, *size)
             self._ids, self._shares = block.part(torch.int32, *grid), block.part(torch.float32, *grid)
-            self._pixels = _grid(size, LABEL_STRIDE, device)
+            self._pixels = _grid_pixels(size, LABEL_STRIDE, device)
             self._terms = CudaPixelTerms.empty(len(self._pixels), _MOST_TERMS, rasterizer.library, device)
             self._votes = CudaVoteLabels(device, rasterizer.library)
         self.explained = torch.empty(size, device=device), depth
@@ -150,11 +150,11 @@ class LookMemory:
 
 
 
-def _thinned(size: tuple[int, int], stride: int) -> tuple[int, int]:
+def _grid_size(size: tuple[int, int], stride: int) -> tuple[int, int]:
     return -(-size[0] // stride), -(-size[1] // stride)
 
 
-def _grid(size: tuple[int, int], stride: int, device: torch.device) -> torch.Tensor:
+def _grid_pixels(size: tuple[int, int], stride: int, device: torch.device) -> torch.Tensor:
     """Every `stride`-th pixel of every `stride`-th row, flat indices, int32 [P]."""
     pixels = torch.arange(size[0] * size[1], dtype=torch.int32, device=device).view(size)
     return pixels[::stride, ::stride].reshape(-1)

@@ -52,7 +52,7 @@ class MapRows:
         """Appends so many Gaussians; returns their rows. Of one opacity, and otherwise as `GaussianMap.insert` begins
         them, but for means, rotations, sizes and colours, which the caller has to write."""
         rows = gaussians.extend(added)
-        arrays, job = self._known(gaussians), self._fill
+        arrays, job = self._find_arrays(gaussians), self._fill
         values = {"opacity_logits": _bits(opacity_logit), "birth_keyframe": birth_keyframe}
         job.count, job.stream = 0, self._library.stream(gaussians.device)
         for name, array in arrays.items():
@@ -66,7 +66,7 @@ class MapRows:
 
     def places(self, gaussians: GaussianMap, row: int) -> Mapping[str, int]:
         """Address of a row in every array."""
-        return {name: array.place + row * array.row_bytes for name, array in self._known(gaussians).items()}
+        return {name: array.place + row * array.row_bytes for name, array in self._find_arrays(gaussians).items()}
 
     # --- that go -----------------------------------------------------------------------------------------------------
 
@@ -88,7 +88,7 @@ class MapRows:
         if count == 0:
             return 0
         job.array_count = 0
-        for array in self._known(gaussians).values():
+        for array in self._find_arrays(gaussians).values():
             if array.row_bytes:
                 job.arrays[job.array_count].rows, job.arrays[job.array_count].words = (
                     array.place, array.row_bytes // _WORD
@@ -104,7 +104,7 @@ class MapRows:
             gaussians.shorten(kept)
         return count - kept
 
-    def _known(self, gaussians: GaussianMap) -> dict[str, _Array]:
+    def _find_arrays(self, gaussians: GaussianMap) -> dict[str, _Array]:
         state = gaussians, gaussians.allocations
         if state != self._of:
             self._of, self._arrays = state, {}
