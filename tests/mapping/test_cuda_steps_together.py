@@ -136,6 +136,41 @@ def test_objects_are_learned_in_the_same_call(frames: list[Frame], schedule: Any
     assert found.map.vote_weights.max() > 0.2 and found.map.features.any()
 
 
+@pytest.mark.long("refinements at three sizes under emulation")
+def test_pictures_of_other_sizes_and_frames_between_keyframes(room: Path) -> None:
+    """Steps at half and at twice the size are made by one call each, those of frames between keyframes, too: but for
+    how the place of these is rounded."""
+    frames = list(open_sequence(room, scale=0.54, stride=2).stream())[:3]
+
+    def work(with_between: bool) -> Callable[[], CudaMapper]:
+        def train() -> CudaMapper:
+            mapper = make_mapper(emulated_library())
+            mapper._exposures.settings = replace(mapper._exposures.settings, enabled=False)
+            mapper.settings = replace(mapper.settings, exposure=mapper._exposures.settings)
+            for number, frame in enumerate(frames[:2]):
+                add_keyframe(mapper, frame, number)
+                mapper.run(2)
+            if with_between:
+                poses = [frame.T_world_camera for frame in frames]
+                mapper.keep_between(frames[2], 1, inverse(poses[1]) @ poses[2])
+            mapper.refine(8)
+            return mapper
+
+        return train
+
+    def made_by_calls(mapper: CudaMapper) -> int:
+        return mapper._training.graphs.counts.started + mapper._training.graphs.counts.plain
+
+    plain, _ = both_ways(work(with_between=False))
+    assert len(plain._training._jobs._kept) == 3 and made_by_calls(plain) == plain.times.steps - 1 == 11
+    found = work(with_between=True)()
+    with one_by_one():
+        expected = work(with_between=True)()
+    assert made_by_calls(found) == 11 and made_by_calls(expected) == 0
+    torch.testing.assert_close(found.map.means, expected.map.means, atol=1e-5, rtol=0)
+    assert not torch.equal(found.map.means, plain.map.means)
+
+
 def test_steps_without_room_change_nothing_and_are_counted(frames: list[Frame]) -> None:
     mapper = make_mapper(emulated_library())
     add_keyframe(mapper, frames[0])
