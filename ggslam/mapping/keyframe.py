@@ -114,14 +114,22 @@ class Keyframe:
 def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
     """The keyframe of a frame seen from `T_world_camera`."""
     unit = depth_unit_for(frame.depth)
-    scaled = frame.depth * np.float32(1 / unit)
-    units = np.clip(scaled + 0.5, 0, _MOST_UNITS).astype(np.uint16)
-    units[scaled > _MOST_UNITS] = 0
+    units = _units_of(frame.depth, unit)
     return Keyframe(
         index, frame.index, frame.timestamp, frame.camera, np.ascontiguousarray(frame.color), units,
         inverse(T_world_camera), frame.mask, camera_number=frame.camera_number, instant=frame.instant,
         moving=frame.moving, depth_unit=unit,
     )  # fmt: skip
+
+
+def _units_of(depth: np.ndarray, unit: float) -> np.ndarray:
+    """Depth, float [H, W] in metres, rounded to units of so many metres, uint16; 0 where it is beyond their range."""
+    scaled = depth * np.float32(1 / unit)
+    beyond = scaled > _MOST_UNITS
+    scaled += 0.5
+    units = np.clip(scaled, 0, _MOST_UNITS, out=scaled).astype(np.uint16)
+    units[beyond] = 0
+    return units
 
 
 def depth_unit_for(depth: np.ndarray) -> float:

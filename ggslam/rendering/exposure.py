@@ -36,9 +36,12 @@ class ExposureTuning(Tuning):
 _SOME = (slice(None, None, ExposureTuning.stride), slice(None, None, ExposureTuning.stride))
 
 
+_IDENTITY = np.tile([1.0, 0.0], (3, 1))
+
+
 def identity_exposure() -> np.ndarray:
     """Gain 1 and offset 0 for each channel, float64 [3, 2]."""
-    return np.tile([1.0, 0.0], (3, 1))
+    return _IDENTITY.copy()
 
 
 def change_of(exposure: np.ndarray) -> float:

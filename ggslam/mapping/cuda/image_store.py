@@ -70,7 +70,7 @@ class CudaKeyframeImages:
         return sum(image.nbytes for image in (self.color, self.depth, self.mask) if image is not None)
 
 
-_TYPES: Final = {"uint8": torch.uint8, "uint16": torch.uint16}
+_TYPES: Final = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.uint16}
 
 
 class ImageStore:
@@ -138,7 +138,7 @@ class ImageStore:
     # --- memory ------------------------------------------------------------------------------------------------------
 
     def _upload(self, image: np.ndarray) -> torch.Tensor:
-        slots, staging = self._memory_for(image.shape, _TYPES[image.dtype.name])
+        slots, staging = self._memory_for(image.shape, _TYPES[image.dtype])
         if self._leaving and not self._is_awaited():
             for left in self._leaving:
                 self._memory_for(tuple(left.shape), left.dtype)[0].give_back(left)

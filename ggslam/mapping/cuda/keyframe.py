@@ -6,6 +6,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Hashable
 from dataclasses import fields
+from typing import Final
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.step_rows import KeptRow
 from ggslam.mapping.keyframe import Keyframe
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
+
+_FIELDS: Final = tuple(field.name for field in fields(Keyframe))
 
 
 class DeviceKeyframe(Keyframe):
@@ -61,7 +64,7 @@ class CudaKeyframe(DeviceKeyframe):
         self._states: KeyframeStates | None = None
         self._images, self.rows = images, []
         values = vars(keyframe)  # without images that are in an archive
-        super().__init__(**{field.name: values[field.name] for field in fields(Keyframe)})
+        super().__init__(**{name: values[name] for name in _FIELDS})
         states.append(keyframe.T_camera_world, keyframe.exposure)
         self._states = states
 

@@ -5,7 +5,7 @@ something that they are made from is another."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from operator import is_
 from typing import Final, Protocol, TypeVar
 
@@ -43,7 +43,7 @@ class StepKind:
 
     def is_like(self, other: StepKind) -> bool:
         """Whether all of it is equal."""
-        return all(getattr(self, field.name) == getattr(other, field.name) for field in fields(self))
+        return vars(self) == vars(other)
 
 
 class StepKinds:

@@ -53,8 +53,9 @@ class AdamSteps:
 
 def adam_arrays(gaussians: GaussianMap, name: str) -> AdamArrays:
     """A parameter of a map with moments, and these."""
-    first, second = f"{name}.first", f"{name}.second"
-    return AdamArrays(*(address(gaussians.storage[array]) for array in (name, first, second)))
+    storage = gaussians.storage
+    first, second = storage[f"{name}.first"], storage[f"{name}.second"]
+    return AdamArrays(storage[name].data_ptr(), first.data_ptr(), second.data_ptr())
 
 
 def _set_numbers(step: AdamStep, optimizer: AdamSettings) -> None:
