@@ -212,7 +212,7 @@ class CudaIdentityLearner(IdentityLearner):
     def step(
         self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers, rate_factor: float = 1.0
     ) -> torch.Tensor | None:
-        if not isinstance(rasterizer, CudaRasterizer) or not self.lessons.takes(gaussians, keyframe):
+        if not isinstance(rasterizer, CudaRasterizer) or not self.lessons.takes(gaussians):
             return super().step(gaussians, rasterizer, keyframe, view, rate_factor)
         start = time.perf_counter()
         self.lessons.run(gaussians, rasterizer, keyframe, rate_factor)

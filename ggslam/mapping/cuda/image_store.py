@@ -115,18 +115,18 @@ class ImageStore:
         """Of all images that are kept these were used last."""
         self._images.move_to_end(images.key)
 
-    def mask_of(self, keyframe: ImageSource) -> torch.Tensor | None:
-        """The mask that a keyframe has now."""
+    def mask_of(self, keyframe: ImageSource, grid: PixelGrid = ALL_PIXELS) -> torch.Tensor | None:
+        """The mask that a keyframe has now, at a grid's pixels."""
         mask = keyframe.mask
         if mask is None:
             return None
-        images = self.of(keyframe)
+        images = self.of(keyframe, grid)
         if images.mask is None or images.mask_of is not mask:
-            if images.mask is None:
-                self.nbytes += mask.nbytes
-            else:
+            if images.mask is not None:
                 self._drop(images.mask)
-            images.mask, images.mask_of = self._upload(mask), mask
+                self.nbytes -= images.mask.nbytes
+            images.mask, images.mask_of = self._upload(grid.of(mask)), mask
+            self.nbytes += images.mask.nbytes
             self._make_room()
         return images.mask
 

@@ -109,17 +109,20 @@ class CudaLessons:
         self._job, self._step = IdentityJob(), IdentityStep()
         self._filled: tuple[object, ...] = ()  # what the job was filled from: as long as it is equal, so is the job
         self._named: tuple[object, ...] = ()
+        self._sizes: set[tuple[int, int]] = set()  # of pictures that the job has room for
         self._memory = GrowingMemory(learner.device)
         self._known = torch.zeros(1, dtype=torch.int32, device=learner.device)
         self._losses = torch.zeros(learner.settings.pixels, device=learner.device)
+        pixels = torch.zeros(learner.settings.pixels, dtype=torch.int32, device=learner.device)
+        self._once = PixelPool(pixels, torch.zeros_like(self._losses))
         self.pools = PoolStore(learner.device, IdentityTuning.pool_steps * learner.settings.pixels)
 
-    def takes(self, gaussians: GaussianMap, keyframe: Any) -> bool:
-        """Whether the library makes steps of this kind."""
+    def takes(self, gaussians: GaussianMap) -> bool:
+        """Whether the library makes steps on a map."""
         s: IdentitySettings = self._learner.settings
-        whole = not isinstance(keyframe, MaskOnGrid) and gaussians.feature_channels == IDENTITY_CHANNELS
         few = s.neighbours.weight == 0 or s.neighbours.neighbours <= MOST_NEIGHBOURS
-        return whole and few and gaussians.with_moments and s.schedule in _SCHEDULES and len(gaussians) > 0
+        fits = gaussians.with_moments and gaussians.feature_channels == IDENTITY_CHANNELS
+        return fits and few and s.schedule in _SCHEDULES and len(gaussians) > 0
 
     def run(self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: Any, rate_factor: float) -> None:
         """A step at pixels of what was rendered last."""
@@ -132,12 +135,15 @@ class CudaLessons:
     def fill(
         self, step: IdentityStep, gaussians: GaussianMap, keyframe: Any, size: tuple[int, int], rate_factor: float
     ) -> IdentityJob:
-        """Fills in the next step on a keyframe, whose images are of `size` (height, width), and counts it; returns the
-        job that goes with it. Valid until map, masks or classes change."""
+        """Fills in the next step on a keyframe, or its mask on a grid, whose picture is of `size` (height, width), and
+        counts it; returns the job that goes with it. Valid until map, masks or classes change."""
         learner = self._learner
         self._fill_job(gaussians, size)
         step.mask, step.rate_factor = keyframe.device_mask.data_ptr(), rate_factor
-        self._fill_pixels(step, keyframe.index)
+        if isinstance(keyframe, MaskOnGrid):
+            self._fill_once(step)
+        else:
+            self._fill_pixels(step, keyframe.index)
         step.pulls = learner.table.count > 0 and self._job.samples > 0 and learner.pulls(gaussians)
         step.pull = learner.times.count
         if self._job.trains:
@@ -159,16 +165,25 @@ class CudaLessons:
         step.used = pool.used
         pool.used += wanted
 
+    def _fill_once(self, step: IdentityStep) -> None:
+        """Pixels of this step alone: the next one has another grid."""
+        step.drawn, step.draw, step.used = len(self._once.pixels), self._learner.drawer.next_draw(), 0
+        step.pool, step.pool_weights = self._once.pixels.data_ptr(), self._once.vote_weights.data_ptr()
+
     def _fill_job(self, gaussians: GaussianMap, size: tuple[int, int]) -> None:
         learner = self._learner
         table, shown = learner.table, learner.labels_for_parts(gaussians)
         parts = None if shown is None else shown.data_ptr()
-        wanted = (gaussians, gaussians.version, gaussians.allocations, table.places, parts, size)
-        if (*wanted, self._memory.allocations) != self._filled:
-            self._fill_in(gaussians, size, shown)
-            self._filled = (*wanted, self._memory.allocations)
+        wanted = (gaussians, gaussians.version, gaussians.allocations, table.places, parts)
+        if wanted != self._filled:
+            self._fill_in(gaussians, shown)
+            self._filled, self._sizes = wanted, set()
+        if size not in self._sizes:
+            room = learner.library.functions.ggslam_cuda_identity_bytes(ctypes.byref(self._job), *size)
+            self._job.workspace = self._memory.block("lesson", room).data_ptr()
+            self._sizes.add(size)
 
-    def _fill_in(self, gaussians: GaussianMap, size: tuple[int, int], shown: torch.Tensor | None) -> None:
+    def _fill_in(self, gaussians: GaussianMap, shown: torch.Tensor | None) -> None:
         job, learner, s = self._job, self._learner, self._learner.settings
         table, near, count = learner.table, learner.settings.neighbours, len(gaussians)
         storage = gaussians.storage
@@ -189,7 +204,4 @@ class CudaLessons:
         job.neighbours = min(near.neighbours, count - 1) if pulls else 0
         job.samples = learner.sample_count(job.neighbours) if pulls else 0
         job.pull_weight = near.weight * near.value / max(1, table.count)
-        room = learner.library.functions.ggslam_cuda_identity_bytes(ctypes.byref(job), *size)
-        workspace = self._memory.block("lesson", room)
-        job.workspace = workspace.data_ptr()
-        self._named = (shown, workspace, rows, first, second)
+        self._named = (shown, rows, first, second)

@@ -14,7 +14,6 @@ from typing import Any, Final
 import torch
 
 from ggslam.abi.cuda import IdentityJob, IdentityStep, TrainingStep
-from ggslam.mapping.cuda.keyframe import CudaKeyframe
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.lessons import CudaLessons
 from ggslam.mapping.cuda.losses import CudaImageLoss
@@ -84,9 +83,11 @@ class CudaTraining:
         self.count += 1
         return True
 
-    def teach_last(self, lessons: CudaLessons, gaussians: GaussianMap, keyframe: CudaKeyframe) -> None:
-        """On the rendering of the last step that was gathered, a step of identity learning is made, too."""
-        camera, number = keyframe.camera, self._lesson_count
+    def teach_last(self, lessons: CudaLessons, gaussians: GaussianMap, keyframe: Any) -> None:
+        """On the rendering of the last step that was gathered, a step of identity learning is made, too, with a
+        keyframe's mask on its grid."""
+        assert self._kind is not None
+        number, camera = self._lesson_count, self._kind.camera
         size = (camera.height, camera.width)
         self._identity = lessons.fill(self._lessons[number], gaussians, keyframe, size, 1.0)
         self._steps[self.count - 1].lesson = number

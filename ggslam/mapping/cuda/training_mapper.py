@@ -147,11 +147,9 @@ class TrainingMapper(ComparingMapper):
     # --- what keyframes are compared with ---------------------------------------------------------------------------
 
     def _masks_on(self, keyframe: Keyframe, grid: PixelGrid) -> Keyframe | MaskOnGrid:
-        mask = None if grid.is_whole or not isinstance(keyframe, CudaKeyframe) else keyframe.device_mask
-        if mask is None:
+        if grid.is_whole or not isinstance(keyframe, CudaKeyframe):
             return super()._masks_on(keyframe, grid)
-        on_grid: torch.Tensor = grid.of(mask.view(torch.int16))  # type: ignore[assignment,arg-type]
-        return CudaMaskOnGrid(keyframe.index, None, on_grid.contiguous().view(torch.uint16))
+        return CudaMaskOnGrid(keyframe.index, None, self._images.mask_of(keyframe, grid))
 
     def _render(
         self, keyframe: Keyframe, features: bool, grid: PixelGrid = ALL_PIXELS, close_below: float = 0.0
@@ -188,7 +186,7 @@ class TrainingMapper(ComparingMapper):
         """Whether the library makes all steps of `run` by one call."""
         if self.residency is not None or not self._training.is_ready or self._needs_all_pixels:
             return False
-        return self.identity is None or self.identity.lessons.takes(self.map, self.keyframes[-1])
+        return self.identity is None or self.identity.lessons.takes(self.map)
 
     def _run_steps(self, iterations: int) -> None:
         optimizer, pose_rate, identity = self._optimizer(1.0, False), self._pose_rate, self.identity
@@ -206,20 +204,18 @@ class TrainingMapper(ComparingMapper):
     ) -> None:
         assert isinstance(keyframe, DeviceKeyframe)
         rate_factor, pose_factor = factors
-        if not self._is_known(keyframe, grid, learns):
+        if not self._is_known(learns):
             self._start_steps()
             super()._step(keyframe, factors, grid, learns, settles)
             return
         pose_rate = self._pose_rate_of(keyframe, grid, pose_factor)
         self._gather(keyframe, grid, self._optimizer(rate_factor, settles), pose_rate, learns)
 
-    def _is_known(self, keyframe: DeviceKeyframe, grid: PixelGrid, learns: bool) -> bool:
-        """Whether the library makes such steps by one call."""
+    def _is_known(self, learns: bool) -> bool:
+        """Whether the library makes a step by one call, one of identity learning with it if `learns`."""
         if self.extra_loss is not None or not self._training.is_ready:
             return False
-        if not learns or self.identity is None:
-            return True
-        return grid.is_whole and self.identity.lessons.takes(self.map, keyframe)
+        return not learns or self.identity is None or self.identity.lessons.takes(self.map)
 
     def _gather(
         self, keyframe: DeviceKeyframe, grid: PixelGrid, optimizer: AdamSettings, pose_rate: float, learns: bool
@@ -231,8 +227,8 @@ class TrainingMapper(ComparingMapper):
         self._images.use(row.images)
         while not training.add(row, optimizer, 0.0 if row.is_world else pose_rate):
             self._start_steps()
-        if learns and isinstance(keyframe, CudaKeyframe) and self.identity is not None:
-            training.teach_last(self.identity.lessons, self.map, keyframe)
+        if learns and self.identity is not None:
+            training.teach_last(self.identity.lessons, self.map, self._masks_on(keyframe, grid))
         self.times.steps += 1
         keyframe.iterations += 1
 
