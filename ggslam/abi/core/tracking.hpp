@@ -71,6 +71,28 @@ struct alignas(64) Voxel {
   float padding[2];
 };
 
+// A target that somebody has a copy of.
+struct TargetCopy {
+  uint64_t number;    // which; 0: none
+  uint32_t version;   // of a growing target
+  int32_t finished;   // whether the copy is of voxels with shapes; else of their moments
+};
+
+// What a copy lacks of one level, and where it is.
+struct LevelChanges {
+  int64_t values_at, blocks_at, indices_at;  // bytes from the beginning: see ggslam_gicp_target_changes
+  int32_t voxel_count, block_count;          // that the copy lacks
+  int32_t all_blocks;                        // of the level
+  int32_t places;                            // voxels of the level have indices below
+};
+
+// What a copy lacks of a target.
+struct TargetChanges {
+  TargetCopy target;  // what it is a copy of then
+  int32_t whole;      // whether that is everything: the copy is of another target
+  LevelChanges fine, coarse;
+};
+
 // How points are aligned to voxels.
 struct AlignSettings {
   double translation_tolerance, rotation_tolerance;  // metres, radians
@@ -140,7 +162,7 @@ GGSLAM_EXPORT int ggslam_gicp_target_build_like(void* context, void* target, con
                                                 const ggslam::TargetSettings* settings);
 
 // As ggslam_gicp_target_build, but leaves the voxels without shapes. Until ggslam_gicp_target_finish has been called, the
-// target may be a base, and be asked for its size, its moments and its blocks.
+// target may be a base, and be asked for its size and for what a copy of its moments lacks.
 GGSLAM_EXPORT int ggslam_gicp_target_gather(void* context, void* target, const void* base,
                                             const ggslam::TargetInput* input, const ggslam::TargetSettings* settings);
 GGSLAM_EXPORT int ggslam_gicp_target_finish(void* context, void* target, const ggslam::TargetSettings* settings);
@@ -148,17 +170,17 @@ GGSLAM_EXPORT int ggslam_gicp_target_finish(void* context, void* target, const g
 // Number of voxels of a level (0 fine, 1 coarse).
 GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target, int level);
 
-// Copies the moments of a level's voxels, [n, 22] in the order of struct VoxelMoments.
-GGSLAM_EXPORT int ggslam_gicp_target_moments(const void* target, int level, float* out);
-
 // Copies a level's voxels, [n, 16] in the order of struct Voxel.
 GGSLAM_EXPORT int ggslam_gicp_target_voxels(const void* target, int level, float* out);
 
-// Copies the unit normals of some fine voxels, [n, 3]; zero where the index is negative.
+// Copies the unit normals of some fine voxels by the index that alignments give, [n, 3]; zero where it is negative.
 GGSLAM_EXPORT int ggslam_gicp_target_normals(const void* target, const int32_t* voxels, int64_t count, float* out);
 
-// Number of blocks of a level. Copies them unless `out` is null: [n, 3] key, occupied, first.
-GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target, int level, uint64_t* out);
+// What a copy of a target lacks, with shapes if `finished`: to `out`, which has `room` bytes, if that is enough; returns the
+// bytes needed. Of each level values: of voxels (struct Voxel, or struct VoxelMoments); blocks: key, occupied, first, of
+// each that changed, whose voxels are the values in the same order; indices: where each value belongs, int32.
+GGSLAM_EXPORT int64_t ggslam_gicp_target_changes(const void* target, const ggslam::TargetCopy* copy, int finished,
+                                                 void* out, int64_t room, ggslam::TargetChanges* changes);
 
 // Uses no thread but the caller's.
 GGSLAM_EXPORT void* ggslam_target_part_create(const void* context, const ggslam::TargetInput* input,

@@ -58,15 +58,22 @@ struct VoxelLevel {
   float size, inverse_size;  // of a voxel, metres
 };
 
-// A level to set up.
+// Blocks of a level that change, or come: all of them, where the table is emptied first. Their voxels go to indices that
+// nothing else uses any more.
 struct VoxelLevelJob {
-  const VoxelBlock* blocks;
-  const VoxelMoments* moments;  // null: the voxels are finished
+  const VoxelBlock* blocks;         // [block_count]
+  const std::int32_t* indices;      // [voxel_count] of their voxels, block by block
+  const VoxelMoments* new_moments;  // [voxel_count] of their voxels, which get their shapes on the device; or null and
+  const Voxel* new_voxels;          // [voxel_count] the voxels with their shapes
+  const VoxelSlot* old_slots;       // a smaller table, whose blocks move to that of the level; null: they are there
+  std::uint64_t old_mask;           // of that, as slot_mask
   VoxelLevel level;
-  Voxel* voxels;  // those of the level, to be finished
+  VoxelMoments* moments;            // of the level's voxels
+  Voxel* voxels;                    // those of the level
   void* stream;
   TargetSettings settings;
   std::int32_t device, block_count, voxel_count;
+  std::int32_t empties;             // whether the table is emptied first
 };
 
 // Points to align to a target.
@@ -141,8 +148,8 @@ GGSLAM_EXPORT std::int64_t ggslam_cuda_depth_points_bytes(const ggslam::cuda::De
 // Points of a depth image, their number and their median depth.
 GGSLAM_EXPORT int ggslam_cuda_depth_points(const ggslam::cuda::DepthPointsJob* job);
 
-// Empties the hash table of a level, which has more places than there are blocks, and puts the level's blocks in; gives
-// the voxels their shapes if they have none yet.
+// Puts blocks into the hash table of a level, which has more places than there are blocks, and their voxels where they
+// belong; gives these their shapes if they have none yet.
 GGSLAM_EXPORT int ggslam_cuda_voxel_level(const ggslam::cuda::VoxelLevelJob* job);
 
 // Bytes of memory that an alignment works in; the caller sets them to zero before the first one. Asks for room,

@@ -15,7 +15,7 @@ import torch
 
 from ggslam.abi.cuda import MOST_NEIGHBOURS, IdentityJob, IdentityStep
 from ggslam.cuda.library import CudaLibrary
-from ggslam.cuda.memory import GrowingMemory
+from ggslam.cuda.memory import GrowingMemory, Slots
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
 from ggslam.mapping.identity import IdentityTimes, IdentityTuning, MaskOnGrid
@@ -26,21 +26,12 @@ from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.pixel_terms import FeatureAdamSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
-from ggslam.system.tuning import Tuning
-
-
-class PoolStoreTuning(Tuning):
-    """Room for pixels that are drawn ahead."""
-
-    at_once = 16
-    """Keyframes for which room is made at a time."""
-
 
 _SCHEDULES: Final = ("sampled", "votes")
 
 
 class PoolStore:
-    """Room for the pixels of keyframes, made for several at a time.
+    """Room for the pixels of keyframes.
 
     Args:
         device: where.
@@ -48,26 +39,24 @@ class PoolStore:
     """
 
     def __init__(self, device: torch.device, size: int) -> None:
-        self._device, self._size = device, size
-        self._spare: list[PixelPool[torch.Tensor]] = []
+        self._size = size
+        self._pixels = Slots((size,), torch.int32, device)
+        self._weights = Slots((size,), torch.float32, device)
 
     def make_room(self) -> None:
         """Makes some if there is none: to be called while nobody minds an allocation."""
-        if not self._spare:
-            shape = (PoolStoreTuning.at_once, self._size)
-            pixels = torch.zeros(shape, dtype=torch.int32, device=self._device)
-            weights = torch.zeros(shape, dtype=torch.float32, device=self._device)
-            self._spare = [PixelPool(*part) for part in zip(pixels.unbind(), weights.unbind(), strict=True)]
+        self._pixels.make_room()
+        self._weights.make_room()
 
     def take(self) -> PixelPool[torch.Tensor]:
         """Room for one keyframe."""
-        self.make_room()
-        return self._spare.pop()
+        return PixelPool(self._pixels.take(), self._weights.take())
 
     def give_back(self, pool: PixelPool[torch.Tensor]) -> None:
         """What is not needed any more; nothing becomes of it if it is of another size."""
         if len(pool.pixels) == self._size:
-            self._spare.append(pool)
+            self._pixels.give_back(pool.pixels)
+            self._weights.give_back(pool.vote_weights)
 
 
 class Learner(Protocol):

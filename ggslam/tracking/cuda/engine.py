@@ -143,6 +143,7 @@ class CudaTrackingEngine:
         job.looks = source.looks
         align.stream = self.library.stream(self.device)
         self.library.call("track_wait", self._reference)
+        self._target.note_made()
         source.note_extracted()
         found = self._found.copy()
         source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Targets on the device: the voxels of the compiled core, and the hash table that finds them."""
+"""Targets on the device: the voxels of the compiled core, and the hash table that finds them.
+
+A target that grew from the one on the device shares most blocks with it: those that changed are sent, in one copy with
+where they belong, and the kernels put them there. Any other target is sent whole in the same form.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import threading
 import weakref
 from ctypes import sizeof
@@ -13,8 +18,8 @@ import numpy as np
 import torch
 
 from ggslam.abi.arrays import address
-from ggslam.abi.core import Voxel, VoxelMoments
-from ggslam.abi.cuda import TrackJob, VoxelBlock, VoxelLevel, VoxelLevelJob, VoxelSlot
+from ggslam.abi.core import LevelChanges, TargetChanges, TargetCopy, Voxel, VoxelMoments
+from ggslam.abi.cuda import TrackJob, VoxelLevel, VoxelLevelJob, VoxelSlot
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Upload
 from ggslam.native.loader import load_library
@@ -22,34 +27,69 @@ from ggslam.system.tuning import Tuning
 from ggslam.tracking.gicp import GicpTarget
 
 
-class HashTableTuning(Tuning):
-    """Hash table of voxels on the device."""
+class CudaTargetTuning(Tuning):
+    """Targets on the device."""
 
     min_slots_per_block = 4
-    """Fewest slots per block, so that most look-ups end at the first slot."""
+    """Fewest slots of the hash table per block, so that most look-ups end at the first slot."""
+    staging_bytes = 1 << 20
+    """Page-locked memory that blocks are sent from, until more are sent at once. A keyframe of 640x480 changes 0.3 to
+    0.9 MB."""
 
 
 @dataclass(frozen=True)
 class _Staged:
-    """A target in page-locked memory, ready to be sent.
+    """What the device lacks of a target, in page-locked memory and ready to be sent.
 
     Attributes:
         target: the target.
         settings: what its voxels' shapes are to be made with; None: they are there.
-        voxels, blocks: how many there are at each level.
-        begins: bytes before each of voxels and blocks, and all bytes.
+        before: the copy on the device that this is added to.
+        changes: what there is, and where.
+        size: bytes of it.
     """
 
     target: weakref.ref[GicpTarget]
     settings: Any
-    voxels: list[int]
-    blocks: list[int]
-    begins: list[int]
+    before: tuple[int, int, int]
+    changes: TargetChanges
+    size: int
+
+
+class _Table:
+    """The hash table of a level on the device, with a power of two for the number of its slots.
+
+    Args:
+        device: where.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        self._slots = self._before = torch.empty(0, dtype=torch.uint8, device=device)
+
+    @property
+    def count(self) -> int:
+        """Number of slots."""
+        return self._slots.numel() // sizeof(VoxelSlot)
+
+    def make_room(self, blocks: int, job: VoxelLevelJob) -> None:
+        """Has the job use this table, with room for so many blocks. A larger one takes over those of the one before,
+        unless the job empties it."""
+        count = old = self.count
+        while count < max(64, CudaTargetTuning.min_slots_per_block * blocks):
+            count = max(64, 2 * count)
+        job.old_slots = None
+        if count > old:
+            self._before = self._slots  # stays until the kernels that read it have been started
+            self._slots = torch.empty(sizeof(VoxelSlot) * count, dtype=torch.uint8, device=self._device)
+            if old and not job.empties:
+                job.old_slots, job.old_mask = self._before.data_ptr(), old - 1
+        job.level.slots, job.level.slot_mask = self._slots.data_ptr(), count - 1
 
 
 class CudaTarget:
-    """The newest target on the device. It is sent when it is first used, in one copy; the next one takes its memory.
-    The thread that made it may get it ready to be sent (`stage`).
+    """A copy of the newest target on the device: it is brought up to date when another one is first used. The thread
+    that made that may get it ready to be sent (`stage`).
 
     Args:
         device: where to.
@@ -59,71 +99,89 @@ class CudaTarget:
         self._device = device
         self._core = load_library()
         self._memory = GrowingMemory(device)
-        self._upload = Upload(device)
+        self._tables = _Table(device), _Table(device)
+        self._upload, self._room = Upload(device), 0
         self._target: weakref.ref[GicpTarget] | None = None
+        self._copy = TargetCopy()  # what is on the device
+        self._sent: tuple[weakref.ref[GicpTarget], TargetCopy] | None = None  # not yet known to have arrived
         self._staged: _Staged | None = None
         self._staging = threading.Lock()
 
     def stage(self, target: GicpTarget) -> None:
-        """Copies a target to page-locked memory; in any thread."""
+        """Copies what the device lacks of a target to page-locked memory; in any thread."""
         with self._staging:
             self._stage(target)
 
     def fill(self, target: GicpTarget, job: TrackJob) -> None:
-        """Sets the levels of the job to those of the target, and whether they have to be made."""
+        """Sets the levels of the job to those of the target, and whether they have to be made. `note_made` when that
+        was started."""
         job.makes_levels = 0
-        if self._target is None or self._target() is not target:
-            self._target = None
-            with self._staging:
-                job.fine, job.coarse = self._send(self._stage(target), target.voxel)
-            job.align.fine, job.align.coarse = job.fine.level, job.coarse.level
-            job.makes_levels = 1
-            self._target = weakref.ref(target)
+        if self._target is not None and self._target() is target:
+            return
+        with self._staging:
+            if self._sent is not None:  # what became of that is not known
+                self._copy, self._sent = TargetCopy(), None
+            staged = self._stage(target)
+            self._send(staged, target.voxel, job)
+            self._target, self._staged = None, None
+            self._sent = weakref.ref(target), staged.changes.target
+        job.align.fine, job.align.coarse = job.fine.level, job.coarse.level
+        job.makes_levels = 1
+
+    def note_made(self) -> None:
+        """The device makes the levels that `fill` asked for."""
+        if self._sent is not None:
+            self._target, self._copy = self._sent
+            self._sent = None
 
     def _stage(self, target: GicpTarget) -> _Staged:
-        """Blocks and voxels of both levels on the host; of voxels without shapes the moments, for the device to finish.
-        """
-        if self._staged is not None and self._staged.target() is target:
+        """Blocks that changed and their voxels on the host; of voxels without shapes the moments, for the device to
+        finish."""
+        copy = self._copy  # the other thread may put a newer one there
+        before = copy.number, copy.version, copy.finished
+        if self._staged is not None and self._staged.target() is target and self._staged.before == before:
             return self._staged
-        core, handle, settings = self._core, target.gathered_handle, target.settings_to_finish
-        copy, size = core.ggslam_gicp_target_voxels, sizeof(Voxel)
-        if settings is not None:
-            copy, size = core.ggslam_gicp_target_moments, sizeof(VoxelMoments)
-        voxels = [core.ggslam_gicp_target_size(handle, level) for level in (0, 1)]
-        blocks = [core.ggslam_gicp_target_blocks(handle, level, None) for level in (0, 1)]
-        begins = np.cumsum([0, *(size * n for n in voxels), *(sizeof(VoxelBlock) * n for n in blocks)]).tolist()
         self._staged = None
-        host = address(self._upload.begin(begins[-1]))
-        for level in (0, 1):
-            copy(handle, level, host + begins[level])
-            core.ggslam_gicp_target_blocks(handle, level, host + begins[2 + level])
-        self._staged = _Staged(weakref.ref(target), settings, voxels, blocks, begins)
+        handle, settings, changes = target.gathered_handle, target.settings_to_finish, TargetChanges()
+        size = self._room = max(self._room, CudaTargetTuning.staging_bytes)
+        while True:
+            size = self._core.ggslam_gicp_target_changes(
+                handle, ctypes.byref(copy), settings is None, address(self._upload.begin(self._room)), self._room,
+                ctypes.byref(changes),
+            )  # fmt: skip
+            if size <= self._room:
+                break
+            self._room = max(size, 2 * self._room)
+        self._staged = _Staged(weakref.ref(target), settings, before, changes, size)
         return self._staged
 
-    def _send(self, staged: _Staged, voxel: float) -> tuple[VoxelLevelJob, VoxelLevelJob]:
-        """Starts to send what was staged; what makes the levels of it."""
-        voxels, blocks, begins = staged.voxels, staged.blocks, staged.begins
-        sent = self._memory.block("target", begins[-1])
-        self._upload.send(sent[: begins[-1]])
-        first = sent.data_ptr()
-        made = []
-        for level in (0, 1):
-            job = VoxelLevelJob(
-                blocks=first + begins[2 + level], voxels=first + begins[level], block_count=blocks[level],
-                voxel_count=voxels[level], device=self._device.index or 0,
+    def _send(self, staged: _Staged, voxel: float, job: TrackJob) -> None:
+        """Starts to send what was staged, and sets the jobs that make the levels of it."""
+        sent = self._memory.block("target", staged.size)
+        self._upload.send(sent[: staged.size])
+        for level, (changes, made) in enumerate(
+            ((staged.changes.fine, job.fine), (staged.changes.coarse, job.coarse))
+        ):
+            made.empties, made.device = staged.changes.whole, self._device.index or 0
+            self._set_values(level, made, changes, sent.data_ptr(), staged.settings)
+            self._tables[level].make_room(changes.all_blocks, made)
+            size = np.float32(voxel) * np.float32(4 if level else 1)
+            made.level = VoxelLevel(
+                made.voxels, made.level.slots, made.level.slot_mask, size, np.float32(1) / size
             )  # fmt: skip
-            if staged.settings is not None:
-                job.moments, job.settings = first + begins[level], staged.settings
-                job.voxels = self._memory.block(f"voxels {level}", sizeof(Voxel) * voxels[level]).data_ptr()
-            job.level = self._level(level, job, voxel)
-            made.append(job)
-        return made[0], made[1]
 
-    def _level(self, level: int, job: VoxelLevelJob, voxel: float) -> VoxelLevel:
-        """The level that the job is to make, with room for its hash table."""
-        places = 64
-        while places < HashTableTuning.min_slots_per_block * job.block_count:
-            places *= 2
-        slots = self._memory.block(f"slots {level}", sizeof(VoxelSlot) * places)
-        size = np.float32(voxel) * np.float32(4 if level else 1)
-        return VoxelLevel(job.voxels, slots.data_ptr(), places - 1, size, np.float32(1) / size)
+    def _set_values(self, level: int, job: VoxelLevelJob, changes: LevelChanges, first: int, settings: Any) -> None:
+        """Where the kernels find what was sent, from address `first` on, and where it belongs."""
+        job.blocks, job.indices = first + changes.blocks_at, first + changes.indices_at
+        job.block_count, job.voxel_count = changes.block_count, changes.voxel_count
+        job.voxels = self._kept(f"voxels {level}", Voxel, changes.places)
+        job.moments = job.new_moments = job.new_voxels = None
+        if settings is None:
+            job.new_voxels = first + changes.values_at
+        else:
+            job.moments = self._kept(f"moments {level}", VoxelMoments, changes.places)
+            job.new_moments, job.settings = first + changes.values_at, settings
+
+    def _kept(self, name: str, value: type[ctypes.Structure], count: int) -> int:
+        """Address of memory for so many values that keeps what is there."""
+        return self._memory.kept_block(name, sizeof(value) * max(1, count)).data_ptr()

@@ -22,12 +22,19 @@ void launch_points(const DepthPointsJob& job, cudaStream_t stream) {
 }
 
 cudaError_t launch_level(const VoxelLevelJob& job, cudaStream_t stream) {
-  const std::size_t bytes = static_cast<std::size_t>(job.level.slot_mask + 1) * sizeof(VoxelSlot);
-  const cudaError_t cleared = cudaMemsetAsync(job.level.slots, 0xff, bytes, stream);
-  launch(fill_table_kernel, blocks_for(job.block_count, kTableThreads), kTableThreads, stream, job);
-  if (job.moments != nullptr)
+  cudaError_t emptied = cudaSuccess;
+  if (job.empties || job.old_slots != nullptr) {
+    const std::size_t bytes = static_cast<std::size_t>(job.level.slot_mask + 1) * sizeof(VoxelSlot);
+    emptied = cudaMemsetAsync(job.level.slots, 0xff, bytes, stream);
+  }
+  if (job.old_slots != nullptr)
+    launch(move_table_kernel, blocks_for(static_cast<std::int64_t>(job.old_mask) + 1, kTableThreads), kTableThreads, stream,
+           job);
+  const int changed = job.block_count > job.voxel_count ? job.block_count : job.voxel_count;
+  launch(change_level_kernel, blocks_for(changed, kTableThreads), kTableThreads, stream, job);
+  if (job.new_moments != nullptr)
     launch(finish_voxels_kernel, blocks_for(job.voxel_count, kFinishThreads), kFinishThreads, stream, job);
-  return cleared;
+  return emptied;
 }
 
 void launch_alignment(const AlignJob& job, cudaStream_t stream) {

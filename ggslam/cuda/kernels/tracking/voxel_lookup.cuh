@@ -24,21 +24,41 @@ __device__ inline std::uint64_t hash_key(std::uint64_t key) {
   return key ^ (key >> 32);
 }
 
-// Puts each block into a table whose keys are all kEmptyKey. Which of two blocks that meet comes first depends on
-// chance; what a look-up finds does not.
-__global__ void __launch_bounds__(kTableThreads) fill_table_kernel(VoxelLevelJob job) {
-  const int i = static_cast<int>(blockIdx.x * kTableThreads + threadIdx.x);
-  if (i >= job.block_count) return;
-  const VoxelBlock block = job.blocks[i];
-  std::uint64_t place = hash_key(block.key) & job.level.slot_mask;
-  for (;; place = (place + 1) & job.level.slot_mask) {
-    unsigned long long* key = reinterpret_cast<unsigned long long*>(&job.level.slots[place].key);
-    if (atomicCAS(key, static_cast<unsigned long long>(kEmptyKey), static_cast<unsigned long long>(block.key)) ==
-        kEmptyKey)
-      break;
+// Puts a block into a table, or what changed of it where its key is there; others do so with other blocks meanwhile. Which
+// of two blocks that meet comes first depends on chance; what a look-up finds does not.
+__device__ inline void put_block(const VoxelLevel& level, std::uint64_t key, std::uint64_t occupied,
+                                 std::uint64_t first) {
+  std::uint64_t place = hash_key(key) & level.slot_mask;
+  for (;; place = (place + 1) & level.slot_mask) {
+    unsigned long long* there = reinterpret_cast<unsigned long long*>(&level.slots[place].key);
+    const std::uint64_t found =
+        atomicCAS(there, static_cast<unsigned long long>(kEmptyKey), static_cast<unsigned long long>(key));
+    if (found == kEmptyKey || found == key) break;
   }
-  job.level.slots[place].occupied = block.occupied;
-  job.level.slots[place].first = block.first;
+  level.slots[place].occupied = occupied;
+  level.slots[place].first = first;
+}
+
+// Blocks of the old table go to the new one, whose keys are all kEmptyKey.
+__global__ void __launch_bounds__(kTableThreads) move_table_kernel(VoxelLevelJob job) {
+  const std::uint64_t i = static_cast<std::uint64_t>(blockIdx.x) * kTableThreads + threadIdx.x;
+  if (i > job.old_mask) return;
+  const VoxelSlot slot = job.old_slots[i];
+  if (slot.key != kEmptyKey) put_block(job.level, slot.key, slot.occupied, slot.first);
+}
+
+// Thread i has block i and voxel i, which is not of that block.
+__global__ void __launch_bounds__(kTableThreads) change_level_kernel(VoxelLevelJob job) {
+  const int i = static_cast<int>(blockIdx.x * kTableThreads + threadIdx.x);
+  if (i < job.block_count) {
+    const VoxelBlock block = job.blocks[i];
+    put_block(job.level, block.key, block.occupied, block.first);
+  }
+  if (i >= job.voxel_count) return;
+  if (job.new_moments != nullptr)
+    job.moments[job.indices[i]] = job.new_moments[i];
+  else
+    job.voxels[job.indices[i]] = job.new_voxels[i];
 }
 
 // Bits of a 4 x 4 x 4 block whose x (y, z) lies in [low, high]; bit x + 4 y + 16 z.

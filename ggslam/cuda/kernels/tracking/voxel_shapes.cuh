@@ -55,10 +55,11 @@ __device__ inline void neighbourhood_scatter(const VoxelLevelJob& job, int i, co
     for (int b = a; b < 3; ++b, ++k) scatter[k] = unit * (f * sums.outer[k] - f * f * sums.sum[a] * sums.sum[b]);
 }
 
-// One voxel per thread. The hash table is full already.
+// One voxel per thread, of those that changed. Table and moments are as they will be.
 __global__ void __launch_bounds__(kFinishThreads, 6) finish_voxels_kernel(VoxelLevelJob job) {
-  const int i = static_cast<int>(blockIdx.x * kFinishThreads + threadIdx.x);
-  if (i >= job.voxel_count) return;
+  const int thread = static_cast<int>(blockIdx.x * kFinishThreads + threadIdx.x);
+  if (thread >= job.voxel_count) return;
+  const int i = job.indices[thread];
   const TargetSettings& s = job.settings;
   const VoxelMoments& m = job.moments[i];
   const float centre[3] = {m.centre[0], m.centre[1], m.centre[2]}, normal[3] = {m.normal[0], m.normal[1], m.normal[2]};

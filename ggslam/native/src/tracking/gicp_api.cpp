@@ -121,10 +121,10 @@ class Aligner {
     const int step = std::max(1, args_.points.count / std::max(1, settings_.coarse_points));
     bool converged = false;
     if (settings_.coarse_iterations > 0) {
-      choose_level(target_.coarse, static_cast<float>(settings_.coarse_kernel_factor), step, false);
+      choose_level(1, static_cast<float>(settings_.coarse_kernel_factor), step, false);
       result.coarse_iterations = descend(pose, settings_.coarse_iterations, 10, &converged);
     }
-    choose_level(target_.fine, 1, 1, has_reference_);
+    choose_level(0, 1, 1, has_reference_);
     result.fine_iterations = descend(pose, settings_.fine_iterations, 1, &converged);
     result.converged = converged;
     pose.rotation = orthonormalize(pose.rotation);
@@ -132,8 +132,8 @@ class Aligner {
   }
 
  private:
-  void choose_level(const VoxelLevel& level, float kernel_factor, int step, bool photometric) {
-    args_.level = level.view();
+  void choose_level(int level, float kernel_factor, int step, bool photometric) {
+    args_.level = target_.contents(level).view;
     args_.kernel_factor = kernel_factor;
     args_.point_step = step;
     use_photometric_ = photometric;
@@ -302,8 +302,7 @@ void check_points(const ggslam::AlignPoints* pointer, const ggslam::AlignSetting
 
 const ggslam::GicpTarget& check_target(const void* pointer) {
   const auto& target = ggslam::object_of<ggslam::GicpTarget>(pointer);
-  for (const ggslam::VoxelLevel* level : {&target.fine, &target.coarse})
-    if (level->slot_key.empty() || level->voxels.size() < level->moments.size()) ggslam::refuse("target: it is not finished");
+  if (!target.is_finished()) ggslam::refuse("target: it is not finished");
   return target;
 }
 
@@ -352,7 +351,7 @@ GGSLAM_EXPORT double ggslam_gicp_linearize(void* context_, const void* target_, 
   check_array("h", h, 36), check_array("b", b, 6);
   LinearizeArgs args{};
   args.points = *points;
-  args.level = (level ? target.coarse : target.fine).view();
+  args.level = target.contents(level).view;
   args.settings = *settings;
   args.kernel_factor = level ? static_cast<float>(settings->coarse_kernel_factor) : 1;
   args.point_step = 1;

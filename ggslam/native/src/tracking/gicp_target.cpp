@@ -70,36 +70,25 @@ Sorted sort_by_partition(Context& context, const TargetInput& input, const Targe
   return s;
 }
 
-// Blocks of an earlier target that belong to one partition: [begin, end). A target keeps its blocks by partition.
-struct BaseRange {
-  const VoxelLevel* level;
-  std::size_t begin, end;
-};
-
-// The voxels of the blocks: those of the base keep their moments, new ones start empty.
-void make_moments(const BaseRange& base, float size, Partition& out) {
+// The voxels of the blocks, empty.
+void make_moments(float size, Partition& out) {
   std::size_t voxels = 0;
   for (const VoxelBlock& b : out.blocks) voxels += __builtin_popcountll(b.occupied);
   out.moments.reserve(voxels);
   for (std::size_t b = 0; b < out.blocks.size(); ++b) {
-    VoxelBlock before{0, 0, 0};
-    if (base.begin + b < base.end) before = base.level->blocks[base.begin + b];
     out.blocks[b].first = static_cast<uint32_t>(out.moments.size());
-    const VoxelMoments* old = before.occupied ? base.level->moments.data() + before.first : nullptr;
-    for (uint64_t rest = out.blocks[b].occupied; rest; rest &= rest - 1) {
-      const int bit = __builtin_ctzll(rest);
-      out.moments.push_back(before.occupied >> bit & 1 ? *old++ : empty_moments(out.keys[b], bit, size));
-    }
+    for (uint64_t rest = out.blocks[b].occupied; rest; rest &= rest - 1)
+      out.moments.push_back(empty_moments(out.keys[b], __builtin_ctzll(rest), size));
   }
 }
 
 // Finds the blocks and voxels of one partition and adds up its members.
 template <typename Accumulate>
-void fill_partition(const Sorted& s, int p, const BaseRange& base, const TargetInput& input,
-                    const TargetSettings& settings, Accumulate accumulate, Partition& out) {
+void fill_partition(const Sorted& s, int p, const TargetInput& input, const TargetSettings& settings,
+                    Accumulate accumulate, Partition& out) {
   const std::size_t begin = s.begin[p], n = s.begin[p + 1] - begin;
   std::size_t capacity = 16;
-  while (capacity < 2 * (n + base.end - base.begin)) capacity *= 2;
+  while (capacity < 2 * n) capacity *= 2;
   std::vector<int32_t> slots(capacity, -1);
   const auto block_of = [&](uint64_t key) {
     std::size_t slot = hash_key(key) & (capacity - 1);
@@ -111,15 +100,13 @@ void fill_partition(const Sorted& s, int p, const BaseRange& base, const TargetI
     }
     return slots[slot];
   };
-  for (std::size_t b = base.begin; b < base.end; ++b)
-    out.blocks[block_of(base.level->block_keys[b])].occupied = base.level->blocks[b].occupied;
   out.voxels.resize(n);
   for (std::size_t i = 0; i < n; ++i) {
     const int32_t g = s.order[begin + i];
     out.voxels[i] = block_of(s.keys[g]);
     out.blocks[out.voxels[i]].occupied |= uint64_t{1} << s.bits[g];
   }
-  make_moments(base, settings.voxel, out);
+  make_moments(settings.voxel, out);
   for (std::size_t i = 0; i < n; ++i) {
     const VoxelBlock& b = out.blocks[out.voxels[i]];
     const uint64_t below = (uint64_t{1} << s.bits[s.order[begin + i]]) - 1;
@@ -147,14 +134,14 @@ void concatenate(std::vector<Partition>& partitions, VoxelLevel& level) {
 }
 
 // For each block of a level the one of another level that holds the same voxels with the same moments, or -1.
-std::vector<int32_t> equal_blocks(Context& context, const VoxelLevel& level, const VoxelLevel& before) {
+std::vector<int32_t> equal_blocks(Context& context, const VoxelLevel& level, const LevelContents& before) {
   std::vector<int32_t> equal(level.blocks.size(), -1);
   context.pool.parallel_for(equal.size(), 256, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t b = begin; b < end; ++b) {
-      const int other = before.block_of(level.block_keys[b]);
-      if (other < 0 || before.blocks[other].occupied != level.blocks[b].occupied) continue;
+      const int other = find_block(before.view, level.block_keys[b]);
+      if (other < 0 || before.view.blocks[other].occupied != level.blocks[b].occupied) continue;
       const std::size_t bytes = sizeof(VoxelMoments) * __builtin_popcountll(level.blocks[b].occupied);
-      if (!std::memcmp(level.moments.data() + level.blocks[b].first, before.moments.data() + before.blocks[other].first,
+      if (!std::memcmp(level.moments.data() + level.blocks[b].first, before.moments + before.view.blocks[other].first,
                        bytes))
         equal[b] = other;
     }
@@ -163,7 +150,7 @@ std::vector<int32_t> equal_blocks(Context& context, const VoxelLevel& level, con
 }
 
 // Whether the blocks around one are as before, too: then its voxels have the shapes that they had.
-bool has_equal_neighbours(const VoxelLevel& level, const VoxelLevel& before, const std::vector<int32_t>& equal,
+bool has_equal_neighbours(const VoxelLevel& level, const LevelContents& before, const std::vector<int32_t>& equal,
                           std::size_t block) {
   const Vec3i c = block_coordinates(level.block_keys[block]);
   for (int z = -1; z <= 1; ++z)
@@ -171,7 +158,7 @@ bool has_equal_neighbours(const VoxelLevel& level, const VoxelLevel& before, con
       for (int x = -1; x <= 1; ++x) {
         const uint64_t key = block_key(c[0] + x, c[1] + y, c[2] + z);
         const int near = level.block_of(key);
-        if (near >= 0 ? equal[near] < 0 : before.block_of(key) >= 0) return false;
+        if (near >= 0 ? equal[near] < 0 : find_block(before.view, key) >= 0) return false;
       }
   return true;
 }
@@ -220,15 +207,27 @@ void VoxelLevel::index_blocks() {
   }
 }
 
-int VoxelLevel::block_of(uint64_t key) const {
-  std::size_t slot = hash_key(key) & (slot_key.size() - 1);
-  while (slot_key[slot] != kEmptyKey && slot_key[slot] != key) slot = (slot + 1) & (slot_key.size() - 1);
-  return slot_key[slot] == key ? slot_block[slot] : -1;
+VoxelLevelView VoxelLevel::view() const {
+  return {voxels.data(),     blocks.data(), nullptr,  slot_key.data(), slot_block.data(),
+          slot_key.size() - 1, size,        1 / size, 0};
 }
 
-VoxelLevelView VoxelLevel::view() const {
-  return {voxels.data(), blocks.data(), slot_key.data(), slot_block.data(), slot_key.size() - 1, size, 1 / size,
-          static_cast<int32_t>(voxels.size())};
+LevelContents GicpTarget::contents(int level) const {
+  if (grown) {
+    const HeldLevel& held = level ? grown->coarse : grown->fine;
+    return {held.view(),      held.moments.get(), held.keys.get(), held.block_count,
+            held.voxel_count, held.places,        false};
+  }
+  const VoxelLevel& flat = level ? coarse : fine;
+  const std::size_t count = std::max(flat.voxels.size(), flat.moments.size());
+  return {flat.view(), flat.moments.data(), flat.block_keys.data(), flat.blocks.size(), count, count, true};
+}
+
+bool GicpTarget::is_finished() const {
+  if (grown) return grown->finished;
+  for (const VoxelLevel* level : {&fine, &coarse})
+    if (level->slot_key.empty() || level->voxels.size() < level->moments.size()) return false;
+  return true;
 }
 
 void GicpTarget::build(Context& context, const GicpTarget* base, const TargetInput& input,
@@ -239,19 +238,20 @@ void GicpTarget::build(Context& context, const GicpTarget* base, const TargetInp
 
 void GicpTarget::gather(Context& context, const GicpTarget* base, const TargetInput& input,
                         const TargetSettings& settings) {
-  static const VoxelLevel nothing;
-  const VoxelLevel& before = base ? base->fine : nothing;
-  std::array<std::size_t, kPartitions + 1> base_begin{};
-  for (uint64_t key : before.block_keys) ++base_begin[partition_of(key) + 1];
-  for (int p = 0; p < kPartitions; ++p) base_begin[p + 1] += base_begin[p];
+  if (base) {
+    std::unique_ptr<TargetVersion> version = grow(context, *base, input, settings);
+    *this = GicpTarget{};
+    grown = std::move(version);
+    return;
+  }
   const Sorted sorted = sort_by_partition(context, input, settings);
   std::vector<Partition> partitions(kPartitions);
   const auto accumulate = GGSLAM_DISPATCH(context.isa, accumulate_members);
   context.pool.parallel_for(kPartitions, 1, [&](std::size_t begin, std::size_t end, int) {
     for (std::size_t p = begin; p < end; ++p)
-      fill_partition(sorted, static_cast<int>(p), {&before, base_begin[p], base_begin[p + 1]}, input, settings,
-                     accumulate, partitions[p]);
+      fill_partition(sorted, static_cast<int>(p), input, settings, accumulate, partitions[p]);
   });
+  *this = GicpTarget{};
   fine.size = settings.voxel;
   concatenate(partitions, fine);
   coarsen(fine, GGSLAM_DISPATCH(context.isa, merge_moments), coarse);
@@ -260,23 +260,24 @@ void GicpTarget::gather(Context& context, const GicpTarget* base, const TargetIn
 void GicpTarget::finish(Context& context, const TargetSettings& settings, const GicpTarget* like) {
   const auto shape = GGSLAM_DISPATCH(context.isa, finish_voxels);
   const bool usable = like && like->shaped && !std::memcmp(&like->shaped_with, &settings, sizeof settings);
-  for (VoxelLevel GicpTarget::*which : {&GicpTarget::fine, &GicpTarget::coarse}) {
-    VoxelLevel& level = this->*which;
+  for (int which = 0; which < 2 && !grown; ++which) {
+    VoxelLevel& level = which ? coarse : fine;
     level.index_blocks();
     level.voxels.resize(level.moments.size());
     const VoxelLevelView view = level.view();
-    const VoxelLevel* before = usable ? &(like->*which) : nullptr;
-    const std::vector<int32_t> equal = before ? equal_blocks(context, level, *before) : std::vector<int32_t>();
+    const LevelContents before = usable ? like->contents(which) : LevelContents{};
+    const std::vector<int32_t> equal = usable ? equal_blocks(context, level, before) : std::vector<int32_t>();
     context.pool.parallel_for(level.blocks.size(), 16, [&](std::size_t begin, std::size_t end, int) {
       for (std::size_t b = begin; b < end; ++b) {
         const std::size_t first = level.blocks[b].first, count = __builtin_popcountll(level.blocks[b].occupied);
-        if (before && equal[b] >= 0 && has_equal_neighbours(level, *before, equal, b))
-          std::copy_n(before->voxels.data() + before->blocks[equal[b]].first, count, level.voxels.data() + first);
+        if (usable && equal[b] >= 0 && has_equal_neighbours(level, before, equal, b))
+          std::copy_n(before.view.voxels + before.view.blocks[equal[b]].first, count, level.voxels.data() + first);
         else
           shape(settings, view, level.moments.data(), first, first + count, level.voxels.data());
       }
     });
   }
+  if (grown) grown->finish(context, settings);
   shaped_with = settings, shaped = true;
 }
 
@@ -338,44 +339,29 @@ GGSLAM_EXPORT int ggslam_gicp_target_finish(void* context, void* target, const g
   return 0;
 } GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target_, int level_) try {
-  const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
-  const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
-  return static_cast<int>(std::max(level.voxels.size(), level.moments.size()));
-} GGSLAM_CATCH_ALL
-
-GGSLAM_EXPORT int ggslam_gicp_target_moments(const void* target_, int level, float* out) try {
-  const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
-  const auto& moments = (level ? target.coarse : target.fine).moments;
-  static_assert(sizeof(ggslam::VoxelMoments) == 22 * sizeof(float), "moments are floats and nothing else");
-  ggslam::check_array("out", out, static_cast<std::int64_t>(moments.size()));
-  std::copy_n(reinterpret_cast<const float*>(moments.data()), moments.size() * 22, out);
-  return 0;
+GGSLAM_EXPORT int ggslam_gicp_target_size(const void* target, int level) try {
+  return static_cast<int>(ggslam::object_of<ggslam::GicpTarget>(target).contents(level).voxel_count);
 } GGSLAM_CATCH_ALL
 
 GGSLAM_EXPORT int ggslam_gicp_target_voxels(const void* target_, int level, float* out) try {
   const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
-  const auto& voxels = (level ? target.coarse : target.fine).voxels;
-  ggslam::check_array("out", out, static_cast<std::int64_t>(voxels.size()));
-  std::copy_n(reinterpret_cast<const float*>(voxels.data()), voxels.size() * 16, out);
+  const ggslam::LevelContents contents = target.contents(level);
+  ggslam::check_array("out", out, static_cast<std::int64_t>(contents.voxel_count));
+  if (!target.is_finished()) ggslam::refuse("target: it is not finished");
+  contents.for_each_block([&](uint64_t, const ggslam::VoxelBlock& block) {
+    const auto count = static_cast<std::size_t>(__builtin_popcountll(block.occupied));
+    out = std::copy_n(reinterpret_cast<const float*>(contents.view.voxels + block.first), 16 * count, out);
+  });
   return 0;
 } GGSLAM_CATCH_ALL
 
-GGSLAM_EXPORT int ggslam_gicp_target_normals(const void* target_, const int32_t* voxels, int64_t count,
+GGSLAM_EXPORT int ggslam_gicp_target_normals(const void* target, const int32_t* voxels, int64_t count,
                                               float* out) try {
-  const auto& level = ggslam::object_of<ggslam::GicpTarget>(target_).fine.voxels;
+  const ggslam::LevelContents fine = ggslam::object_of<ggslam::GicpTarget>(target).contents(0);
   ggslam::check_array("voxels", voxels, count), ggslam::check_array("out", out, count);
   for (int64_t i = 0; i < count; ++i) {
-    if (voxels[i] >= static_cast<int64_t>(level.size())) ggslam::refuse("voxels: there is no such voxel");
-    for (int a = 0; a < 3; ++a) out[3 * i + a] = voxels[i] < 0 ? 0.0f : level[voxels[i]].normal[a];
+    if (voxels[i] >= static_cast<int64_t>(fine.places)) ggslam::refuse("voxels: there is no such voxel");
+    for (int a = 0; a < 3; ++a) out[3 * i + a] = voxels[i] < 0 ? 0.0f : fine.view.voxels[voxels[i]].normal[a];
   }
   return 0;
-} GGSLAM_CATCH_ALL
-
-GGSLAM_EXPORT int ggslam_gicp_target_blocks(const void* target_, int level_, uint64_t* out) try {
-  const auto& target = ggslam::object_of<ggslam::GicpTarget>(target_);
-  const ggslam::VoxelLevel& level = level_ ? target.coarse : target.fine;
-  for (std::size_t b = 0; out && b < level.blocks.size(); ++b, out += 3)
-    out[0] = level.block_keys[b], out[1] = level.blocks[b].occupied, out[2] = level.blocks[b].first;
-  return static_cast<int>(level.blocks.size());
 } GGSLAM_CATCH_ALL

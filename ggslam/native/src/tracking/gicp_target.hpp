@@ -4,6 +4,7 @@
 #include <memory>
 #include <vector>
 
+#include "tracking/growing_target.hpp"
 #include "tracking/target_part.hpp"
 
 namespace ggslam {
@@ -20,8 +21,24 @@ struct VoxelLevel {
   // Fills slot_key and slot_block from block_keys.
   void index_blocks();
   // The block of a key, or -1.
-  int block_of(uint64_t key) const;
+  int block_of(uint64_t key) const { return find_block(view(), key); }
   VoxelLevelView view() const;
+};
+
+// A level as it is read, whatever holds it.
+struct LevelContents {
+  VoxelLevelView view;  // look-ups ask for a finished target
+  const VoxelMoments* moments;  // by index, as the view's voxels
+  const uint64_t* keys;
+  std::size_t block_count, voxel_count, places;  // indices of voxels lie below `places`
+  bool in_order;  // whether block i is that of key i
+
+  // Calls visit(key, block) in the order of the keys.
+  template <typename Visit>
+  void for_each_block(const Visit& visit) const {
+    for (std::size_t b = 0; b < block_count; ++b)
+      visit(keys[b], view.blocks[in_order ? static_cast<int>(b) : find_block(view, keys[b])]);
+  }
 };
 
 struct BlockSource {
@@ -38,13 +55,19 @@ struct Composition {
 };
 
 struct GicpTarget {
-  VoxelLevel fine, coarse;
+  uint64_t number = new_target_number();
+  VoxelLevel fine, coarse;  // empty if grown
+  std::unique_ptr<TargetVersion> grown;  // null: it was not made from a base
   Composition composition;  // empty unless composed
   TargetSettings shaped_with{};  // of the voxels' shapes...
   bool shaped = false;           // ...if `finish` made them
 
+  LevelContents contents(int level) const;
+  bool is_finished() const;
+
   // Replaces the contents by what `base` (may be null) holds and the Gaussians of `input`. `base` must have been built
-  // with the same settings. The result does not depend on the number of threads.
+  // with the same settings; the cost goes with the blocks that the Gaussians lie in, if nothing else was built on it.
+  // The result does not depend on the number of threads.
   void build(Context& context, const GicpTarget* base, const TargetInput& input, const TargetSettings& settings,
              const GicpTarget* like = nullptr);
 

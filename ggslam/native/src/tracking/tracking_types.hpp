@@ -14,17 +14,18 @@ namespace ggslam {
 struct VoxelBlock {
   uint64_t occupied;  // bit x + 4 y + 16 z
   uint32_t first;     // index of the voxel of the lowest bit
-  uint32_t reserved;
+  uint32_t version;   // of a growing target: the first one that has the block so
 };
 
 struct VoxelLevelView {
   const Voxel* voxels;
   const VoxelBlock* blocks;
+  const int32_t* previous;    // of a growing target: the block that each one replaced, or -1
   const uint64_t* slot_key;   // open addressing, capacity slot_mask + 1; kEmptyKey marks a free slot
   const int32_t* slot_block;
   uint64_t slot_mask;
   float size, inverse_size;
-  int32_t count;
+  uint32_t version;           // what later ones brought is not seen
 };
 
 constexpr uint64_t kEmptyKey = ~uint64_t{0};

@@ -4,26 +4,9 @@
 #include <algorithm>
 #include <cmath>
 
-#include "tracking/tracking_types.hpp"
+#include "tracking/block_lookup.hpp"
 
 namespace ggslam::GGSLAM_ISA {
-
-// Bits of a 4 x 4 x 4 block whose x (y, z) lies in [low, high]; bit x + 4 y + 16 z.
-static inline uint64_t bits_x(int low, int high) { return ((2ull << high) - (1ull << low)) * 0x1111111111111111ull; }
-static inline uint64_t bits_y(int low, int high) {
-  return ((16ull << (4 * high)) - (1ull << (4 * low))) * 0x0001000100010001ull;
-}
-static inline uint64_t bits_z(int low, int high) {
-  const uint64_t above = high == 3 ? 0 : 1ull << (16 * (high + 1));
-  return above - (1ull << (16 * low));
-}
-
-static inline int find_block(const VoxelLevelView& level, uint64_t key) {
-  for (uint64_t slot = hash_key(key) & level.slot_mask;; slot = (slot + 1) & level.slot_mask) {
-    if (level.slot_key[slot] == key) return level.slot_block[slot];
-    if (level.slot_key[slot] == kEmptyKey) return -1;
-  }
-}
 
 // Far outside of any voxel where x is no number or too large.
 static inline int voxel_coordinate(float x, float inverse_size) {
