@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Copies between host and device by way of page-locked memory, for which the host waits as little as can be: once
-(`upload`, `download`), or again and again through the same memory (`Upload`, `Download`, `HostMirror`)."""
+(`upload`, `download`), or again and again through the same memory (`Upload`, `Staging`, `Download`, `HostMirror`)."""
 
 from __future__ import annotations
 
 import threading
+from collections import deque
 
 import numpy as np
 import torch
@@ -67,26 +68,58 @@ class Upload:
         self._sent.set()
 
 
-class Download:
-    """Fetches float64 [count] from the device.
+class Staging:
+    """Sends arrays of one shape to the device, again and again, by turns through a few places. The host waits only if
+    the one that went through the same place is still on its way.
 
     Args:
-        count: numbers.
-        device: where from.
+        shape: of an array.
+        dtype: of its numbers.
+        device: where to.
+        places: how many may be on their way.
     """
 
-    def __init__(self, count: int, device: torch.device) -> None:
-        self.source = torch.zeros(count, dtype=torch.float64, device=device)
-        """On the device."""
-        self._copy = _allocate_page_locked(8 * count, device).view(torch.float64)
+    def __init__(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device, places: int = 2) -> None:
+        made = [torch.empty(shape, dtype=dtype, pin_memory=device.type == "cuda") for _ in range(places)]
+        self._places = deque((place, place.numpy(), Marker(device)) for place in made)
+
+    def send(self, array: np.ndarray, out: torch.Tensor) -> None:
+        """Starts a copy of an array to `out`, both of the shape; the array may be changed afterwards."""
+        place, on_host, sent = self._places[0]
+        self._places.rotate(-1)
+        sent.wait_if_ahead()
+        np.copyto(on_host, array)
+        out.copy_(place, non_blocking=True)
+        sent.set()
+
+
+class Download:
+    """Fetches numbers from the device, again and again.
+
+    Args:
+        count: of them.
+        device: where from.
+        dtype: of them.
+    """
+
+    def __init__(self, count: int, device: torch.device, dtype: torch.dtype = torch.float64) -> None:
+        self.source = torch.zeros(count, dtype=dtype, device=device)
+        """On the device, [count]."""
+        self._copy = torch.zeros(count, dtype=dtype, pin_memory=device.type == "cuda")
+        self.newest = self._copy.numpy()
+        """On the host, as of the last `fetch`, which changes it in place."""
         self._done = Marker(device)
 
-    def wait(self) -> np.ndarray:
-        """What `source` is when everything started before is done: the host's one wait."""
+    def fetch(self) -> np.ndarray:
+        """What `source` is when everything started before is done, in `newest`: the host's one wait."""
         self._copy.copy_(self.source, non_blocking=True)
         self._done.set()
         self._done.wait()
-        return self._copy.numpy().copy()
+        return self.newest
+
+    def wait(self) -> np.ndarray:
+        """As `fetch`; the numbers stay as they are."""
+        return self.fetch().copy()
 
 
 def upload(array: np.ndarray, device: torch.device) -> torch.Tensor:
@@ -122,10 +155,11 @@ class HostMirror:
     def __init__(self, source: torch.Tensor) -> None:
         self._source = source
         self._arriving = torch.zeros(source.shape, dtype=source.dtype, pin_memory=source.device.type == "cuda")
+        self._arriving_numbers = self._arriving.numpy()
         self._sent = Marker(source.device)
         self._under_way = False
         self._lock = threading.Lock()
-        self._newest = self._arriving.numpy().copy()
+        self._newest = self._arriving_numbers.copy()
 
     def send(self) -> None:
         """Starts a copy on the current stream, unless one is still under way."""
@@ -147,5 +181,5 @@ class HostMirror:
 
     def _take(self) -> None:
         if self._sent.is_passed():
-            self._newest = self._arriving.numpy().copy()
+            self._newest = self._arriving_numbers.copy()
             self._under_way = False

@@ -25,7 +25,7 @@ from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid, grid_of_turn
 from ggslam.mapping.settings import InsertionSettings, LossSettings
 from ggslam.mapping.view_colors import ShownColors, ViewColorTuning, fit_view_colors
 from ggslam.native.loader import NativeContext
-from ggslam.rendering.exposure import SeenAgain, change_of, exactly_without_exposure, relative_sharpness
+from ggslam.rendering.exposure import Seen, SeenAgain, change_of, exactly_without_exposure, relative_sharpness
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.camera import Camera
 from ggslam.system.tuning import Tuning
@@ -80,7 +80,7 @@ class ComparingMapper(Mapper):
 
     # --- exposures ---------------------------------------------------------------------------------------------------
 
-    def _colors(self, keyframe: Keyframe, seen: SeenAgain | None) -> np.ndarray:
+    def _colors(self, keyframe: Keyframe, seen: Seen | None) -> np.ndarray:
         """Colours [H, W, 3] that Gaussians of a new keyframe get: as the map's exposure shows them. Of a keyframe that
         shows none, those that most of the map has."""
         exposures = self._exposures
@@ -188,7 +188,7 @@ class ComparingMapper(Mapper):
             few = len(own) < HiddenGaussianTuning.few_keyframes
             self._render_all(keyframe, ALL_PIXELS if few else grid_of_turn(keyframe.index, keyframe.camera))
             self._mark_shown(stays, least)
-        self.map.keep(stays)
+        self._keep(stays)
 
     # --- terms of the loss, and insertion ----------------------------------------------------------------------------
 

@@ -110,6 +110,11 @@ class MaskOnGrid:
         return MaskOnGrid(keyframe.index, None if mask is None else np.ascontiguousarray(grid.of(mask)))
 
 
+def ids_of(mask: np.ndarray) -> np.ndarray:
+    """Ids that are in a mask of uint16, each once, in order."""
+    return np.flatnonzero(np.bincount(mask.reshape(-1), minlength=1)).astype(np.uint16)
+
+
 @dataclass
 class IdentityLearner(ABC):
     """Objects and their ids.
@@ -162,7 +167,7 @@ class IdentityLearner(ABC):
     def due(self, keyframe: MaskedKeyframe) -> bool:
         """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
         self._iterations += 1
-        return keyframe.mask is not None and self.table.count > 0 and self._iterations % self.settings.every == 0
+        return self._iterations % self.settings.every == 0 and keyframe.mask is not None and self.table.count > 0
 
     # --- a map that is partly on disk ---------------------------------------------------------------------------------
 
@@ -192,7 +197,7 @@ class IdentityLearner(ABC):
     def observe(self, mask: np.ndarray) -> None:
         """A keyframe with this mask (uint16 [H, W]) arrives: its objects get classes."""
         self._forget_shown()
-        self.table.add(np.flatnonzero(np.bincount(self.current(mask).reshape(-1), minlength=1)).astype(np.uint16))
+        self.table.add(np.unique(self.current(ids_of(mask))))
 
     def merge(self, gaussians: GaussianMap, pairs: Sequence[tuple[int, int]]) -> None:
         """Objects turned out to be one: masks, votes and classes of the second of each pair become those of the

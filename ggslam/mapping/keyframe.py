@@ -106,17 +106,15 @@ class Keyframe:
         """The refined pose, camera to world."""
         return inverse(self.T_camera_world)
 
-    def depth_m(self) -> np.ndarray:
-        """Depth in metres, float32 [H, W]."""
-        return self.depth.astype(np.float32) / np.float32(1 / self.depth_unit)
+    def depth_m(self, of: np.ndarray | None = None) -> np.ndarray:
+        """Depth in metres, float32 [H, W]; `of`: of a part of the depth image."""
+        return (self.depth if of is None else of).astype(np.float32) / np.float32(1 / self.depth_unit)
 
 
 def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyframe:
     """The keyframe of a frame seen from `T_world_camera`."""
     unit = depth_unit_for(frame.depth)
-    scaled = frame.depth * np.float32(1 / unit)
-    units = np.clip(scaled + 0.5, 0, _MOST_UNITS).astype(np.uint16)
-    units[scaled > _MOST_UNITS] = 0
+    units = _units_of(frame.depth, unit)
     return Keyframe(
         index, frame.index, frame.timestamp, frame.camera, np.ascontiguousarray(frame.color), units,
         inverse(T_world_camera), frame.mask, camera_number=frame.camera_number, instant=frame.instant,
@@ -124,11 +122,21 @@ def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyfr
     )  # fmt: skip
 
 
+def _units_of(depth: np.ndarray, unit: float) -> np.ndarray:
+    """Depth, float [H, W] in metres, rounded to units of so many metres, uint16; 0 where it is beyond their range."""
+    scaled = depth * np.float32(1 / unit)
+    beyond = scaled > _MOST_UNITS
+    scaled += 0.5
+    units = np.clip(scaled, 0, _MOST_UNITS, out=scaled).astype(np.uint16)
+    units[beyond] = 0
+    return units
+
+
 def depth_unit_for(depth: np.ndarray) -> float:
     """Unit for depth, float [H, W], in metres: `DEPTH_UNIT`, doubled until at most `DepthRangeTuning.far_share` of the
     pixels with depth are beyond its range."""
-    known, unit = depth[depth > 0], DEPTH_UNIT
-    while len(known) and np.mean(known > _MOST_UNITS * unit) > DepthRangeTuning.far_share:
+    known, unit = np.count_nonzero(depth > 0), DEPTH_UNIT
+    while known and np.count_nonzero(depth > _MOST_UNITS * unit) / known > DepthRangeTuning.far_share:
         unit *= 2
     return unit
 

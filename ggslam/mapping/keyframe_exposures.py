@@ -13,6 +13,7 @@ from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.settings import ExposureSettings
 from ggslam.rendering.exposure import (
     ExposureTuning,
+    Seen,
     SeenAgain,
     change_of,
     frame_weights,
@@ -88,7 +89,7 @@ class KeyframeExposures:
         self.known.append(False)
         self.blind.append(False)
 
-    def lights_up(self, keyframe: Keyframe, seen: SeenAgain | None) -> bool:
+    def lights_up(self, keyframe: Keyframe, seen: Seen | None) -> bool:
         """Whether a new keyframe is the first to show colours, of a map that has none so far: it is to take them from
         there. If it has itself none it is blind.
 
@@ -100,17 +101,17 @@ class KeyframeExposures:
             return False
         lit = is_lit(keyframe.color)
         if self.found_lit:
-            self.blind[keyframe.index] = not lit and seen is not None and shows_otherwise(keyframe.color, seen)
+            self.blind[keyframe.index] = not lit and _contradicts(keyframe, seen)
             return False
         self.found_lit = lit
-        if not lit or keyframe.index == 0 or seen is None or not shows_otherwise(keyframe.color, seen):
+        if not lit or keyframe.index == 0 or not _contradicts(keyframe, seen):
             self.known[keyframe.index] = lit
             return False
         self.blind[: keyframe.index] = [True] * keyframe.index
         self.known[keyframe.index] = True
         return True
 
-    def compensate(self, keyframe: Keyframe, seen: SeenAgain, keyframes: Sequence[Keyframe]) -> np.ndarray:
+    def compensate(self, keyframe: Keyframe, seen: Seen, keyframes: Sequence[Keyframe]) -> np.ndarray:
         """A keyframe seen with another exposure than the map gets what is measured; its colours [H, W, 3] as the map's
         exposure would have shown them.
 
@@ -190,6 +191,11 @@ class KeyframeExposures:
 def unsaturated_pixels(color: np.ndarray) -> np.ndarray:
     """Pixels of an image uint8 [H, W, 3] of which no channel is saturated, bool [H, W]."""
     return np.asarray((color < ExposureTuning.bright * 255).all(2))
+
+
+def _contradicts(keyframe: Keyframe, seen: Seen | None) -> bool:
+    """Whether a keyframe shows another scene than the map where it looks."""
+    return seen is not None and shows_otherwise(keyframe.color, seen.pictures())
 
 
 def _against(exposure: np.ndarray, gain: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from ggslam.mapping.between_frames import BetweenFrame, BetweenTuning, code_fram
 from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.duplicates import remove_duplicates
 from ggslam.mapping.extra_loss import ExtraLoss, add_extra_loss, uses_features
-from ggslam.mapping.identity import IdentityLearner, MaskOnGrid
+from ggslam.mapping.identity import IdentityLearner, MaskOnGrid, ids_of
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.mapping.labelling import KeyframeLabels, Labeller
 from ggslam.mapping.losses import LossGradients
@@ -247,7 +247,7 @@ class Mapper(ABC):
         if len(self.keyframes) % self.settings.pruning.every_keyframes == 0:
             self._densify()
             if self.settings.pruning.enabled:
-                prune(self.map, self.settings.pruning)
+                self._prune()
         if self._is_noisy and not self.is_live and is_look_due(len(self.keyframes)):
             self.drop_hidden()
         self.times.insertion += time.perf_counter() - start
@@ -321,7 +321,7 @@ class Mapper(ABC):
         """Takes the Gaussians of some keyframes out of the map, which is all in memory, and trains on these no more."""
         self.left_out |= numbers
         gone = torch.tensor(sorted(self.left_out), dtype=self.map.birth_keyframe.dtype, device=self.map.device)
-        self.map.keep(~torch.isin(self.map.birth_keyframe, gone))
+        self._keep(~torch.isin(self.map.birth_keyframe, gone))
 
     def retrain_loop_ends(self, kept: list[int], doubted: list[int], iterations: int) -> None:
         """After the keyframes were moved so that two ends of a loop meet: drops what the newer end had mapped again,
@@ -352,6 +352,14 @@ class Mapper(ABC):
 
     def _densify(self) -> None:  # noqa: B027
         """Clones and splits Gaussians if `MapperSettings.densification` says so; on the CPU."""
+
+    def _prune(self) -> None:
+        """Drops useless Gaussians."""
+        prune(self.map, self.settings.pruning)
+
+    def _keep(self, stays: torch.Tensor) -> None:
+        """Drops Gaussians where `stays`, bool [N] where the map is, is False."""
+        self.map.keep(stays)
 
     def _take_labels(self, keyframe: Keyframe, labels: KeyframeLabels) -> None:
         """The keyframe's objects become its mask. What was rendered last is the map as the keyframe sees it, if
@@ -689,7 +697,7 @@ class Mapper(ABC):
         mask = keyframe.mask
         if mask is None:
             return np.zeros(0, np.int64)
-        ids = np.unique(self.identity.current(np.flatnonzero(np.bincount(mask.reshape(-1)))))
+        ids = np.unique(self.identity.current(ids_of(mask)))
         return ids[ids > 0].astype(np.int64)
 
     def _train_identity(self, keyframe: Keyframe, steps: int, rate_factor: float) -> None:

@@ -21,7 +21,7 @@ class NewGaussians(Generic[Array]):
         quaternions: [M, 4] wxyz, of unit length.
         log_scales: [M, 3], natural logarithm of the standard deviations in metres.
         rgb: [M, 3] in [0, 1].
-        pixels: int64 [M], flat index of the pixel that each comes from.
+        pixels: int64 [M], on a device int32, flat index of the pixel that each comes from.
     """
 
     means: Array

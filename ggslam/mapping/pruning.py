@@ -39,11 +39,15 @@ def prune(gaussians: GaussianMap, settings: PruningSettings) -> int:
     Transparency also catches floaters: a Gaussian in front of the surface hides what is measured behind it, so the
     colour and depth losses drive its opacity down in every keyframe that looks through it.
     """
-    logit = math.log(settings.min_opacity / (1 - settings.min_opacity))
-    largest = gaussians.log_scales.amax(1)
-    good = (gaussians.opacity_logits > logit) & (largest < math.log(settings.max_scale_m))
+    logit, log_scale = pruning_limits(settings)
+    good = (gaussians.opacity_logits > logit) & (gaussians.log_scales.amax(1) < log_scale)
     good &= torch.isfinite(gaussians.means).all(1)
     return gaussians.keep(good)
+
+
+def pruning_limits(settings: PruningSettings) -> tuple[float, float]:
+    """Logit of opacity above which, and logarithm of the largest standard deviation below which, Gaussians stay."""
+    return math.log(settings.min_opacity / (1 - settings.min_opacity)), math.log(settings.max_scale_m)
 
 
 def is_look_due(keyframes: int) -> bool:

@@ -60,8 +60,12 @@ class KeyframeSampler:
         return int((self._offset + self._draws * GOLDEN_RATIO) % 1.0 * count)
 
     def choose(self, numbers: Sequence[int]) -> int:
-        """One of the keyframes with these numbers, in the order of the recording."""
-        return numbers[self.draw(len(numbers))]
+        """One of the keyframes with these numbers, of which there are some, in the order of the recording."""
+        return numbers[self._next(len(numbers))]
+
+    def choose_many(self, numbers: Sequence[int], times: int) -> list[int]:
+        """As `choose`, so many times."""
+        return [self.choose(numbers) for _ in range(times)]
 
     def arrive(self, keyframes: Sequence[Keyframe]) -> None:
         """The last of the keyframes is new."""
@@ -117,7 +121,7 @@ class CovisibleSampler(RandomSampler):
     def choose(self, numbers: Sequence[int]) -> int:
         near = [number for number in self._window if number in numbers]
         if near and self._rng.random() >= SamplingTuning.elsewhere:
-            return near[self.draw(len(near))]
+            return near[self._next(len(near))]
         return super().choose(numbers)
 
     def arrive(self, keyframes: Sequence[Keyframe]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -35,9 +36,12 @@ class ExposureTuning(Tuning):
 _SOME = (slice(None, None, ExposureTuning.stride), slice(None, None, ExposureTuning.stride))
 
 
+_IDENTITY = np.tile([1.0, 0.0], (3, 1))
+
+
 def identity_exposure() -> np.ndarray:
     """Gain 1 and offset 0 for each channel, float64 [3, 2]."""
-    return np.tile([1.0, 0.0], (3, 1))
+    return _IDENTITY.copy()
 
 
 def change_of(exposure: np.ndarray) -> float:
@@ -65,6 +69,16 @@ def typical_gain(gains: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray
     return found
 
 
+class Seen(Protocol):
+    """What a map shows where an image looks, as that is compared with it."""
+
+    def measure(self, color: np.ndarray) -> np.ndarray | None:
+        """Exposure [3, 2] of the image, uint8 [H, W, 3], against the map; None if too little is seen by both."""
+
+    def pictures(self) -> SeenAgain:
+        """The pictures themselves."""
+
+
 @dataclass(frozen=True)
 class SeenAgain:
     """The map, rendered at the pose of an image.
@@ -84,6 +98,10 @@ class SeenAgain:
     depth: np.ndarray
     thinned: bool = False
 
+    def pictures(self) -> SeenAgain:
+        """Itself, see `Seen`."""
+        return self
+
     def some(self, image: np.ndarray) -> np.ndarray:
         """The rows and columns that are compared, of an image [H, W]."""
         return image if self.thinned else image[_SOME]
@@ -97,14 +115,26 @@ class SeenAgain:
     def measure(self, color: np.ndarray) -> np.ndarray | None:
         """`measure_exposure` of what the camera saw, uint8 [H, W, 3]."""
         known = self.common_pixels()
-        exposure = identity_exposure()
+        gains = []
         for channel in range(3):
             x, y = self.some(self.image[channel])[known], color[_SOME][..., channel][known].astype(np.float32) / 255
             used = (x > ExposureTuning.dark) & (x < ExposureTuning.bright) & (y < ExposureTuning.bright)
-            if used.sum() < ExposureTuning.min_share * known.size:
+            if not is_enough(int(used.sum()), known.size):
                 return None
-            exposure[channel, 0] = _median(y[used] / x[used])
-        return exposure if (exposure[:, 0] > 0).all() else None
+            gains.append(_median(y[used] / x[used]))
+        return exposure_of(gains)
+
+
+def is_enough(used: int, pixels: int) -> bool:
+    """Whether so many of the pixels that are compared tell of an exposure."""
+    return used >= ExposureTuning.min_share * pixels
+
+
+def exposure_of(gains: Sequence[float]) -> np.ndarray | None:
+    """The exposure [3, 2] with these gains and no offsets; None if one is impossible."""
+    exposure = identity_exposure()
+    exposure[:, 0] = gains
+    return exposure if (exposure[:, 0] > 0).all() else None
 
 
 def is_lit(color: np.ndarray) -> bool:

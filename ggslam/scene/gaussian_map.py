@@ -234,6 +234,21 @@ class GaussianMap:
 
     # --- whole rows --------------------------------------------------------------------------------------------------
 
+    @property
+    def storage(self) -> Mapping[str, torch.Tensor]:
+        """All arrays by name, `means.first` and `means.second` being the moments of `means`, with the rows that are
+        not in use. The same tensors as long as `allocations` stays."""
+        return self._storage
+
+    def extend(self, added: int) -> slice:
+        """Appends M Gaussians without any values: the caller writes their rows of all arrays; returns which."""
+        rows = slice(self.count, self.count + added)
+        first = not self.capacity  # others will follow: rows without use take no memory on the host
+        self.reserve(self.count + added + (int(added * self.growth) if first else 0))
+        self.count += added
+        self.version += 1
+        return rows
+
     def _arrays(self, count: int) -> dict[str, torch.Tensor]:
         """The first `count` rows of every array, by name."""
         return {name: array[:count] for name, array in self._storage.items()}
@@ -314,10 +329,7 @@ class GaussianMap:
         Returns:
             The rows they occupy.
         """
-        added = means.shape[0]
-        rows = slice(self.count, self.count + added)
-        first = not self.capacity  # others will follow: rows without use take no memory on the host
-        self.reserve(self.count + added + (int(added * self.growth) if first else 0))
+        rows = self.extend(means.shape[0])
         given = {"means": means, "quaternions": quaternions, "log_scales": log_scales, "opacity_logits": opacity_logits}
         for name, value in given.items():
             self._storage[name][rows] = value
@@ -329,8 +341,6 @@ class GaussianMap:
         for name in self._names:
             if name in _ZERO_AT_BIRTH or "." in name:  # the moments
                 self._storage[name][rows].zero_()
-        self.count += added
-        self.version += 1
         return rows
 
     def keep(self, selected: torch.Tensor) -> int:
@@ -342,14 +352,18 @@ class GaussianMap:
         self.reorder(index)
         return removed
 
+    def shorten(self, kept: int) -> None:
+        """The first rows stay, so many: the caller has moved there what stays, rows of all arrays in their order."""
+        self.count = kept
+        self.version += 1
+        self.order += 1
+
     def reorder(self, index: torch.Tensor) -> None:
         """Makes row i the former row index[i] (int64 [M]); rows not named are dropped. Moments move along."""
         kept, index = index.shape[0], index.to(self.device)  # once, not for each array
         for array in self._storage.values():
             array[:kept] = torch.index_select(array[: self.count], 0, index)  # a third of what array[index] takes
-        self.count = kept
-        self.version += 1
-        self.order += 1
+        self.shorten(kept)
 
     def move(self, rows: torch.Tensor, T_new_old: torch.Tensor) -> None:
         """Moves Gaussians of `rows` (bool [N] or int64 [M]) rigidly by `T_new_old` [4, 4]: means and rotations.

@@ -18,6 +18,7 @@ from ggslam.mapping.cpu.identity import CpuIdentityLearner
 from ggslam.mapping.cpu.pixel_pool import draw_pool
 from ggslam.mapping.cuda.class_table import CudaClassTuning
 from ggslam.mapping.cuda.identity import CudaIdentityLearner, CudaIdentityTuning
+from ggslam.mapping.cuda.insertion import NewRows
 from ggslam.mapping.identity import IdentityTuning
 from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
 from ggslam.mapping.pixel_pool import PixelPool
@@ -242,9 +243,16 @@ def test_pixels_drawn_before_their_objects_were_forgotten_change_nothing(cuda_li
 def test_new_gaussians_have_the_objects_of_their_pixels(cuda_library: CudaLibrary) -> None:
     both = Both(cuda_library)
     both.cuda.merge(both.device_map, [(2, 300)])
-    pixels = torch.tensor([5 * WIDTH + 16, 5 * WIDTH + 3, 0, 23], device=both.device)
-    assert both.cuda.labels_at(both.keyframe, pixels).tolist() == [2, 2, 1, 0]
-    assert both.cuda.labels_at(MaskedKeyframe(1, None, both.device), pixels).tolist() == [0] * 4
+    where = [5 * WIDTH + 16, 5 * WIDTH + 3, 0, 23]
+    pixels = torch.tensor(where, dtype=torch.int32, device=both.device)
+    new, gaussians = NewRows(slice(2, 6), pixels.data_ptr()), both.device_map
+    for keyframe, ids in ((both.keyframe, [2, 2, 1, 0]), (MaskedKeyframe(1, None, both.device), [0] * 4)):
+        both.cuda.begin_at(gaussians, keyframe, new)
+        assert gaussians.vote_ids[2:6, 0].tolist() == ids
+        assert gaussians.vote_weights[2:6, 0].tolist() == [np.float32(IdentityTuning.birth_vote) * (k > 0) for k in ids]
+        codes = both.cuda.table.codes(torch.tensor(ids, device=both.device))
+        torch.testing.assert_close(gaussians.features[2:6], codes, atol=1e-6, rtol=0)
+        assert bool(codes.any()) == any(ids)
 
 
 def test_new_gaussians_may_begin_at_random(cuda_library: CudaLibrary) -> None:

@@ -81,7 +81,7 @@ def check_same(found: NewGaussians, expected: list[NewGaussians], images: Images
     to so many `levels` of 255."""
     pixels = found.pixels.cpu().numpy()
     np.testing.assert_array_equal(pixels, np.concatenate([part.pixels for part in expected]))
-    assert len(found) == len(pixels) and found.pixels.dtype == torch.int64
+    assert len(found) == len(pixels) and found.pixels.dtype == torch.int32
     discs = len(expected[0].pixels)
     means, quaternions, log_scales, rgb = (
         getattr(found, name).cpu().numpy() for name in ("means", "quaternions", "log_scales", "rgb")

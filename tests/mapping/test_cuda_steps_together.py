@@ -76,7 +76,7 @@ def test_the_job_follows_what_grows_and_goes(frames: list[Frame]) -> None:
             mapper.map.reserve(mapper.map.count + 1000)
             mapper.run(2)
             capacities.add(mapper.map.capacity)
-            tables.add(mapper._states._table.data_ptr())
+            tables.add(mapper._states.table.data_ptr())
             assert len(mapper._images._images) == 1
         assert len(capacities) == len(frames) and len(tables) > 1
         mapper.map.keep(mapper.map.opacity_logits > mapper.map.opacity_logits.median())
@@ -101,7 +101,7 @@ def test_where_cameras_show_nothing_and_what_moved(frames: list[Frame]) -> None:
 
 
 def test_cameras_of_several_sizes(frames: list[Frame], room: Path) -> None:
-    """Steps that follow one another with one camera are one call."""
+    """Steps that follow one another with one camera are one call; each camera has its job until the map changes."""
     larger = next(iter(open_sequence(room, scale=0.3).stream()))
 
     def work() -> CudaMapper:
@@ -112,7 +112,7 @@ def test_cameras_of_several_sizes(frames: list[Frame], room: Path) -> None:
         return mapper
 
     found, _ = both_ways(work)
-    assert len({keyframe.camera for keyframe in found.keyframes}) == 2 and found._training.fillings > 5
+    assert len({keyframe.camera for keyframe in found.keyframes}) == 2 and found._training.fillings == 1 + 2 + 2
 
 
 @pytest.mark.parametrize("schedule", ["sampled", "votes"])
@@ -134,6 +134,43 @@ def test_objects_are_learned_in_the_same_call(frames: list[Frame], schedule: Any
     assert np.array_equal(ours.weight, theirs.weight) and np.array_equal(ours.bias, theirs.bias)
     assert found.identity.times.count == expected.identity.times.count > 6
     assert found.map.vote_weights.max() > 0.2 and found.map.features.any()
+
+
+@pytest.mark.long("refinements at three sizes under emulation")
+def test_pictures_of_other_sizes_and_frames_between_keyframes(room: Path) -> None:
+    """Steps at half and at twice the size are made by one call each, objects are learned there, too; and so are those
+    of frames between keyframes, but for how the place of these is rounded."""
+    frames = list(open_sequence(room, scale=0.54, stride=2).stream(masks=True))[:3]
+
+    def work(with_between: bool) -> Callable[[], CudaMapper]:
+        def train() -> CudaMapper:
+            mapper = make_mapper(emulated_library(), replace(LEARNING, every=1))
+            mapper._exposures.settings = replace(mapper._exposures.settings, enabled=False)
+            mapper.settings = replace(mapper.settings, exposure=mapper._exposures.settings)
+            for number, frame in enumerate(frames[:2]):
+                add_keyframe(mapper, frame, number)
+                mapper.run(2)
+            if with_between:
+                poses = [frame.T_world_camera for frame in frames]
+                mapper.keep_between(frames[2], 1, inverse(poses[1]) @ poses[2])
+            mapper.refine(8)
+            return mapper
+
+        return train
+
+    def made_by_calls(mapper: CudaMapper) -> int:
+        return mapper._training.graphs.counts.started + mapper._training.graphs.counts.plain
+
+    plain, _ = both_ways(work(with_between=False))
+    assert len(plain._training._jobs._kept) == 3 and plain.times.steps == 12
+    # The first step is made of single calls, and one with a lesson is two pieces.
+    assert plain.identity is not None and plain.identity.times.count == 12 and made_by_calls(plain) == 2 * 11
+    found = work(with_between=True)()
+    with one_by_one():
+        expected = work(with_between=True)()
+    assert made_by_calls(found) > 11 and made_by_calls(expected) == 0
+    torch.testing.assert_close(found.map.means, expected.map.means, atol=1e-5, rtol=0)
+    assert not torch.equal(found.map.means, plain.map.means)
 
 
 def test_steps_without_room_change_nothing_and_are_counted(frames: list[Frame]) -> None:

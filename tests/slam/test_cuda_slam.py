@@ -155,7 +155,7 @@ def test_a_keyframe_looks_again_if_its_rendering_found_no_room(
 
         def rendered_short(keyframe: Keyframe, with_room: bool) -> Any:
             view = rendered(keyframe, with_room)
-            mapper.room_was_short.fill_(0 if with_room else 1)
+            mapper._rasterizer.last_overflowed.fill_(0 if with_room else 1)
             looks.append(with_room)
             return view
 

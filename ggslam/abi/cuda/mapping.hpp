@@ -55,9 +55,12 @@ struct InsertionJob {
   const float *alpha, *rendered_depth;  // [H, W], rendered: alpha and expected depth in metres; both null: an empty map
   // Written by ggslam_cuda_insertion_select: how many Gaussians there will be.
   std::int32_t* total;
-  // Written by ggslam_cuda_insertion_build, of `count` rows: [3], [4] wxyz, [3], [3] and flat pixel indices.
-  float *means, *quaternions, *log_scales, *rgb;
-  std::int64_t* pixels;
+  // Written by ggslam_cuda_insertion_build, of `count` rows: [3], [4] wxyz, [3], and flat pixel indices.
+  float *means, *quaternions, *log_scales;
+  std::int32_t* pixels;
+  float* colors;  // the first three of each row's color_numbers: R, G, B in [0, 1], or
+  std::int32_t as_harmonics;   // 1: their constant coefficients of spherical harmonics
+  std::int32_t color_numbers;
   void* workspace;
   void* stream;
   std::int32_t device, height, width, count;

@@ -34,6 +34,7 @@ struct TrainingJob {
 struct TrainingStep {
   TargetImages images;
   KeyframeChoice keyframe;
+  const double* T_camera_keyframe;  // [4, 4], of a frame that hangs on the keyframe and is rendered; null: the keyframe
   float rates[kAdamGroups];
   std::int32_t bounded;  // 1: sizes, and perhaps colours, are brought within their bounds after it
   std::int32_t lesson;   // number of the step of identity learning on the same rendering; -1: there is none

@@ -10,7 +10,8 @@ import torch
 
 from ggslam.cuda.transfers import upload
 from ggslam.mapping.between_frames import BetweenFrame
-from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceKeyframe, ImageStore
+from ggslam.mapping.cuda.image_store import ImageStore
+from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceKeyframe
 from ggslam.rendering.exposure import identity_exposure
 from ggslam.scene.poses import inverse
 
@@ -33,6 +34,7 @@ class CudaBetweenView(DeviceKeyframe):
         self.camera, self.camera_number = keyframe.camera, keyframe.camera_number
         self.depth_unit, self.iterations = keyframe.depth_unit, 0
         self.mask = self.moving = self.archive = self.instant = None
+        self.rows = []
 
     @property
     def color(self) -> np.ndarray:  # type: ignore[override]
@@ -61,6 +63,10 @@ class CudaBetweenView(DeviceKeyframe):
     @property
     def device_pose(self) -> torch.Tensor:
         return torch.mm(self._T_camera_keyframe, self._keyframe.exact_device_pose)[:3].float().view(12)
+
+    @property
+    def T_camera_keyframe_on_device(self) -> torch.Tensor | None:
+        return self._T_camera_keyframe
 
     @property
     def has_depth(self) -> bool:

@@ -6,9 +6,12 @@ Which id has which class is known on the host as well: ids appear and go with ke
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
 import torch
 
+from ggslam.abi.cuda import MOST_NEW_CLASSES, MOST_NEW_WEIGHTS, NewClassJob
 from ggslam.cuda.streams import let_go
 from ggslam.cuda.transfers import upload
 from ggslam.mapping.class_numbers import ClassNumbers, ClassTuning, new_rows
@@ -42,8 +45,7 @@ class CudaClassTable:
         self._rows = self._zeros(ClassTuning.initial_rows)  # weights, then the bias
         self._moments = (self._zeros(ClassTuning.initial_rows), self._zeros(ClassTuning.initial_rows))
         self._steps = torch.zeros(1, dtype=torch.int32, device=self._device)
-        self.ids = torch.zeros(0, dtype=torch.int32, device=self._device)
-        """Object id of each class, int32 [count]."""
+        self._ids = torch.zeros(ClassTuning.initial_rows, dtype=torch.int32, device=self._device)
         self.class_of = torch.full((IDS,), -1, dtype=torch.int32, device=self._device)
         """Class number of every object id, int32 [65536], -1 where there is none."""
 
@@ -51,6 +53,11 @@ class CudaClassTable:
     def count(self) -> int:
         """Number of classes."""
         return self._numbers.count
+
+    @property
+    def ids(self) -> torch.Tensor:
+        """Object id of each class, int32 [count]; a view."""
+        return self._ids[: self.count]
 
     @property
     def rows(self) -> torch.Tensor:
@@ -61,6 +68,11 @@ class CudaClassTable:
     def training_arrays(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
         """Rows and their two moments, float32 [at least count, F + 1], and the number of steps so far, int32 [1]."""
         return self._rows, *self._moments, self._steps
+
+    @property
+    def places(self) -> tuple[int, int]:
+        """Of the training arrays: others as soon as they move, or there are more or fewer classes."""
+        return self._rows.data_ptr(), self._numbers.count
 
     @property
     def weight(self) -> torch.Tensor:
@@ -84,17 +96,26 @@ class CudaClassTable:
         new = self._numbers.add(object_ids)
         if new.stop > len(self._rows):
             extra = max(new.stop, 2 * len(self._rows)) - len(self._rows)
-            let_go(self._rows, *self._moments)
+            let_go(self._rows, *self._moments, self._ids)
+            self._ids = torch.cat([self._ids, torch.zeros(extra, dtype=torch.int32, device=self._device)])
             self._rows = torch.cat([self._rows, self._zeros(extra)])
             self._moments = (
                 torch.cat([self._moments[0], self._zeros(extra)]), torch.cat([self._moments[1], self._zeros(extra)])
             )  # fmt: skip
-        weights = new_rows(self._rng, new.stop - new.start, self._channels)
-        if len(weights):
-            self._rows[new] = upload(np.pad(weights, ((0, 0), (0, 1))), self._device)
-            ids = upload(self._numbers.ids[new].astype(np.int32), self._device)
-            self.class_of[ids.long()] = torch.arange(new.start, new.stop, dtype=torch.int32, device=self._device)
-            self.ids = torch.cat([self.ids, ids])
+        self._write(new, new_rows(self._rng, new.stop - new.start, self._channels))
+
+    def _write(self, new: slice, weights: np.ndarray) -> None:
+        """Rows of new classes, float32 [n, F], and their ids, for which there is room."""
+        job, ids = NewClassJob(channels=self._channels, device=self._device.index or 0), self._numbers.ids
+        job.rows, job.ids, job.class_of = self._rows.data_ptr(), self._ids.data_ptr(), self.class_of.data_ptr()
+        job.stream = self._kernels.library.stream(self._device)
+        at_once = min(MOST_NEW_CLASSES, MOST_NEW_WEIGHTS // self._channels)
+        for begin in range(new.start, new.stop, at_once):
+            end = min(begin + at_once, new.stop)
+            job.first, job.count = begin, end - begin
+            job.new_ids[: job.count] = ids[begin:end].tolist()
+            job.weights[: job.count * self._channels] = weights[begin - new.start : end - new.start].ravel().tolist()
+            self._kernels.library.call("new_classes", ctypes.byref(job))
 
     def resume(self, classifier: IdentityClassifier) -> None:
         """Takes over the classes of a classifier, with fresh moments."""
@@ -115,7 +136,7 @@ class CudaClassTable:
         self._tell_numbers()
 
     def _tell_numbers(self) -> None:
-        self.ids = upload(self._numbers.ids.astype(np.int32), self._device)
+        self.ids.copy_(upload(self._numbers.ids.astype(np.int32), self._device))
         self.class_of.copy_(upload(self._numbers.table, self._device))
 
     # --- vectors ------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ classes, and neighbours are those of the map as it is.
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Protocol
@@ -16,10 +17,14 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import torch
 
+from ggslam.abi.arrays import address
+from ggslam.abi.cuda import BirthLabelJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.transfers import upload
+from ggslam.mapping.class_numbers import ClassTuning
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
+from ggslam.mapping.cuda.insertion import NewRows
 from ggslam.mapping.cuda.lessons import CudaLessons
 from ggslam.mapping.cuda.neighbours import cuda_neighbours
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
@@ -31,7 +36,7 @@ from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.pixel_terms import FeatureAdamSettings
 from ggslam.rendering.types import RenderBuffers
-from ggslam.scene.gaussian_map import SH_C0, GaussianMap
+from ggslam.scene.gaussian_map import SH_C0, VOTE_SLOTS, GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
 from ggslam.system.tuning import Tuning
 
@@ -171,20 +176,29 @@ class CudaIdentityLearner(IdentityLearner):
         shown, _ = terms.labels(self._shown_labels(gaussians))
         return torch.where((self.device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
 
-    def labels_at(self, keyframe: CudaMaskedKeyframe, pixels: torch.Tensor) -> torch.Tensor:
-        """Objects at pixels (integers [M], flat indices) of a keyframe, int32 [M], for `begin`; 0 = unknown."""
-        if keyframe.device_mask is None:
-            return torch.zeros(len(pixels), dtype=torch.int32, device=self.device)
-        return self._kernels.labels(keyframe.device_mask, pixels.to(torch.int32), self.device_alias)
-
     def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
-        ids = self.device_alias[labels.long()]
-        gaussians.vote_ids[rows, 0] = ids
-        gaussians.vote_weights[rows, 0] = IdentityTuning.birth_vote * (ids > 0)
-        if self.settings.initialisation == "votes":
-            gaussians.features[rows] = self.table.codes(ids)
-        else:
-            shape = (len(labels), IDENTITY_CHANNELS)
+        self._begin(gaussians, rows, BirthLabelJob(labels=labels.to(torch.int32).contiguous().data_ptr()))
+
+    def begin_at(self, gaussians: GaussianMap, keyframe: CudaMaskedKeyframe, new: NewRows) -> None:
+        """As `begin`, of Gaussians that a keyframe brought."""
+        self._begin(gaussians, new.rows, BirthLabelJob(pixels=new.pixels, mask=address(keyframe.device_mask)))
+
+    def _begin(self, gaussians: GaussianMap, rows: slice, job: Any) -> None:
+        """New Gaussians, whose votes are zero, get their first vectors and votes. `job` names their objects."""
+        count, by_votes = rows.stop - rows.start, self.settings.initialisation == "votes"
+        if count == 0:
+            return
+        storage, channels = gaussians.storage, gaussians.feature_channels
+        job.alias, job.class_of = self.device_alias.data_ptr(), self.table.class_of.data_ptr()
+        job.class_rows, job.code_length = self.table.training_arrays[0].data_ptr(), ClassTuning.code_length
+        job.vote_ids = storage["vote_ids"].data_ptr() + 4 * VOTE_SLOTS * rows.start
+        job.vote_weights = storage["vote_weights"].data_ptr() + 4 * VOTE_SLOTS * rows.start
+        job.features = storage["features"].data_ptr() + 4 * channels * rows.start if by_votes else None
+        job.vote, job.count, job.channels, job.slots = IdentityTuning.birth_vote, count, channels, VOTE_SLOTS
+        job.device, job.stream = self.device.index or 0, self.library.stream(self.device)
+        self.library.call("birth_labels", ctypes.byref(job))
+        if not by_votes:
+            shape = (count, IDENTITY_CHANNELS)
             random = torch.rand(shape, generator=self._drawer.generator, device=self.device)
             gaussians.features[rows] = (random - 0.5) / SH_C0
 
@@ -198,7 +212,7 @@ class CudaIdentityLearner(IdentityLearner):
     def step(
         self, gaussians: GaussianMap, rasterizer: Any, keyframe: Any, view: RenderBuffers, rate_factor: float = 1.0
     ) -> torch.Tensor | None:
-        if not isinstance(rasterizer, CudaRasterizer) or not self.lessons.takes(gaussians, keyframe):
+        if not isinstance(rasterizer, CudaRasterizer) or not self.lessons.takes(gaussians):
             return super().step(gaussians, rasterizer, keyframe, view, rate_factor)
         start = time.perf_counter()
         self.lessons.run(gaussians, rasterizer, keyframe, rate_factor)

@@ -22,17 +22,18 @@ from ggslam.abi.cuda import InsertionJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
+from ggslam.mapping.cuda.map_rows import MapRows
 from ggslam.mapping.new_gaussians import NewGaussians
 from ggslam.mapping.settings import InsertionSettings
 from ggslam.rendering.types import check_pose
 from ggslam.scene.camera import Camera
+from ggslam.scene.gaussian_map import GaussianMap
 
 _NUMBERS = ("alpha_threshold", "depth_tolerance_m", "depth_tolerance_relative", "scale_pixels", "flatness",
             "max_slope", "texture_threshold", "max_depth_m")  # fmt: skip
+_SHAPES: Final = ("means", "quaternions", "log_scales")
 _MOST_PIXELS: Final = 1 << 29
 """Most pixels of an image: the kernels number pixels and points for filling together in 31 bits."""
-
-
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,20 @@ class Selection:
 
     job: InsertionJob
     total: torch.Tensor
+
+
+@dataclass(frozen=True)
+class NewRows:
+    """Gaussians that were inserted.
+
+    Attributes:
+        rows: of the map.
+        pixels: address on the device of the flat indices of the pixels that they come from, int32 [M]; valid until the
+            next insertion.
+    """
+
+    rows: slice
+    pixels: int
 
 
 class CudaInsertion:
@@ -65,6 +80,9 @@ class CudaInsertion:
         self.library, self.device = library_and_device(device, library)
         self._memory = GrowingMemory(self.device)
         self._total = torch.empty(1, dtype=torch.int32, device=self.device)
+        self._sizes: dict[tuple[int, ...], int] = {}  # of the workspace, for the last images and settings
+        self.rows = MapRows(self.device, self.library)
+        """Of maps that are inserted to."""
 
     def new_gaussians(self, *arguments: Any, **named: Any) -> NewGaussians[torch.Tensor]:
         """`select` and `build`. Waits for the device once, for the number of Gaussians."""
@@ -81,6 +99,7 @@ class CudaInsertion:
         camera: Camera,
         T_world_camera: np.ndarray,
         settings: InsertionSettings,
+        total: torch.Tensor | None = None,
     ) -> Selection:
         """Starts to choose what the map lacks: first the pixels that `find_unexplained` gives `new_gaussians`, then, if
         holes are filled, those of `fill_gaussians`. Valid until the next one; the images have to stay till `build`.
@@ -93,6 +112,7 @@ class CudaInsertion:
             expected_depth: rendered expected depth, float32 [H, W], metres; not None unless `alpha` is.
             camera: intrinsics of the image size [H, W].
             T_world_camera: [4, 4], pose of the camera.
+            total: int32 [1] on the device, is written; None: memory of this object.
 
         Raises:
             RenderError: an array has another shape, type or device, or a number is impossible.
@@ -104,21 +124,41 @@ class CudaInsertion:
         job.units_per_metre = 1 / depth_scale
         job.color, job.depth = color.data_ptr(), depth.data_ptr()
         job.alpha, job.rendered_depth = address(alpha), address(expected_depth)
-        job.total = self._total.data_ptr()
-        size = self.library.functions.ggslam_cuda_insertion_bytes(ctypes.byref(job))
-        job.workspace = self._memory.block("insertion", size).data_ptr()
+        total = self._total if total is None else total
+        job.total = total.data_ptr()
+        key = (camera.height, camera.width, settings.fill_stride)
+        if key not in self._sizes:
+            self._sizes = {key: self.library.functions.ggslam_cuda_insertion_bytes(ctypes.byref(job))}
+        job.workspace = self._memory.block("insertion", self._sizes[key]).data_ptr()
         self.library.call("insertion_select", ctypes.byref(job))
-        return Selection(job, self._total)
+        return Selection(job, total)
 
     def build(self, selection: Selection, count: int) -> NewGaussians[torch.Tensor]:
         """The Gaussians of a selection, `count` being the number in its `total`."""
         job = selection.job
         job.count = count
         new = self._empty(count)
-        for name in ("means", "quaternions", "log_scales", "rgb", "pixels"):
+        for name in (*_SHAPES, "pixels"):
             setattr(job, name, getattr(new, name).data_ptr())
+        job.colors, job.color_numbers, job.as_harmonics = new.rgb.data_ptr(), 3, 0
         self.library.call("insertion_build", ctypes.byref(job))
         return new
+
+    def insert(
+        self, selection: Selection, count: int, gaussians: GaussianMap, opacity: float, keyframe: int
+    ) -> NewRows:
+        """The Gaussians of a selection, as of `build`, in a map: of one opacity, born at keyframe number `keyframe`."""
+        rows = self.rows.append(gaussians, count, float(np.log(opacity / (1 - opacity))), keyframe)
+        if count == 0:
+            return NewRows(rows, 0)
+        job, places = selection.job, self.rows.places(gaussians, rows.start)
+        job.count = count
+        for name in _SHAPES:
+            setattr(job, name, places[name])
+        job.colors, job.color_numbers, job.as_harmonics = places["sh"], 3 * (gaussians.sh_degree + 1) ** 2, 1
+        job.pixels = self._memory.block("pixels", 4 * count).data_ptr()
+        self.library.call("insertion_build", ctypes.byref(job))
+        return NewRows(rows, job.pixels)
 
     def _job(self, camera: Camera, T_world_camera: np.ndarray, settings: InsertionSettings) -> InsertionJob:
         job = InsertionJob(
@@ -134,7 +174,7 @@ class CudaInsertion:
 
     def _empty(self, count: int) -> NewGaussians[torch.Tensor]:
         means, quaternions, log_scales, rgb = (torch.empty(count, n, device=self.device) for n in (3, 4, 3, 3))
-        pixels = torch.empty(count, dtype=torch.int64, device=self.device)
+        pixels = torch.empty(count, dtype=torch.int32, device=self.device)
         return NewGaussians(means, quaternions, log_scales, rgb, pixels)
 
     def _check_images(

@@ -8,39 +8,37 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from ggslam.cuda.memory import ByKind
 from ggslam.cuda.transfers import download
 from ggslam.mapping.cuda.insertion import Selection
 from ggslam.mapping.cuda.keyframe import CudaKeyframe
+from ggslam.mapping.cuda.look_memory import LABEL_STRIDE, LookKind, LookMemory
 from ggslam.mapping.labelling import MapLabels
-from ggslam.rendering.exposure import ExposureTuning, SeenAgain
+from ggslam.rendering.exposure import ExposureTuning, Seen, SeenAgain
 from ggslam.rendering.types import RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
+
+Explained = tuple[torch.Tensor | None, torch.Tensor | None]
+"""Alpha and depth in metres of what a map explains, float32 [H, W]; None: it explains nothing."""
 
 
 class LookedAt(Protocol):
     """What of a `CudaMapper` a look needs; see there."""
 
     map: GaussianMap
-
-    @property
-    def room_was_short(self) -> torch.Tensor: ...
+    looks: ByKind[LookKind, LookMemory]
 
     def render_keyframe(self, keyframe: CudaKeyframe, with_room: bool) -> RenderBuffers: ...
 
-    def labels_on_grid(self, alpha: torch.Tensor, stride: int) -> tuple[torch.Tensor, torch.Tensor]: ...
-
-    def find_explained(
-        self, keyframe: CudaKeyframe, alpha: torch.Tensor | None, depth: torch.Tensor | None
-    ) -> tuple[torch.Tensor | None, torch.Tensor | None]: ...
+    def valid_on_device(self, keyframe: CudaKeyframe) -> torch.Tensor | None: ...
 
     def selection(
-        self, color: torch.Tensor, keyframe: CudaKeyframe, explained: tuple[torch.Tensor | None, torch.Tensor | None],
-        T_world_camera: np.ndarray,
+        self, color: torch.Tensor, keyframe: CudaKeyframe, explained: Explained, T_world_camera: np.ndarray,
+        total: torch.Tensor,
     ) -> Selection: ...  # fmt: skip
 
 
 _SOME = (..., slice(None, None, ExposureTuning.stride), slice(None, None, ExposureTuning.stride))
-_LABEL_STRIDE = 2
 
 
 class KeyframeLook:
@@ -60,54 +58,71 @@ class KeyframeLook:
         with_colors: bool,
     ) -> None:  # fmt: skip
         self._mapper, self._keyframe, self._T = mapper, keyframe, T_world_camera
-        self._with_labels, self._with_colors = with_labels, with_colors
+        size = (keyframe.camera.height, keyframe.camera.width)
+        self._memory = mapper.looks.of(LookKind(size, with_labels, with_colors))
         self.shows = mapper.map.count > 0
         """Whether there is a map to look at."""
         self._count: int | None = None
-        self._found: list[np.ndarray] = []
         self._start(with_room=False)
 
     def _start(self, with_room: bool) -> None:
         mapper, keyframe, self._with_room = self._mapper, self._keyframe, with_room
-        alpha = depth = None
-        self._wanted: list[torch.Tensor] = []
+        valid = mapper.valid_on_device(keyframe)
+        self._explained: Explained = _nothing_explained(valid)
         if self.shows:
-            view = mapper.render_keyframe(keyframe, with_room)
-            alpha, depth = view.alpha, view.expected_depth
-            if self._with_labels:
-                self._wanted += [*mapper.labels_on_grid(alpha, _LABEL_STRIDE), depth]
-            if self._with_colors:
-                self._wanted += [image[_SOME].contiguous() for image in (view.image, alpha, depth)]
-        self._explained = mapper.find_explained(keyframe, alpha, depth)
-        self.selection = mapper.selection(keyframe.device_images().color, keyframe, self._explained, self._T)
+            self._view = mapper.render_keyframe(keyframe, with_room)
+            self._memory.see(mapper.map, self._view, keyframe.device_images(), keyframe.depth_unit, valid)
+            self._explained = self._memory.explained
+        self._select(keyframe.device_images().color)
+
+    def _select(self, color: torch.Tensor) -> None:
+        self.selection = self._mapper.selection(color, self._keyframe, self._explained, self._T, self._memory.total)
 
     def select_again(self, color: torch.Tensor) -> None:
         """Chooses pixels of the keyframe with other colours, uint8 [H, W, 3] on the device."""
         self.count()  # by now it is known whether there was room
         self._color = color  # it has to stay
-        self.selection = self._mapper.selection(color, self._keyframe, self._explained, self._T)
+        self._select(color)
         self._count = int(download(self.selection.total)[0][0])
 
     def labels(self) -> MapLabels:
-        """What the map shows of the objects, looked at on every `_LABEL_STRIDE`-th pixel and row; on the host."""
+        """What the map shows of the objects, looked at on every `LABEL_STRIDE`-th pixel and row; on the host."""
         self.count()
-        ids, share, depth = self._found[:3]
-        return MapLabels.from_grid(ids, share, depth, _LABEL_STRIDE)
+        ids, share, depth = self._memory.labels()
+        return MapLabels.from_grid(ids, share, depth.copy(), LABEL_STRIDE)
 
-    def view(self) -> SeenAgain | None:
-        """What the map shows where the keyframe looks; None: nothing, or colours were not asked for."""
-        if not (self.shows and self._with_colors):
-            return None
+    def view(self) -> Seen | None:
+        """What the map shows where the keyframe looks; None: nothing, or colours were not asked for. Good until the
+        next rendering."""
+        return self if self.shows and self._memory.kind.with_colors else None
+
+    def measure(self, color: np.ndarray) -> np.ndarray | None:
+        """The keyframe's exposure, see `Seen`."""
         self.count()
-        image, alpha, depth = self._found[-3:]
-        return SeenAgain(image, alpha, depth, self._keyframe.depth_m()[_SOME], thinned=True)
+        return self._memory.exposure()
+
+    def pictures(self) -> SeenAgain:
+        """See `Seen`. Waits."""
+        self.count()
+        shown = (self._view.image, self._view.alpha, self._memory.explained[1])
+        image, alpha, rendered_depth = download(*(picture[_SOME].contiguous() for picture in shown))
+        measured = self._keyframe.depth_m(self._keyframe.depth[_SOME])
+        return SeenAgain(image, alpha, rendered_depth, measured, thinned=True)
 
     def count(self) -> int:
         """Of the Gaussians to insert."""
         while self._count is None:
-            *self._found, total, short = download(*self._wanted, self.selection.total, self._mapper.room_was_short)
-            if short[0] and self.shows and not self._with_room:
+            total, was_short = self._memory.fetch()
+            if was_short and self.shows and not self._with_room:
                 self._start(with_room=True)
             else:
-                self._count = int(total[0])
+                self._count = total
         return self._count
+
+
+def _nothing_explained(valid: torch.Tensor | None) -> Explained:
+    """What is explained without a map: where a keyframe shows nothing, bool [H, W] on a device being False, there is
+    nothing to explain."""
+    if valid is None:
+        return None, None
+    return (~valid).float(), torch.zeros(valid.shape, device=valid.device)

@@ -98,10 +98,10 @@ class KeyframeStates:
         Raises:
             RenderError: another shape.
         """
-        if self._count == len(self._table):
+        if self._count == len(self.table):
             table = self._new_table(2 * self._count)
-            table[: self._count] = self._table
-            let_go(self._table)
+            table[: self._count] = self.table
+            let_go(self.table)
             self._use(table)
         self._write(self._count, T_camera_world, exposure)
         self._count += 1
@@ -186,7 +186,7 @@ class KeyframeStates:
     def scale_gradients(self, gain: np.ndarray) -> None:
         """The moments of all exposures follow a map that became `gain` [3] times as bright: gradients with respect to
         a gain are as large as the map is bright."""
-        offset, rows = KeyframeState.exposure_moments.offset, self._table[: self._count]
+        offset, rows = KeyframeState.exposure_moments.offset, self.table[: self._count]
         moments = rows[:, offset : offset + ctypes.sizeof(AdamMoments)].view(torch.float64).view(-1, 2, 3, 2)
         factors = upload(np.stack([gain, np.square(gain)]).astype(np.float64), self.device)
         moments[..., 0].mul_(factors)
@@ -222,7 +222,8 @@ class KeyframeStates:
         return torch.empty(rows, ctypes.sizeof(KeyframeState), dtype=torch.uint8, device=self.device)
 
     def _use(self, table: torch.Tensor) -> None:
-        self._table = table
+        self.table = table
+        """On the device, uint8, a row for each keyframe; another tensor after an `append` that found no room."""
         for_rasterizer, for_loss = KeyframeState.pose_copy.offset // 4, KeyframeState.exposure_copy.offset // 4
         numbers = table.view(torch.float32)
         self._poses = numbers[:, for_rasterizer : for_rasterizer + 12]
@@ -230,7 +231,7 @@ class KeyframeStates:
 
     def _doubles_of(self, field: ctypes._CField, i: int) -> torch.Tensor:
         """Doubles of keyframe i's row, a view [n]."""
-        return self._table[self._check_index(i), field.offset : field.offset + field.size].view(torch.float64)
+        return self.table[self._check_index(i), field.offset : field.offset + field.size].view(torch.float64)
 
     def _upload_exposure(self, exposure: np.ndarray) -> torch.Tensor:
         """float64 [6] on the device."""
@@ -245,11 +246,11 @@ class KeyframeStates:
 
     def address(self, i: int) -> int:
         """Of keyframe i's row; valid until the next `append`."""
-        return self._table.data_ptr() + self._check_index(i) * ctypes.sizeof(KeyframeState)
+        return self.table.data_ptr() + self._check_index(i) * ctypes.sizeof(KeyframeState)
 
     def _write(self, i: int, T_camera_world: np.ndarray, exposure: np.ndarray | None) -> None:
         job = KeyframeWriteJob(stream=self._current_stream(), device=self.device.index or 0)
-        job.state = self._table.data_ptr() + i * ctypes.sizeof(KeyframeState)
+        job.state = self.table.data_ptr() + i * ctypes.sizeof(KeyframeState)
         for name, array, shape in (("pose", T_camera_world, (4, 4)), ("exposure", exposure, (3, 2))):
             if array is None:
                 continue
@@ -265,7 +266,7 @@ class KeyframeStates:
         changes = self._changes  # as of before the copy: another thread may go on meanwhile
         if after != changes:
             with self.in_turn():
-                table = self._table[: self._count].cpu().numpy().copy()
+                table = self.table[: self._count].cpu().numpy().copy()
             self._read_table = changes, table
         part = table[:, field.offset : field.offset + field.size]
         return part.copy().view(np.float64)

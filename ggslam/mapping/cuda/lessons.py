@@ -9,40 +9,29 @@ summed in another order.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import torch
 
 from ggslam.abi.cuda import MOST_NEIGHBOURS, IdentityJob, IdentityStep
 from ggslam.cuda.library import CudaLibrary
-from ggslam.cuda.memory import GrowingMemory
+from ggslam.cuda.memory import GrowingMemory, Slots
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
 from ggslam.mapping.identity import IdentityTimes, IdentityTuning, MaskOnGrid
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
-from ggslam.rendering.cuda.finished import MapState
 from ggslam.rendering.cuda.pixel_terms import feature_step
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
 from ggslam.rendering.pixel_terms import FeatureAdamSettings
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
-from ggslam.system.tuning import Tuning
-
-
-class PoolStoreTuning(Tuning):
-    """Room for pixels that are drawn ahead."""
-
-    at_once = 16
-    """Keyframes for which room is made at a time."""
-
 
 _SCHEDULES: Final = ("sampled", "votes")
 
 
 class PoolStore:
-    """Room for the pixels of keyframes, made for several at a time.
+    """Room for the pixels of keyframes.
 
     Args:
         device: where.
@@ -50,26 +39,24 @@ class PoolStore:
     """
 
     def __init__(self, device: torch.device, size: int) -> None:
-        self._device, self._size = device, size
-        self._spare: list[PixelPool[torch.Tensor]] = []
+        self._size = size
+        self._pixels = Slots((size,), torch.int32, device)
+        self._weights = Slots((size,), torch.float32, device)
 
     def make_room(self) -> None:
         """Makes some if there is none: to be called while nobody minds an allocation."""
-        if not self._spare:
-            shape = (PoolStoreTuning.at_once, self._size)
-            pixels = torch.zeros(shape, dtype=torch.int32, device=self._device)
-            weights = torch.zeros(shape, dtype=torch.float32, device=self._device)
-            self._spare = [PixelPool(*part) for part in zip(pixels.unbind(), weights.unbind(), strict=True)]
+        self._pixels.make_room()
+        self._weights.make_room()
 
     def take(self) -> PixelPool[torch.Tensor]:
         """Room for one keyframe."""
-        self.make_room()
-        return self._spare.pop()
+        return PixelPool(self._pixels.take(), self._weights.take())
 
     def give_back(self, pool: PixelPool[torch.Tensor]) -> None:
         """What is not needed any more; nothing becomes of it if it is of another size."""
         if len(pool.pixels) == self._size:
-            self._spare.append(pool)
+            self._pixels.give_back(pool.pixels)
+            self._weights.give_back(pool.vote_weights)
 
 
 class Learner(Protocol):
@@ -99,17 +86,6 @@ class Learner(Protocol):
     def note_losses(self, losses: torch.Tensor, known: torch.Tensor) -> None: ...
 
 
-@dataclass(frozen=True)
-class _Filled:
-    """What the job was filled from: as long as it is equal, so is the job."""
-
-    map: MapState
-    classes: tuple[int, int]
-    parts: int | None
-    size: tuple[int, int]
-    memory: int
-
-
 class CudaLessons:
     """Fills in the steps of a learner.
 
@@ -120,19 +96,22 @@ class CudaLessons:
     def __init__(self, learner: Learner) -> None:
         self._learner, self._device = learner, learner.device
         self._job, self._step = IdentityJob(), IdentityStep()
-        self._filled: _Filled | None = None
+        self._filled: tuple[object, ...] = ()  # what the job was filled from: as long as it is equal, so is the job
         self._named: tuple[object, ...] = ()
+        self._sizes: set[tuple[int, int]] = set()  # of pictures that the job has room for
         self._memory = GrowingMemory(learner.device)
         self._known = torch.zeros(1, dtype=torch.int32, device=learner.device)
         self._losses = torch.zeros(learner.settings.pixels, device=learner.device)
+        pixels = torch.zeros(learner.settings.pixels, dtype=torch.int32, device=learner.device)
+        self._once = PixelPool(pixels, torch.zeros_like(self._losses))
         self.pools = PoolStore(learner.device, IdentityTuning.pool_steps * learner.settings.pixels)
 
-    def takes(self, gaussians: GaussianMap, keyframe: Any) -> bool:
-        """Whether the library makes steps of this kind."""
+    def takes(self, gaussians: GaussianMap) -> bool:
+        """Whether the library makes steps on a map."""
         s: IdentitySettings = self._learner.settings
-        whole = not isinstance(keyframe, MaskOnGrid) and gaussians.feature_channels == IDENTITY_CHANNELS
         few = s.neighbours.weight == 0 or s.neighbours.neighbours <= MOST_NEIGHBOURS
-        return whole and few and gaussians.with_moments and s.schedule in _SCHEDULES and len(gaussians) > 0
+        fits = gaussians.with_moments and gaussians.feature_channels == IDENTITY_CHANNELS
+        return fits and few and s.schedule in _SCHEDULES and len(gaussians) > 0
 
     def run(self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: Any, rate_factor: float) -> None:
         """A step at pixels of what was rendered last."""
@@ -145,12 +124,15 @@ class CudaLessons:
     def fill(
         self, step: IdentityStep, gaussians: GaussianMap, keyframe: Any, size: tuple[int, int], rate_factor: float
     ) -> IdentityJob:
-        """Fills in the next step on a keyframe, whose images are of `size` (height, width), and counts it; returns the
-        job that goes with it. Valid until map, masks or classes change."""
+        """Fills in the next step on a keyframe, or its mask on a grid, whose picture is of `size` (height, width), and
+        counts it; returns the job that goes with it. Valid until map, masks or classes change."""
         learner = self._learner
         self._fill_job(gaussians, size)
         step.mask, step.rate_factor = keyframe.device_mask.data_ptr(), rate_factor
-        self._fill_pixels(step, keyframe.index)
+        if isinstance(keyframe, MaskOnGrid):
+            self._fill_once(step)
+        else:
+            self._fill_pixels(step, keyframe.index)
         step.pulls = learner.table.count > 0 and self._job.samples > 0 and learner.pulls(gaussians)
         step.pull = learner.times.count
         if self._job.trains:
@@ -172,21 +154,31 @@ class CudaLessons:
         step.used = pool.used
         pool.used += wanted
 
+    def _fill_once(self, step: IdentityStep) -> None:
+        """Pixels of this step alone: the next one has another grid."""
+        step.drawn, step.draw, step.used = len(self._once.pixels), self._learner.drawer.next_draw(), 0
+        step.pool, step.pool_weights = self._once.pixels.data_ptr(), self._once.vote_weights.data_ptr()
+
     def _fill_job(self, gaussians: GaussianMap, size: tuple[int, int]) -> None:
         learner = self._learner
         table, shown = learner.table, learner.labels_for_parts(gaussians)
-        classes, parts = (table.training_arrays[0].data_ptr(), table.count), None if shown is None else shown.data_ptr()
-        wanted = _Filled(MapState.of(gaussians), classes, parts, size, self._memory.allocations)
+        parts = None if shown is None else shown.data_ptr()
+        wanted = (gaussians, gaussians.version, gaussians.allocations, table.places, parts)
         if wanted != self._filled:
-            self._fill_in(gaussians, size, shown)
-            self._filled = _Filled(wanted.map, wanted.classes, wanted.parts, size, self._memory.allocations)
+            self._fill_in(gaussians, shown)
+            self._filled, self._sizes = wanted, set()
+        if size not in self._sizes:
+            room = learner.library.functions.ggslam_cuda_identity_bytes(ctypes.byref(self._job), *size)
+            self._job.workspace = self._memory.block("lesson", room).data_ptr()
+            self._sizes.add(size)
 
-    def _fill_in(self, gaussians: GaussianMap, size: tuple[int, int], shown: torch.Tensor | None) -> None:
+    def _fill_in(self, gaussians: GaussianMap, shown: torch.Tensor | None) -> None:
         job, learner, s = self._job, self._learner, self._learner.settings
         table, near, count = learner.table, learner.settings.neighbours, len(gaussians)
-        job.means, job.gaussians = gaussians.means.data_ptr(), count
+        storage = gaussians.storage
+        job.means, job.gaussians = storage["means"].data_ptr(), count
         job.adam = feature_step(gaussians, FeatureAdamSettings(rate=0.0))
-        job.vote_ids, job.vote_weights = gaussians.vote_ids.data_ptr(), gaussians.vote_weights.data_ptr()
+        job.vote_ids, job.vote_weights = storage["vote_ids"].data_ptr(), storage["vote_weights"].data_ptr()
         job.alias, job.class_of = learner.device_alias.data_ptr(), table.class_of.data_ptr()
         job.whole_of = None if shown is None else learner.device_whole_of.data_ptr()
         job.shown = None if shown is None else shown.data_ptr()
@@ -201,7 +193,4 @@ class CudaLessons:
         job.neighbours = min(near.neighbours, count - 1) if pulls else 0
         job.samples = learner.sample_count(job.neighbours) if pulls else 0
         job.pull_weight = near.weight * near.value / max(1, table.count)
-        room = learner.library.functions.ggslam_cuda_identity_bytes(ctypes.byref(job), *size)
-        workspace = self._memory.block("lesson", room)
-        job.workspace = workspace.data_ptr()
-        self._named = (shown, workspace, rows, first, second)
+        self._named = (shown, rows, first, second)

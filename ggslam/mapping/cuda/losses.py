@@ -16,7 +16,7 @@ import torch
 
 from ggslam.abi.cuda import ImageLossJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
-from ggslam.cuda.memory import GrowingMemory
+from ggslam.cuda.memory import ByKind, GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.mapping.keyframe_exposures import KeyframeExposureTuning
 from ggslam.mapping.losses import LOSS_WEIGHTS, LossGradients, LossTarget, LossValues, RenderedImages
@@ -71,7 +71,8 @@ class CudaImageLoss:
         self._leaves_saturated = leaves_saturated
         self.memory = GrowingMemory(self.device)
         self._results = torch.empty(_VALUES + 6, dtype=torch.float64, device=self.device)
-        self._gradients = self._new_gradients(0, 0)
+        self._images = ByKind(self._new_gradients)
+        self._gradients = self._images.of((0, 0))
 
     def evaluate(
         self, rendered: RenderedImages, target: LossTarget[torch.Tensor], settings: LossSettings
@@ -116,15 +117,15 @@ class CudaImageLoss:
             job.saturated_from = 255 * ExposureTuning.bright
         for name in LOSS_WEIGHTS:
             setattr(job, name, getattr(settings, name))
-        if self._gradients[1].shape != (height, width):
-            self._gradients = self._new_gradients(height, width)
+        self._gradients = self._images.of((height, width))
         job.d_image, job.d_depth, job.d_alpha = (gradient.data_ptr() for gradient in self._gradients)
         job.results = self._results.data_ptr()
         size_of_block = self.library.functions.ggslam_cuda_image_loss_bytes(ctypes.byref(job))
         job.workspace = self.memory.block("loss", size_of_block).data_ptr()
         return job
 
-    def _new_gradients(self, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def _new_gradients(self, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        height, width = size
         image = torch.empty(3, height, width, device=self.device)
         return image, torch.empty(height, width, device=self.device), torch.empty(height, width, device=self.device)
 

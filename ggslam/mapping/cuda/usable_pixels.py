@@ -34,6 +34,8 @@ class UsablePixels:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._kept: OrderedDict[Hashable, tuple[_Sources, torch.Tensor | None]] = OrderedDict()
+        self.kept_since = object()
+        """Another object as soon as a mask is dropped: who holds masks longer would keep them all in memory."""
 
     def valid(
         self, keyframe: Keyframe, sources: _Sources, make: Callable[[], np.ndarray | None],
@@ -69,4 +71,5 @@ class UsablePixels:
         self._kept[key] = found  # the one used last stands last
         if len(self._kept) > UsablePixelTuning.kept:
             self._kept.popitem(last=False)
+            self.kept_since = object()
         return found[1]

@@ -13,6 +13,7 @@ from ggslam.abi.cuda import AdamStep
 from ggslam.errors import RenderError
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cuda.finished import MapState
+from ggslam.rendering.types import PARAMETERS
 from ggslam.scene.gaussian_map import GaussianMap
 
 
@@ -34,8 +35,8 @@ class AdamSteps:
             raise RenderError("backward_step: the map was made without moments")
         state = MapState.of(gaussians)
         if state != self._map:
-            if gaussians.updates.device != device:
-                found = gaussians.updates.device
+            found = gaussians.storage["updates"].device
+            if found != device:
                 raise RenderError(f"backward_step: expected a map on {device}, found one on {found}")
             self._point_to(gaussians)
             self._map = state
@@ -45,10 +46,16 @@ class AdamSteps:
         return self._step
 
     def _point_to(self, gaussians: GaussianMap) -> None:
-        self._step.updates = address(gaussians.updates)
-        for name, (first, second) in gaussians.moments.items():
-            arrays = AdamArrays(address(getattr(gaussians, name)), address(first), address(second))
-            setattr(self._step, name, arrays)
+        self._step.updates = address(gaussians.storage["updates"])
+        for name in PARAMETERS:
+            setattr(self._step, name, adam_arrays(gaussians, name))
+
+
+def adam_arrays(gaussians: GaussianMap, name: str) -> AdamArrays:
+    """A parameter of a map with moments, and these."""
+    storage = gaussians.storage
+    first, second = storage[f"{name}.first"], storage[f"{name}.second"]
+    return AdamArrays(storage[name].data_ptr(), first.data_ptr(), second.data_ptr())
 
 
 def _set_numbers(step: AdamStep, optimizer: AdamSettings) -> None:

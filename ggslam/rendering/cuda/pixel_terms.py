@@ -15,11 +15,11 @@ from typing import Final
 import torch
 
 from ggslam.abi.arrays import address
-from ggslam.abi.core import AdamArrays
 from ggslam.abi.cuda import AdamStep, PixelTerms, Rendering, TermsByGaussian
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
 from ggslam.rendering.adam import ADAM_GROUPS
+from ggslam.rendering.cuda.adam import adam_arrays
 from ggslam.rendering.pixel_terms import MAX_CHANNELS, FeatureAdamSettings
 from ggslam.scene.gaussian_map import VOTE_SLOTS, GaussianMap
 
@@ -81,8 +81,12 @@ class CudaPixelTerms:
                 f"pixels: expected a contiguous torch.int32 [P], found {pixels.dtype} {list(pixels.shape)}"
             )
         terms = CudaPixelTerms.empty(len(pixels), capacity, library, pixels.device)
-        terms._call("collect", rendering, address(pixels), min_weight)
+        terms.collect(rendering, pixels, min_weight)
         return terms
+
+    def collect(self, rendering: Rendering, pixels: torch.Tensor, min_weight: float) -> None:
+        """In terms that are `empty`, or those of other renderings, writes those of a rendering; see `of_rendering`."""
+        self._call("collect", rendering, address(pixels), min_weight)
 
     def append(self, other: CudaPixelTerms) -> CudaPixelTerms:
         """These pixels followed by those of `other`, which must have the same capacity."""
@@ -128,8 +132,12 @@ class CudaPixelTerms:
         self._check("gaussian_labels", gaussian_labels, torch.int32, (len(gaussian_labels),))
         ids = torch.empty(len(self), dtype=torch.int32, device=self.device)
         shares = torch.empty(len(self), dtype=torch.float32, device=self.device)
-        self._call("label", address(gaussian_labels), len(gaussian_labels), address(ids), address(shares))
+        self.label(gaussian_labels, ids, shares)
         return ids, shares
+
+    def label(self, gaussian_labels: torch.Tensor, ids: torch.Tensor, shares: torch.Tensor) -> None:
+        """As `labels`, to memory of the caller's."""
+        self._call("label", address(gaussian_labels), len(gaussian_labels), address(ids), address(shares))
 
     # --- at the Gaussians --------------------------------------------------------------------------------------------
 
@@ -146,7 +154,7 @@ class CudaPixelTerms:
         """
         channels = self._checked_channels(gaussians)
         self._check("gradient", gradient, torch.float32, (len(self), channels))
-        if not gaussians.moments:
+        if not gaussians.with_moments:
             raise RenderError("step: the map was made without moments")
         adam = feature_step(gaussians, optimizer)
         self._call("step", self._by_gaussian(len(gaussians)), address(gradient), channels, adam)
@@ -233,10 +241,9 @@ def feature_step(gaussians: GaussianMap, optimizer: FeatureAdamSettings) -> Adam
     def logarithm(factor: float) -> float:
         return math.log(factor) if factor > 0 else -math.inf
 
-    first, second = gaussians.moments["features"]
     step = AdamStep(
-        features=AdamArrays(address(gaussians.features), address(first), address(second)),
-        updates=address(gaussians.feature_updates), decayed_groups=0, log_decay=0.0, decay_floor=1.0,
+        features=adam_arrays(gaussians, "features"),
+        updates=address(gaussians.storage["feature_updates"]), decayed_groups=0, log_decay=0.0, decay_floor=1.0,
         beta1=optimizer.beta1, beta2=optimizer.beta2, log_beta1=logarithm(optimizer.beta1),
         log_beta2=logarithm(optimizer.beta2), epsilon=optimizer.epsilon,
     )  # fmt: skip

@@ -23,7 +23,7 @@ from ggslam.abi import core as structures
 from ggslam.abi.arrays import address
 from ggslam.abi.cuda import AdamStep, Rendering, Sizes
 from ggslam.cuda.library import CudaLibrary, library_and_device
-from ggslam.cuda.memory import GrowingMemory
+from ggslam.cuda.memory import ByKind, GrowingMemory
 from ggslam.errors import RenderError
 from ggslam.rendering.adam import AdamSettings
 from ggslam.rendering.arguments import (
@@ -128,7 +128,7 @@ class CudaRasterizer:
         self._adam_steps = AdamSteps()
         self._planned: tuple[object, Sizes, int, int] = (None, Sizes(), 0, 0)
         self.memory = GrowingMemory(self.device)
-        self._images: dict[str, torch.Tensor] = {}
+        self._images: ByKind[tuple[int, int], dict[str, torch.Tensor]] = ByKind(lambda size: {})
         self._last: FinishedRendering | None = None
 
     # --- forward -------------------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ class CudaRasterizer:
         """
         self._last = None
         self._last = self.render(
-            gaussians, camera, T_camera_world, self.memory, self._images,
+            gaussians, camera, T_camera_world, self.memory, self._images.of((camera.height, camera.width)),
             features=features, median_depth=median_depth, active_sh_degree=active_sh_degree,
         )  # fmt: skip
         return self._last.buffers
@@ -192,7 +192,7 @@ class CudaRasterizer:
         parameters = self._parameters(gaussians)
         arrays, view = gaussian_arrays(parameters, False, None), camera_view(camera, self.near_plane, self.low_pass)
         view.close_below = self.close_below
-        buffers = image_buffers(self._images, camera, 0, False, self.device)
+        buffers = image_buffers(self._images.of((camera.height, camera.width)), camera, 0, False, self.device)
         rendering = self._describe(gaussians, parameters, arrays, view, buffers, None)
         sizes, memory = self._plan(rendering, room), self.memory
         rendering.use("gaussian_workspace", memory.block("gaussians", sizes.gaussian_workspace))

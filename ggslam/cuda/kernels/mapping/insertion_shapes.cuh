@@ -7,6 +7,7 @@
 namespace ggslam::cuda::insertion {
 
 constexpr int kBuildThreads = 128;
+constexpr float kHarmonic0 = 0.28209479177387814f;  // SH_C0 of ggslam/scene/gaussian_map.py
 
 struct Vector {
   float x, y, z;
@@ -128,6 +129,12 @@ __device__ inline void write_mean(const InsertionJob& job, std::int64_t i, const
   job.means[3 * i + 2] = world.z + job.translation[2];
 }
 
+// A channel's value, 0 to 255.
+__device__ inline void write_color(const InsertionJob& job, std::int64_t i, int channel, float value) {
+  const float color = value / 255.0f;
+  job.colors[job.color_numbers * i + channel] = job.as_harmonics != 0 ? (color - 0.5f) / kHarmonic0 : color;
+}
+
 __device__ inline void build_disc(const InsertionJob& job, std::int64_t i, int x, int y, float stride) {
   const Vector position = measured_position(job, x, y);
   const Disc disc = disc_at(job, x, y, position);
@@ -138,7 +145,7 @@ __device__ inline void build_disc(const InsertionJob& job, std::int64_t i, int x
   const std::uint8_t* color = job.color + 3 * (static_cast<std::int64_t>(y) * job.width + x);
   for (int k = 0; k < 3; ++k) {
     job.log_scales[3 * i + k] = logf(footprint * disc.stretch[k]);
-    job.rgb[3 * i + k] = static_cast<float>(color[k]) / 255.0f;
+    write_color(job, i, k, static_cast<float>(color[k]));
   }
 }
 
@@ -157,7 +164,7 @@ __device__ inline void build_filling(const InsertionJob& job, std::int64_t i, in
   const std::int64_t count = static_cast<std::int64_t>(stride) * stride;
   for (int k = 0; k < 3; ++k) {
     job.log_scales[3 * i + k] = logf(sigma);
-    job.rgb[3 * i + k] = static_cast<float>((2 * sums[k] + count) / (2 * count)) / 255.0f;
+    write_color(job, i, k, static_cast<float>((2 * sums[k] + count) / (2 * count)));
   }
   for (int k = 0; k < 4; ++k) job.quaternions[4 * i + k] = k == 0 ? 1.0f : 0.0f;
 }
@@ -177,7 +184,7 @@ __global__ void __launch_bounds__(kBuildThreads) build_kernel(InsertionJob job, 
     y = static_cast<int>(fill / candidates.fill_wide) * job.fill_stride + job.fill_stride / 2;
     build_filling(job, i, x, y, w.fill_depth[fill]);
   }
-  job.pixels[i] = static_cast<std::int64_t>(y) * job.width + x;
+  job.pixels[i] = y * job.width + x;
 }
 
 }  // namespace ggslam::cuda::insertion

@@ -5,7 +5,7 @@
 #include "common/carver.cuh"
 #include "common/host.cuh"
 #include "abi/cuda/sight.hpp"
-#include "tracking/block_median.cuh"
+#include "common/block_median.cuh"
 
 namespace ggslam::cuda {
 

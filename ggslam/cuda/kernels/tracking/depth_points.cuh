@@ -8,7 +8,7 @@
 #include "common/platform.cuh"
 #include "abi/cuda/tracking.hpp"
 #include "native/formulas/depth_window.hpp"
-#include "tracking/block_median.cuh"
+#include "common/block_median.cuh"
 
 namespace ggslam::cuda {
 

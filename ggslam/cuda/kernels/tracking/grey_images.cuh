@@ -5,7 +5,7 @@
 #pragma once
 #include "common/carver.cuh"
 #include "common/host.cuh"
-#include "tracking/block_median.cuh"
+#include "common/block_median.cuh"
 #include "abi/cuda/tracking.hpp"
 
 namespace ggslam::cuda {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Of the matched points of an alignment: how many they are, and the medians of their squared distances and depths.
 #pragma once
-#include "tracking/block_median.cuh"
+#include "common/block_median.cuh"
 #include "abi/cuda/tracking.hpp"
 
 namespace ggslam::cuda {

@@ -11,8 +11,8 @@ constexpr int kBoundThreads = 256;
 
 struct TrainingDesk {
   TrainingStep step;       // the one that is made
-  float pose[12];          // of its keyframe, as it was when the step began
-  float exposure[6];       // likewise
+  float pose[12];          // that it renders, as it was when the step began
+  float exposure[6];       // of its keyframe, likewise
   std::int64_t totals[2];  // as Totals; the pairs are the most of any step of the call so far
   std::int32_t next;       // of the waiting ones
   TrainingStep waiting[kMostWaitingSteps];
@@ -44,13 +44,22 @@ __global__ void lay_down_steps_kernel(StepBatch batch, TrainingDesk* desk) {
   if (batch.first != 0) desk->totals[0] = desk->totals[1] = 0;
 }
 
+// Number `i` of the first three rows of a frame's T_camera_world, row by row, that hangs on a keyframe.
+__device__ inline float hanging_pose(const double* T_camera_keyframe, const KeyframeState& keyframe, int i) {
+  double sum = 0.0;
+  for (int k = 0; k < 4; ++k) sum += T_camera_keyframe[i / 4 * 4 + k] * keyframe.pose[4 * k + i % 4];
+  return static_cast<float>(sum);
+}
+
 // One warp.
 __global__ void begin_step_kernel(TrainingDesk* desk) {
   const int lane = static_cast<int>(threadIdx.x), number = desk->next;
   const TrainingStep& mine = desk->waiting[number];
   copy_words(desk->step, mine, lane);
   const KeyframeState& state = *mine.keyframe.state;
-  if (lane < 12) desk->pose[lane] = state.pose_copy[lane];
+  if (lane < 12)
+    desk->pose[lane] = mine.T_camera_keyframe == nullptr ? state.pose_copy[lane]
+                                                         : hanging_pose(mine.T_camera_keyframe, state, lane);
   if (lane < 6) desk->exposure[lane] = state.exposure_copy[lane];
   __syncwarp();  // all have read which one it is
   if (lane == 0) desk->next = number + 1;
