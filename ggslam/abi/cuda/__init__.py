@@ -9,7 +9,9 @@ from typing import Any
 from ggslam.abi.core import DECLARED as CORE
 from ggslam.abi.headers import Declarations
 
-HEADERS = ("common", "mapping", "rendering", "sampled_identity", "sight", "edges_planes", "tracking", "training", "volumes")
+HEADERS = (
+    "common", "mapping", "rendering", "sampled_identity", "sight", "edges_planes", "tracking", "training", "volumes",
+)  # fmt: skip
 DECLARED = Declarations(Path(__file__).parent, HEADERS, CORE.structures)
 globals().update(DECLARED.names)
 

@@ -17,7 +17,8 @@ struct FeatureState {
   double current[kFeatureSums];  // at `pose`
   double next[kFeatureSums];     // at the candidate
   double damping, step[6];
-  std::int32_t rows, matchings, steps, steps_here, settled, goes_on;
+  std::int32_t rows, matchings, steps, steps_here, settled;
+  std::int32_t goes_on, matches_again;  // another step, another matching follows
 };
 
 // Sums over the block in double, thread by thread, warp by warp. Starts and ends with a barrier.
@@ -121,7 +122,7 @@ __device__ inline void match_and_step(const FeatureAlignJob& job, const AlignedC
   }
   if (threadIdx.x == 0) {
     s.settled = rows >= job.limits.min_matches && is_settled(job, s);
-    s.goes_on = rows >= job.limits.min_matches && !s.settled && s.matchings < job.limits.outer_iterations;
+    s.matches_again = rows >= job.limits.min_matches && !s.settled && s.matchings < job.limits.outer_iterations;
   }
   __syncthreads();
 }
@@ -174,7 +175,7 @@ __global__ void __launch_bounds__(kFeatureThreads) align_features_kernel(Feature
   }
   __syncthreads();
   do match_and_step(job, counts, state, room, count_room);
-  while (state.goes_on);
+  while (state.matches_again);
   FloatPose pose;
   set_float_pose(state.pose.r, state.pose.t, pose);
   float values[kFeatureReportSums] = {};
