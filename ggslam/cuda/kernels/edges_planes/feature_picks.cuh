@@ -139,12 +139,12 @@ __device__ inline void write_feature(const FeatureScanJob& job, const PickGroup&
 #pragma unroll
     for (int a = 0; a < 3; ++a) out.planes[3 * n + a] = patch.point[a], out.normals[3 * n + a] = patch.normal[a];
     out.discs[n] = patch.z * s.disc_per_depth;
-    out.plane_sigmas[n] = depth_sigma(s, patch.z);
+    out.plane_sigmas[n] = feature_sigma(s, patch.z);
     return;
   }
   const float z = depth_of(job)[static_cast<std::int64_t>(at.v) * s.width + at.u];
   out.edges[3 * n] = ray_x(s, at.u) * z, out.edges[3 * n + 1] = ray_y(s, at.v) * z, out.edges[3 * n + 2] = z;
-  out.edge_sigmas[n] = depth_sigma(s, z);
+  out.edge_sigmas[n] = feature_sigma(s, z);
 }
 
 // Writes the features of each segment behind those of the segments before it.

@@ -51,7 +51,7 @@ __device__ inline bool fit_patch(const FeatureScanJob& job, PixelPlace at, Plane
   const float a = fit.per_column * s.fx, b = fit.per_row * s.fy, c = fit.middle - a * x - b * y;
   const float length = sqrtf(a * a + b * b + c * c);  // the plane's normal over its distance
   const float cosine = fit.middle / (length * sqrtf(x * x + y * y + 1.0f));
-  const float limit = s.plane_sigmas * depth_sigma(s, z) + s.roughness * z;
+  const float limit = s.plane_sigmas * feature_sigma(s, z) + s.roughness * z;
   patch.z = z;
   patch.point[0] = x * z, patch.point[1] = y * z, patch.point[2] = z;
   patch.normal[0] = a / -length, patch.normal[1] = b / -length, patch.normal[2] = c / -length;

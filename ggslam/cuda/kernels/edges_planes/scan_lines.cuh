@@ -34,9 +34,12 @@ __device__ inline const float* depth_of(const FeatureScanJob& job) {
 __device__ inline float ray_x(const FeatureSettings& s, int u) { return (static_cast<float>(u) - s.cx) / s.fx; }
 __device__ inline float ray_y(const FeatureSettings& s, int v) { return (static_cast<float>(v) - s.cy) / s.fy; }
 
-// Standard deviation of a depth.
+// Standard deviation of a depth on a line, and the same of a feature's: the order of products differs as on the CPU.
 __device__ inline float depth_sigma(const FeatureSettings& s, float z) {
   return __fadd_rn(__fmul_rn(__fmul_rn(z, z), s.noise_square), s.noise_constant);
+}
+__device__ inline float feature_sigma(const FeatureSettings& s, float z) {
+  return __fadd_rn(__fmul_rn(__fmul_rn(s.noise_square, z), z), s.noise_constant);
 }
 
 // A place and its neighbours: depths, 0 where there is none, and viewing rays, of which one coordinate is the same for
