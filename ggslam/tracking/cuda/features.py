@@ -59,7 +59,9 @@ class CudaFeatures:
         self._blocks = BlockPool(self.device)
         self._memory = GrowingMemory(self.device)
         job.scan.most_planes, job.scan.most_edges = settings.align.planes, settings.align.edges
-        self._arrays, job.add.table = _make_table(settings.map, self.device)
+        self.table, job.add.table = _make_table(settings.map, self.device)
+        """Keys, weights, surfaces and scatters of the voxels, as of `FeatureMap`; what was added last is in it after the
+        next alignment, or `flush`."""
         job.align.table, job.align.limits = job.add.table, _limits(settings.align, settings.map)
         results = (FeatureResult.FEATURE_RESULTS,)
         self._results = torch.zeros(results, dtype=torch.float64, device=self.device)
@@ -114,16 +116,13 @@ class CudaFeatures:
 
     def clear(self) -> None:
         """See `FeatureEngine`."""
-        self._added, self._job.clears = None, True
+        self._added, self._job.adds, self._job.clears = None, False, True
 
     def add(self, scan: CudaScan, T_map_sensor: np.ndarray) -> None:
         """See `FeatureEngine`; the next call does it."""
-        job = self._job
         if self._added is not None:
-            job.add.stream = self.library.stream(self.device)
-            self._start(self._added)
-            self.library.call("feature_update", self._reference)
-            self._note_updated()
+            self.flush()
+        job = self._job
         job.add.scan, room = scan.arrays(), sum(scan.rooms)
         job.add.pose[:9], job.add.pose[9:] = T_map_sensor[:3, :3].ravel().tolist(), T_map_sensor[:3, 3].tolist()
         if job.add.room < room:
@@ -149,6 +148,20 @@ class CudaFeatures:
         scan.note_extracted()
         self._note_updated()
         return self._taken(scan, self._found.copy())
+
+    def flush(self) -> None:
+        """Starts what the next alignment would do first: clearing the map, adding the last scan."""
+        if self._added is not None:
+            self._start(self._added)
+        self._job.add.stream = self.library.stream(self.device)
+        self.library.call("feature_update", self._reference)
+        self._note_updated()
+
+    def world_pose(self) -> np.ndarray:
+        """The pose [4, 4] that the last alignment found, in the world, as it is on the device."""
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self._found[:9].reshape(3, 3), self._found[9:12]
+        return T
 
     def depth_address(self, depth: np.ndarray) -> int | None:
         """Where a frame's depth is on the device, if this very array was sent last."""
