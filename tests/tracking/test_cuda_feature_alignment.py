@@ -87,15 +87,17 @@ def test_a_motion_is_followed_as_on_the_cpu(cuda_library: CudaLibrary) -> None:
 
 def test_a_recording_is_followed_as_on_the_cpu(cuda_library: CudaLibrary, frames: list[Frame]) -> None:
     noise = DepthNoise()
-    sides = Sides.of(cuda_library, camera=frames[0].camera)
-    for i, frame in enumerate(frames):
+    sides, T = Sides.of(cuda_library, camera=frames[0].camera), None
+    for frame in frames:
         assert frame.T_world_camera is not None
         scans = sides.scans(frame.depth, noise)
-        if i:
+        if T is None:
+            T = frame.T_world_camera
+        else:
             found, expected = sides.align(scans, T)
             check_aligned(found, expected)
             assert apart(frame.T_world_camera, found.T_map_sensor)[0] < 0.02
-        T = frame.T_world_camera if i == 0 else expected.T_map_sensor
+            T = expected.T_map_sensor
         sides.add(scans, T)
     check_tables(sides, 400)
 
@@ -110,7 +112,8 @@ def test_exact_depth_gives_the_exact_pose(cuda_library: CudaLibrary) -> None:
 
 
 @pytest.mark.parametrize("change", [
-    {"edge_weight": 0.0}, {"edge_weight": 5.0}, {"planes": 100, "edges": 30}, {"outer_iterations": 6, "rematch_share": 0.0},
+    {"edge_weight": 0.0}, {"edge_weight": 5.0}, {"planes": 100, "edges": 30},
+    {"outer_iterations": 6, "rematch_share": 0.0},
     {"inner_iterations": 1}, {"inner_iterations": 5, "translation_tolerance": 0.0}, {"huber_sigmas": 0.3},
     {"gate_constant": 0.001, "gate_sigmas": 1.0}, {"overlap_sigmas": 0.1, "overlap_constant": 0.0},
     {"degenerate_below": 0.2}, {"min_matches": 5000},

@@ -60,8 +60,8 @@ class CudaFeatures:
         self._memory = GrowingMemory(self.device)
         job.scan.most_planes, job.scan.most_edges = settings.align.planes, settings.align.edges
         self.table, job.add.table = _make_table(settings.map, self.device)
-        """Keys, weights, surfaces and scatters of the voxels, as of `FeatureMap`; what was added last is in it after the
-        next alignment, or `flush`."""
+        """Keys, weights, surfaces and scatters of the voxels, as of `FeatureMap`; the last scan is in it after the next
+        alignment, or `flush`."""
         job.align.table, job.align.limits = job.add.table, _limits(settings.align, settings.map)
         results = (FeatureResult.FEATURE_RESULTS,)
         self._results = torch.zeros(results, dtype=torch.float64, device=self.device)
