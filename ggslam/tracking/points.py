@@ -107,15 +107,12 @@ class DeferredPoints:
         extract: gives them.
         median_depth: estimate of their median depth, metres, that needs no extraction.
         source: what they are extracted from; None: that is here.
-        elsewhere: they are extracted on a device, and have to be fetched.
     """
 
     def __init__(
-        self, extract: Callable[[], PointSource], median_depth: float, source: PointSource | None = None,
-        elsewhere: bool = False,
-    ) -> None:  # fmt: skip
-        self._extract, self._source, self._elsewhere = extract, source, elsewhere
-        self._extracted: PointSource | None = None
+        self, extract: Callable[[], FramePoints], median_depth: float, source: PointSource | None = None
+    ) -> None:
+        self._extract, self._source = extract, source
         self._points: FramePoints | None = None
         self.median_depth = median_depth
         """Metres, an estimate."""
@@ -130,23 +127,16 @@ class DeferredPoints:
     def read(self) -> FramePoints:
         """The points, extracted by the first call."""
         if self._points is None:
-            self._points = self._start().read()
+            self._points = self._extract()
         return self._points
 
     def send(self) -> None:
         """See `PointSource`."""
         if self._source is not None:
             self._source.send()
-        if self._elsewhere:
-            self._start().send()
 
     def expect_look(self) -> None:
         """Nothing: no alignment tells of them."""
-
-    def _start(self) -> PointSource:
-        if self._extracted is None:
-            self._extracted = self._extract()
-        return self._extracted
 
 
 def grid_stride(pixels: int, count: int) -> int:

@@ -70,7 +70,6 @@ class CudaTrackingEngine:
         self._ring = FetchRing(self.device)
         self._pending: weakref.ref[CudaPoints] | None = None
         self._grid = (-1, -1)  # that there is memory for
-        self._sent: np.ndarray | None = None
         self._workspace = torch.zeros(0, dtype=torch.uint8, device=self.device)
         self._largest = (0, 0)  # room and textured points that the workspace is known to have room for
         self._settings_of: tuple[AlignSettings, DepthNoise, PhotometricSettings | None] | None = None
@@ -97,9 +96,7 @@ class CudaTrackingEngine:
         Raises:
             ValueError: `depth` has another shape than the camera.
         """
-        if depth is not self._sent or not self._depth.holds(depth):
-            self.send_depth(depth)
-        self._sent = None
+        self.send_depth(depth)
         stride = grid_stride(int(np.count_nonzero(self._depth.staged > 0)), settings.count)
         arguments = native_points_settings(self.camera, settings, noise, stride, depth)
         border = arguments.window * arguments.window_step
@@ -118,7 +115,7 @@ class CudaTrackingEngine:
         return found
 
     def send_depth(self, depth: np.ndarray) -> None:
-        """Sends a frame's depth image ahead of what is made of it; `points` of it need not send it again.
+        """Sends a frame's depth image ahead of what is made of it.
 
         Args:
             depth: float32 [H, W], metres, 0 where unknown.
@@ -131,7 +128,6 @@ class CudaTrackingEngine:
         if before is not None:
             self._extract(before)
         self._depth.send(depth)
-        self._sent = depth
 
     @property
     def depth_on_device(self) -> int:

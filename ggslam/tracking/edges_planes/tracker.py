@@ -24,7 +24,7 @@ from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.motion import CameraMotion
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.observability import about_point
-from ggslam.tracking.points import DeferredPoints, PointSource
+from ggslam.tracking.points import DeferredPoints, FramePoints, PointSource, extract_points
 from ggslam.tracking.settings import DepthNoise, TrackerSettings
 from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
 
@@ -150,11 +150,12 @@ class FeatureTracker(Tracker):
         self.local_map.add(self._extractor.extract(view.depth, self.noise or DepthNoise()), T_world_camera)
 
     def _points(self, frame: Frame, scan: Scan) -> DeferredPoints:
-        """The frame's points, for who reads them."""
-        return DeferredPoints(
-            lambda: self._gicp.engine.points(frame.depth, self.settings.points, self.noise or DepthNoise()),
-            scan.median_depth, elsewhere=self._device_engine is not None,
-        )  # fmt: skip
+        """The frame's points, for who reads them: by the compiled core, as that may be another thread than the one that
+        a device serves."""
+        return DeferredPoints(lambda: self._extract_points(frame), scan.median_depth)
+
+    def _extract_points(self, frame: Frame) -> FramePoints:
+        return extract_points(frame.depth, self.camera, self.settings.points, self.noise or DepthNoise(), self.context)
 
     def _start_in_target(self, frame: Frame, scan: Scan) -> TrackingResult:
         """Nothing of its own to hold on to, but a map that someone else made: see `start_lost`."""
