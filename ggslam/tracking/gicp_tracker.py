@@ -62,9 +62,9 @@ class GicpTracker(Tracker):
         self._median_depth = None
 
     @classmethod
-    def with_state(cls, state: TrackerState) -> GicpTracker:
-        """A tracker that works with the state of another."""
-        tracker = cls(state.camera, state.settings, state.context)
+    def with_state(cls, state: TrackerState, engine: TrackingEngine | None = None) -> GicpTracker:
+        """A tracker that works with the state of another; `engine` as of the constructor."""
+        tracker = cls(state.camera, state.settings, state.context, engine=engine)
         tracker.state = state
         return tracker
 

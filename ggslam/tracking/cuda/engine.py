@@ -96,11 +96,7 @@ class CudaTrackingEngine:
         Raises:
             ValueError: `depth` has another shape than the camera.
         """
-        check_depth(depth, self.camera)
-        before = None if self._pending is None else self._pending()
-        if before is not None:
-            self._extract(before)
-        self._depth.send(depth)
+        self.send_depth(depth)
         stride = grid_stride(int(np.count_nonzero(self._depth.staged > 0)), settings.count)
         arguments = native_points_settings(self.camera, settings, noise, stride, depth)
         border = arguments.window * arguments.window_step
@@ -117,6 +113,26 @@ class CudaTrackingEngine:
             self._grid = columns, rows
         self._pending = weakref.ref(found)
         return found
+
+    def send_depth(self, depth: np.ndarray) -> None:
+        """Sends a frame's depth image ahead of what is made of it.
+
+        Args:
+            depth: float32 [H, W], metres, 0 where unknown.
+
+        Raises:
+            ValueError: `depth` has another shape than the camera.
+        """
+        check_depth(depth, self.camera)
+        before = None if self._pending is None else self._pending()
+        if before is not None:
+            self._extract(before)
+        self._depth.send(depth)
+
+    @property
+    def depth_on_device(self) -> int:
+        """Where depth images are on the device."""
+        return self._depth.address
 
     def align(
         self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,

@@ -21,6 +21,11 @@ _TOTAL = AlignResult.SPREAD_TOTAL
 _CENTROID = slice(AlignResult.CENTROID, AlignResult.RADIUS)
 
 
+def symmetric6(triangle: np.ndarray) -> np.ndarray:
+    """The symmetric matrix [6, 6] whose upper triangle the first 21 numbers are, row by row."""
+    return triangle[_PLACES]
+
+
 class CudaMatches:
     """Matches of points that stay on the device until they are read.
 
@@ -62,7 +67,7 @@ def cuda_alignment(
     """
     T = _STILL.copy()
     T[:3, :3], T[:3, 3] = found[:9].reshape(3, 3), found[9:12]
-    information = found[AlignResult.INFORMATION :][_PLACES]
+    information = symmetric6(found[AlignResult.INFORMATION :])
     value = found.tolist()
     spread = PointSpread(value[_TOTAL], found[_CENTROID], value[AlignResult.RADIUS])
     usable = value[AlignResult.USABLE] != 0
