@@ -13,7 +13,7 @@ import torch
 from device_watch import DeviceWatch
 
 from ggslam.abi.core import Voxel, VoxelMoments
-from ggslam.abi.cuda import TrackJob, VoxelLevel
+from ggslam.abi.cuda import TrackJob
 from ggslam.cuda.library import CudaLibrary
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera

@@ -4,7 +4,7 @@
 #pragma once
 #include "common/carver.cuh"
 #include "edges_planes/plane_patches.cuh"
-#include "tracking/block_median.cuh"
+#include "common/block_median.cuh"
 
 namespace ggslam::cuda {
 
