@@ -34,8 +34,9 @@ class Marker:
 
     def wait_if_ahead(self) -> None:
         """As `wait`, for a place that the device has mostly passed long ago."""
-        if not self.is_passed():
-            self.wait()
+        event = self._event
+        if event is not None and not event.query():
+            event.synchronize()
 
 
 def _allocate_page_locked(size: int, device: torch.device) -> torch.Tensor:
@@ -163,7 +164,8 @@ class HostMirror:
     def send(self) -> None:
         """Starts a copy on the current stream, unless one is still under way."""
         with self._lock:
-            self._take()
+            if self._under_way:
+                self._take()
             if self._under_way:
                 return
             self._arriving.copy_(self._source, non_blocking=True)
@@ -173,10 +175,11 @@ class HostMirror:
     def newest(self) -> np.ndarray:
         """The numbers of the last copy that has arrived; zeros before the first."""
         with self._lock:
-            self._take()
+            if self._under_way:
+                self._take()
             return self._newest
 
     def _take(self) -> None:
-        if self._under_way and self._sent.is_passed():
+        if self._sent.is_passed():
             self._newest = self._arriving_numbers.copy()
             self._under_way = False

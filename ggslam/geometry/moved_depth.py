@@ -4,29 +4,40 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse
 
+_WHERE_IT_WAS = np.eye(4)
+
 
 def largest_shift(T_new_old: np.ndarray, camera: Camera, depth_m: float) -> float:
     """About how many pixels what is seen at a depth (metres) shifts in the image when the camera makes a motion
     [4, 4]."""
-    corners, rays = _corners(camera)
-    moved = depth_m * rays @ T_new_old[:3, :3].T + T_new_old[:3, 3]
-    seen = moved[:, :2] / np.maximum(moved[:, 2:], 1e-6) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    apart = seen - corners
-    return math.sqrt(np.add.reduce(apart * apart, axis=1).max())
+    return shift_between(_WHERE_IT_WAS, T_new_old, camera, depth_m)
 
 
-@lru_cache(maxsize=8)
-def _corners(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels at an image's corners [4, 2] and their rays [4, 3]."""
-    corners = np.array([[u, v] for u in (0, camera.width - 1) for v in (0, camera.height - 1)], float)
-    return corners, np.column_stack([(corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(4)])
+def shift_between(T_world_new: np.ndarray, T_world_old: np.ndarray, camera: Camera, depth_m: float) -> float:
+    """The same when it moves from one pose [4, 4] to another."""
+    back = T_world_new[:3, :3].T
+    # Numbers: arrays of four corners cost several times as much.
+    (a, b, c), (d, e, f), (g, h, i) = (back @ T_world_old[:3, :3]).tolist()
+    tx, ty, tz = (back @ (T_world_old[:3, 3] - T_world_new[:3, 3])).tolist()
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    largest, z = 0.0, depth_m
+    for u in (0, camera.width - 1):
+        x = (u - cx) / fx * z
+        for v in (0, camera.height - 1):
+            y = (v - cy) / fy * z
+            ahead = g * x + h * y + i * z + tz
+            if ahead < 1e-6:
+                ahead = 1e-6
+            off_u = (a * x + b * y + c * z + tx) / ahead * fx + cx - u
+            off_v = (d * x + e * y + f * z + ty) / ahead * fy + cy - v
+            largest = max(off_u * off_u + off_v * off_v, largest)  # NaN stays
+    return math.sqrt(largest)
 
 
 def moved_depth(depth: np.ndarray, camera: Camera, T_new_old: np.ndarray) -> np.ndarray:

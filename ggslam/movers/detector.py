@@ -14,7 +14,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
-from ggslam.geometry.moved_depth import largest_shift
+from ggslam.geometry.moved_depth import shift_between
 from ggslam.movers.evidence import EvidenceRequest, EvidenceSource, HostEvidence
 from ggslam.movers.segments import Gathering, gather, grow_places
 from ggslam.movers.settings import MoverSettings
@@ -22,10 +22,10 @@ from ggslam.movers.trail import Trail
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse
 from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView, thin_out
 from ggslam.system.array_forms import Form, Mask
+from ggslam.system.medians import median
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 
@@ -44,7 +44,7 @@ class DetectorTuning(Tuning):
     """Fewest rows and columns of the reduced images."""
 
 
-@savable(not_saved="settings source")
+@savable(not_saved="settings source _asked")
 @dataclass
 class MoverDetector:
     """Detects movers in located frames. It gets each frame once, in order.
@@ -72,6 +72,8 @@ class MoverDetector:
     segments: frozenset[int] = frozenset()
     trail: Trail = field(default_factory=Trail)
     source: EvidenceSource = field(default_factory=HostEvidence)
+    _asked: EvidenceRequest | None = None
+    """What the source was told to prepare of the frame at hand."""
 
     def expect(self, frame: Frame) -> Frame:
         """The frame to locate: without depth where something is expected to move."""
@@ -82,7 +84,8 @@ class MoverDetector:
     def prepare(self, frame: Frame, margin: Margin) -> None:
         """A frame will be located next, and looked at with this margin as far as is known."""
         if self.found is None and self.expected is None:
-            self.source.prepare(self._request(frame, margin))
+            self._asked = self._request(frame, margin)
+            self.source.prepare(self._asked)
 
     def look(
         self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, context: NativeContext,
@@ -102,8 +105,12 @@ class MoverDetector:
         self.mask = self.things = None
         if T_world_camera is None:
             self.views, self.found, self.small, self.expected, self.segments = [], None, None, None, frozenset()
+            self._asked = None
             return
-        s, request = self.settings, self._request(frame, margin)
+        s, request = self.settings, self._asked
+        if request is None or request.depth is not frame.depth or request.margin is not margin:
+            request = self._request(frame, margin)
+        self._asked = None
         view, evidence = self.source.look(request, T_world_camera, self.small, context)
         earlier, self.views = self.views, [*self.views[-DetectorTuning.ages[-1] :], *([] if swift else [view])]
         before, moved, moving = self.found, self.small, self.segments
@@ -150,7 +157,7 @@ class MoverDetector:
 
     def move(self, T_new_old: np.ndarray) -> None:
         """Follows a correction [4, 4] of the world about the camera."""
-        self.views = [view.move(T_new_old) for view in self.views]
+        self.views, self._asked = [view.move(T_new_old) for view in self.views], None
 
 
 def _stays_in_place(view: CoarseView, before: CoarseView, places: np.ndarray) -> bool:
@@ -158,8 +165,7 @@ def _stays_in_place(view: CoarseView, before: CoarseView, places: np.ndarray) ->
     seen = view.depth[places & (view.depth > 0)]
     if not len(seen):
         return False
-    T_new_old = inverse(view.T_world_camera) @ before.T_world_camera
-    shift = largest_shift(T_new_old, view.camera, float(np.median(seen)))
+    shift = shift_between(view.T_world_camera, before.T_world_camera, view.camera, median(seen))
     return shift * 320 <= 2 * DetectorTuning.prediction_margin * view.camera.width
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from ggslam.errors import SequenceError
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
+from ggslam.system.medians import median
 from ggslam.system.tuning import Tuning
 
 
@@ -25,26 +26,22 @@ class FrameCheckTuning(Tuning):
 def wrong_unit(depth: np.ndarray) -> str:
     """What to say of a depth image [H, W] that cannot be in metres; empty if it can. Looks at every eighth pixel and
     row."""
-    median = _median(depth)
-    if median <= FrameCheckTuning.max_median_m:
+    found = _median_depth(depth)
+    if found <= FrameCheckTuning.max_median_m:
         return ""
-    if median <= FrameCheckTuning.max_median_cm:
+    if found <= FrameCheckTuning.max_median_cm:
         return (
-            f"depth looks like millimetres or centimetres (median {median:.0f}), expected metres: divide millimetres "
+            f"depth looks like millimetres or centimetres (median {found:.0f}), expected metres: divide millimetres "
             "by 1000, centimetres by 100"
         )
-    return f"depth looks like millimetres (median {median:.0f}), expected metres: divide it by 1000"
+    return f"depth looks like millimetres (median {found:.0f}), expected metres: divide it by 1000"
 
 
-def _median(depth: np.ndarray) -> float:
+def _median_depth(depth: np.ndarray) -> float:
     """Of the depths that are known, 0 if none is."""
     seen = depth[::8, ::8]
     seen = seen[(seen > 0) & np.isfinite(seen)]
-    if not len(seen):
-        return 0.0
-    seen.sort()
-    half = len(seen) // 2
-    return float(seen[half] if len(seen) % 2 else (seen[half - 1] + seen[half]) / 2)
+    return median(seen) if len(seen) else 0.0
 
 
 def check_frame(frame: Frame, camera: Camera) -> None:
@@ -68,13 +65,16 @@ def check_frame(frame: Frame, camera: Camera) -> None:
         raise SequenceError(f"frame {frame.source_index}: it is of {frame.camera}, expected {camera}")
     if unit := wrong_unit(frame.depth):
         raise SequenceError(f"frame {frame.source_index}: {unit}")
-    if not (frame.depth >= 0).all() or not np.isfinite(frame.depth).all():
+    # Of a NaN among them, the least and the greatest are NaN.
+    if not (np.minimum.reduce(frame.depth, axis=None) >= 0 and np.maximum.reduce(frame.depth, axis=None) < np.inf):
         raise SequenceError(f"frame {frame.source_index}: depth has negative, infinite or NaN values; 0 means none")
     if not math.isfinite(frame.timestamp):
         raise SequenceError(f"frame {frame.source_index}: its time is {frame.timestamp}, expected seconds")
-    T = frame.T_world_camera
-    if T is not None and (np.shape(T) != (4, 4) or not np.isfinite(T).all()):
-        found = "numbers that are not finite" if np.shape(T) == (4, 4) else f"shape {list(np.shape(T))}"
+    if frame.T_world_camera is None:
+        return
+    T = np.asarray(frame.T_world_camera)
+    if T.shape != (4, 4) or not np.logical_and.reduce(np.isfinite(T), axis=None):
+        found = "numbers that are not finite" if T.shape == (4, 4) else f"shape {list(T.shape)}"
         raise SequenceError(
             f"frame {frame.source_index}: T_world_camera has {found}, expected a finite 4x4 matrix or None"
         )

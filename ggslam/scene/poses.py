@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.linalg.lapack import dgesdd, dgetrf
 
 _Row = tuple[float, float, float, float]
 Matrix = tuple[_Row, _Row, _Row, _Row]
@@ -124,13 +125,24 @@ def inverse(T: np.ndarray) -> np.ndarray:
 
 def orthonormalize(T: np.ndarray) -> np.ndarray:
     """The transform with its 3x3 part replaced by the nearest rotation (removes accumulated rounding)."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
+    U, _, Vt, failed = dgesdd(T[:3, :3])  # np.linalg calls the same with twenty functions of Python about it
+    if failed:
+        raise np.linalg.LinAlgError(f"no nearest rotation of {T[:3, :3].tolist()}")
     sign, out = np.zeros((3, 3)), np.zeros((4, 4))
     sign[0, 0] = sign[1, 1] = out[3, 3] = 1.0
-    sign[2, 2] = np.linalg.det(U @ Vt)
+    sign[2, 2] = _determinant(U @ Vt)
     out[:3, :3] = U @ sign @ Vt
     out[:3, 3] = T[:3, 3]
     return out
+
+
+def _determinant(R: np.ndarray) -> float:
+    """Of a rotation [3, 3] or a reflection, to the last digit as `np.linalg.det` has it."""
+    factors, rows, _ = dgetrf(R)
+    a, b, c = factors.diagonal().tolist()
+    first, second, _ = rows.tolist()  # each was swapped with a row, or itself
+    size = math.exp(math.log(abs(a)) + math.log(abs(b)) + math.log(abs(c)))
+    return math.copysign(size, a * b * c) * (1 if (first == 0) == (second == 1) else -1)
 
 
 def fit_similarity(source: np.ndarray, target: np.ndarray, with_scale: bool = False) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ggslam.abi.core import SightMargin
 from ggslam.system.tuning import Tuning
 
 
@@ -65,6 +66,10 @@ class Margin:
     def times(self, factor: float) -> Margin:
         """A margin `factor` times as wide."""
         return replace(self, least=factor * self.least, share=factor * self.share, sigmas=factor * self.sigmas)
+
+    def native(self) -> SightMargin:
+        """As compiled code takes it."""
+        return SightMargin(self.least, self.share, self.sigmas, self.constant, self.square)
 
     def __call__(self, z: np.ndarray, noise_share: np.ndarray | float = 1.0) -> np.ndarray:
         """Metres at depths z [...] in metres; `noise_share` of the noise is left where means of depth are compared."""

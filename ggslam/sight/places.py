@@ -23,7 +23,6 @@ from ggslam.abi.core import (
     OtherPlacesView,
     PlacesEvidenceJob,
     PlacesView,
-    SightMargin,
 )
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
@@ -174,7 +173,7 @@ def compare(
     job = PlacesEvidenceJob(_places(view, alive), ctypes.addressof(asked), len(others))
     if moved is not None:
         job.moved = address(_of_places(moved, np.uint8, view, alive))
-    job.margin = SightMargin(margin.least, margin.share, margin.sigmas, margin.constant, margin.square)
+    job.margin = margin.native()
     t = PlaceTuning
     job.rough, job.least_share, job.nearest = t.rough_sigmas, t.min_noise_share, t.nearest_factor
     job.every, job.fewest = t.stride, t.min_places

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from ggslam.abi.arrays import address
-from ggslam.abi.core import SightCode, SightJob, SightMargin
+from ggslam.abi.core import SightCode, SightJob
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, transform_points
@@ -179,14 +179,14 @@ class View:
         return np.where(other.depth > 0, codes, np.uint8(Sight.OUTSIDE))
 
     def _ask(self, count: int, points: np.ndarray | None = None, depths: np.ndarray | None = None) -> Answers:
-        camera, m = self.camera, self.margin
+        camera = self.camera
         found = Answers(np.empty(count, np.uint8), np.empty(count, np.int32), np.empty(count))
         job = SightJob(
             *map(address, (self.depth, self.near, self.far)), camera.height, camera.width,
             camera.fx, camera.fy, camera.cx, camera.cy,
         )  # fmt: skip
         job.T_camera_world[:] = inverse(self.T_world_camera)[:3].ravel().tolist()
-        job.margin = SightMargin(m.least, m.share, m.sigmas, m.constant, m.square)
+        job.margin = self.margin.native()
         job.points, job.depths, job.count = address(points), address(depths), count
         job.codes, job.pixels, job.z = address(found.codes), address(found.pixels), address(found.z)
         load_library().ggslam_sight(self.context.handle, ctypes.byref(job))

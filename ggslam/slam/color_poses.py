@@ -6,7 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.result import TrackedFrame
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
+from ggslam.system.side_thread import SideThread
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.tracker import TrackerState, TrackingResult, TrackingStatus
 
@@ -60,9 +62,10 @@ class ColorPoseTuning(Tuning):
 
 
 _Coded = Annotated[np.ndarray, Form("u1", None)]
+_Kept = tuple[int, float, _Coded, _Coded]
 
 
-@savable(not_saved="mapper poses state", growing="images")
+@savable(not_saved="mapper poses state coder", growing="images", save="state_to_save")
 @dataclass
 class ColorPoses:
     """Aligns located frames to the map as it is, where that is due, and to the map as it is at the end.
@@ -79,15 +82,17 @@ class ColorPoses:
         held_bytes: what they take.
         active: whether frames may be aligned.
         live: whether another thread trains the map meanwhile, so that frames can be aligned at the end only.
+        coder: codes the image that is kept next, which joins `images` when the next one comes or they are needed.
     """
 
     mapper: Mapper
     poses: FramePoses
     state: TrackerState
-    images: list[tuple[int, float, _Coded, _Coded]] = field(default_factory=list)
+    images: list[_Kept] = field(default_factory=list)
     held_bytes: int = 0
     active: bool = field(init=False)
     live: bool = False
+    coder: SideThread[_Kept] = field(default_factory=lambda: SideThread("images"))
 
     def __post_init__(self) -> None:
         self.active = isinstance(self.mapper, ComparingMapper) and self.mapper.settings.view_alignment.enabled
@@ -114,6 +119,7 @@ class ColorPoses:
         end and there is memory for it."""
         if not self.active or found.still or found.status in (TrackingStatus.LOST, TrackingStatus.FIRST):
             return
+        self._take_coded()
         number, depth = len(self.poses.frames) - 1, found.median_depth_m
         if not self._tells_more(depth) and number >= ColorPoseTuning.undecided_frames:
             return
@@ -121,18 +127,24 @@ class ColorPoses:
             ColorPoseTuning.kept_bytes if self.mapper.residency is None else ColorPoseTuning.kept_bytes_paged
         ):
             return
-        grey, hidden = grey_of(frame.color), _find_hidden(frame.moving, frame.valid)
-        coded = cv2.imencode(
-            ".jpg", np.rint(255 * grey).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, ColorPoseTuning.jpeg_quality]
-        )[1]
-        mask = np.zeros(0, np.uint8) if hidden is None else cv2.imencode(".png", hidden.view(np.uint8))[1]
-        self.images.append((number, depth, coded.reshape(-1), mask.reshape(-1)))
-        self.held_bytes += coded.nbytes + mask.nbytes
+        self.coder.start(partial(_code, number, depth, frame.color, frame.moving, frame.valid))
+
+    def _take_coded(self) -> None:
+        """What `coder` was asked for joins the images."""
+        if self.coder.is_asked:
+            self.images.append(self.coder.take())
+            self.held_bytes += self.images[-1][2].nbytes + self.images[-1][3].nbytes
+
+    def state_to_save(self) -> dict[str, Any]:
+        """What is saved."""
+        self._take_coded()
+        return vars(self)
 
     def align_last(self, report: Callable[[], None] = lambda: None) -> None:
         """Aligns the frames whose images were kept to the map as it is now; `report` is called now and then."""
         if not self.active:
             return
+        self._take_coded()
         aligned, due = {}, [image for image in self.images if self._tells_more(image[1])]
         for numbers in self.mapper.stages() if due else ():
             together = set(numbers)
@@ -255,6 +267,17 @@ class ColorPoses:
             return found
         before, after = (misfit(grey, rendered, depth, alpha, camera, settings, pose) for pose in (np.eye(4), T))
         return found if after < better * before else None
+
+
+def _code(
+    number: int, depth: float, color: np.ndarray, moving: np.ndarray | None, valid: np.ndarray | None
+) -> _Kept:
+    """What is kept of a frame with a median depth, metres: an element of `ColorPoses.images`."""
+    grey, hidden = grey_of(color), _find_hidden(moving, valid)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, ColorPoseTuning.jpeg_quality]
+    coded = cv2.imencode(".jpg", np.rint(255 * grey).astype(np.uint8), quality)[1]
+    mask = np.zeros(0, np.uint8) if hidden is None else cv2.imencode(".png", hidden.view(np.uint8))[1]
+    return number, depth, coded.reshape(-1), mask.reshape(-1)
 
 
 def _find_hidden(moving: np.ndarray | None, valid: np.ndarray | None) -> np.ndarray | None:

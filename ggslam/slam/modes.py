@@ -53,6 +53,10 @@ CAPABILITIES = (
     Capability("a memory limit", {Mode.RIG: _NO, Mode.GPU: _NO}, "memory_limit_mb", lambda c: c.memory_limit_mb > 0),
     Capability("a GPU", {Mode.RIG: _NO, Mode.PAGED: _NO}, "device", lambda c: c.device == "cuda"),
     Capability("tracking by edges and planes", {Mode.RIG: _NO}, "tracker", lambda c: c.tracker != "gicp"),
+    Capability(
+        "a limit of time for edges and planes", {Mode.RIG: _OUT, Mode.GPU: _OUT}, "edges_planes.align.budget_ms",
+        lambda c: c.tracker == "edges_planes" and c.edges_planes.align.budget_ms > 0,
+    ),
     Capability("starting in the map of another run", {Mode.PAGED: _NO}),
     Capability("masking moving things", {Mode.RIG: _OUT}, "movers.enabled", lambda c: c.movers.enabled),
     Capability(

@@ -32,6 +32,7 @@ from ggslam.slam.modes import Mode, refuse
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.cuda.engine import CudaTrackingEngine
+from ggslam.tracking.cuda.features import CudaFeatures
 from ggslam.tracking.edges_planes.tracker import FeatureTracker
 from ggslam.tracking.gicp_tracker import GicpTracker
 from ggslam.tracking.surface import MeasuredSurface
@@ -91,8 +92,7 @@ def make_parts(
     tracker = make_tracker(camera, config, context, library)
     pager = make_pager(camera, config, paging)
     surface = MeasuredSurface(config.tracking.target, context, None if pager is None else pager.archive)
-    # A device makes the voxels' shapes itself; features are tracked on the CPU, which has them made here.
-    surface.finish = library is None or config.tracker != "gicp"
+    surface.finish = library is None  # a device makes the voxels' shapes itself
     surface.prepare = tracker.expect_target
     loops = LoopCloser(camera, config.loops, surface, tracker, context) if config.loops.enabled else None
     mapper = make_mapper(config, masks.active, context, library, compact)
@@ -162,18 +162,21 @@ def make_tracker(camera: Camera, config: Config, context: NativeContext, library
         camera: of all frames.
         config: of the run.
         context: threads of the CPU.
-        library: CUDA kernels to align with; None: on the CPU, where features are tracked in any case.
+        library: CUDA kernels to align with; None: on the CPU.
     """
-    if config.tracker == "edges_planes":
-        return FeatureTracker(camera, config.tracking, config.edges_planes, context)
     engine = None if library is None else CudaTrackingEngine(camera, library.whole_device(None), library)
+    if config.tracker == "edges_planes":
+        features = None if engine is None else CudaFeatures(config.edges_planes, engine)
+        return FeatureTracker(camera, config.tracking, config.edges_planes, context, engine=features)
     return GicpTracker(camera, config.tracking, context, engine=engine)
 
 
 def make_evidence(tracker: Tracker, library: CudaLibrary | None) -> EvidenceSource:
     """What compares frames to find what moves: where the tracker has their depth."""
-    engine = tracker.engine if isinstance(tracker, GicpTracker) else None
-    if library is None or not isinstance(engine, CudaTrackingEngine):
+    engine: object = tracker.engine if isinstance(tracker, GicpTracker) else None
+    if isinstance(tracker, FeatureTracker):
+        engine = tracker.device_engine
+    if library is None or not isinstance(engine, CudaTrackingEngine | CudaFeatures):
         return HostEvidence()
     return CudaEvidence(engine, library, engine.device)
 

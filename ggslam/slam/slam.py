@@ -38,6 +38,8 @@ from ggslam.system.tuning import Tuning
 from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
+LOST = TrackingStatus.LOST.value
+
 
 class TrimTuning(Tuning):
     """How freed memory is returned to the system."""
@@ -96,12 +98,12 @@ class Slam(RunState):
         # 1. Clean the frames: no depth that hangs between two surfaces, was taken at another time than the colour, or
         #    shows what is fixed to the camera.
         with part("tracking"):
-            cleaned = [self.clean(frame) for frame in frames]
+            cleaned = list(map(self.clean, frames))
 
-        # 2. Track: follow what closed loops have corrected, then align the frames' points to the map (G-ICP). A lost
-        #    camera is looked for at all known places, or begins a new part of the map.
-        with part("tracking"), self.schedule.beside_mapping():
-            located = self.track(cleaned)
+            # 2. Track: follow what closed loops have corrected, then align the frames' points to the map (G-ICP). A
+            #    lost camera is looked for at all known places, or begins a new part of the map.
+            with self.schedule.beside_mapping():
+                located = self.track(cleaned)
 
         # 3. Decide whether the frames become keyframes: those that show enough that the map does not, and one every
         #    few frames.
@@ -109,9 +111,10 @@ class Slam(RunState):
         self._note_poses(located, chosen)
 
         # 4. to 7. Map the keyframes and train: `map_keyframe` and `train`, at once or in another thread.
-        new = [*located.early, *((located.frames[k], located.tracked[k]) for k in chosen)]
+        new = [*located.early, *[(located.frames[k], located.tracked[k]) for k in chosen]]
         with part("mapping"):
-            self.schedule.map(self, [NewKeyframe(*one, self.moves_followed) for one in new], len(frames))
+            keyframes = [NewKeyframe(*one, self.moves_followed) for one in new] if new else []
+            self.schedule.map(self, keyframes, len(frames))
 
         self.times.stop()
         seconds = (time.perf_counter() - start) / len(frames)
@@ -195,17 +198,18 @@ class Slam(RunState):
         if not len(self.surface):
             self.use_scale(scene_scale(np.concatenate([frame.depth.reshape(-1) for frame in frames])))
         located = self.locator.locate(frames, self.growing, self.schedule.takes_keyframes)
-        self._set_noise(located.joint.median_depth_m)
-        judged = [
-            self.chains[frame.camera_number].judge(frame, tracking, self.tracker.noise)
-            for frame, tracking in zip(located.frames, located.tracked, strict=True)
-        ]
+        self._set_noise(located.joint)
+        seen, tracked = list[Frame](), list[TrackingResult]()
+        for frame, tracking in zip(located.frames, located.tracked, strict=True):
+            judged = self.chains[frame.camera_number].judge(frame, tracking, self.tracker.state.noise)
+            seen.append(judged[0])
+            tracked.append(judged[1])
         if self.filters.expects_motion():
             self.tracker.expect_motion()
         seconds = time.perf_counter() - start
         self.times.tracking_by_frame += [seconds / len(frames)] * len(frames)
         self.times.tracking += seconds
-        return replace(located, frames=[frame for frame, _ in judged], tracked=[result for _, result in judged])
+        return Located(seen, located.joint, tracked, located.early)
 
     def follow_corrections(self) -> None:
         """Everything that knows a pose of the camera goes along with corrections of the map made since the last frame.
@@ -229,11 +233,12 @@ class Slam(RunState):
         """Fits the parts to the scene once more, where settings that follow it were not restored with a saved state."""
         self.use_scale(self.scale)
 
-    def _set_noise(self, median_depth: float) -> None:
+    def _set_noise(self, tracked: TrackingResult) -> None:
         """The mapper learns what the tracker says of the noise, on the first frame and whenever it says more."""
-        noise = self.tracker.noise
-        if noise is None or noise == self._noise:
+        noise = self.tracker.state.noise
+        if noise is None or noise is self._noise or noise == self._noise:
             return
+        median_depth = tracked.median_depth_m
         if self._noise is not None or not self.mapper.keyframes:  # a map made before keeps what it was trained with
             self.mapper.depth_sigma = noise.sigma(median_depth)
         if median_depth > 0:
@@ -252,8 +257,10 @@ class Slam(RunState):
         candidates = self.locator.keyframe_candidates(located)
         if not candidates:
             return []
-        least = min(located.tracked[k].overlap for k in candidates)
-        return candidates if self.policy.decide(number, replace(located.joint, overlap=least)) else []
+        joint, least = located.joint, min([located.tracked[k].overlap for k in candidates])
+        if least != joint.overlap:
+            joint = replace(joint, overlap=least)
+        return candidates if self.policy.decide(number, joint) else []
 
     def _note_poses(self, located: Located, chosen: list[int]) -> None:
         """Poses are remembered relative to the newest keyframe, so that they move with it."""
@@ -277,11 +284,11 @@ class Slam(RunState):
         """What the step did that has just ended with frame `number` of `frames` and took `seconds`; `steps` remembers
         it."""
         loops_s = 0.0 if self.loops is None else self.loops.seconds
-        frame = self.frames[number]
-        report = self.steps.add(frame, is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count)
-        if frame.status != TrackingStatus.LOST.value:
-            report.T_world_camera = self.poses.as_tracked(frame)
-        return report
+        frame = self.poses.frames[number]
+        pose = None if frame.status == LOST else self.poses.as_tracked(frame)
+        return self.steps.add(
+            frame, pose, is_keyframe, seconds, self.times, loops_s, self.mapper, self.gaussian_count
+        )
 
     # --- the end of a run --------------------------------------------------------------------------------------------
 

@@ -4,15 +4,17 @@
 from __future__ import annotations
 
 import io
+import math
 from array import array
 from dataclasses import fields
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 
 from ggslam.errors import FormatError
-from ggslam.mapping.mapper import LossSums, Mapper, MapperTimes
+from ggslam.mapping.mapper import LossSums, Mapper
 from ggslam.slam.result import SlamTimes, StepReport, TrackedFrame
 from ggslam.system.array_forms import Form
 from ggslam.system.plurals import quantity
@@ -23,6 +25,7 @@ from ggslam.system.untrusted_files import read_untrusted_text
 STEPS_FILE = "steps.csv"
 _PARTS = ("insertion", "forward", "loss", "backward", "identity")
 _LOSSES = tuple(field.name for field in fields(LossSums))
+_PARTS_OF, _LOSSES_OF = attrgetter(*_PARTS), attrgetter(*_LOSSES)
 COLUMNS = (
     "frame", "end_s", "step_ms", "tracking_ms", "loops_ms", *(f"{part}_ms" for part in _PARTS), "iterations",
     "keyframe", "gaussians", "resident_mb", *(f"loss_{name}" for name in _LOSSES),
@@ -55,13 +58,14 @@ class StepLog:
         return len(self._rows) // len(COLUMNS)
 
     def add(
-        self, frame: TrackedFrame, is_keyframe: bool, seconds: float, times: SlamTimes, loops_s: float, mapper: Mapper,
-        gaussians: int,
+        self, frame: TrackedFrame, T_world_camera: np.ndarray | None, is_keyframe: bool, seconds: float,
+        times: SlamTimes, loops_s: float, mapper: Mapper, gaussians: int,
     ) -> StepReport:  # fmt: skip
         """Notes a step that has just ended, and reports it.
 
         Args:
             frame: as tracked.
+            T_world_camera: [4, 4], where it is; None: it was lost.
             is_keyframe: whether it became one.
             seconds: that the step took.
             times: of the run.
@@ -69,19 +73,19 @@ class StepLog:
             mapper: of the run.
             gaussians: of the map.
         """
-        spent = _spent(times, loops_s, mapper.times)
-        losses_so_far = mapper.losses
-        sums, iterations = np.array([getattr(losses_so_far, name) for name in _LOSSES]), mapper.times.iterations
+        spent = np.array([times.tracking, loops_s, *_PARTS_OF(mapper.times)])
+        sums, iterations = np.array(_LOSSES_OF(mapper.losses)), mapper.times.iterations
         count, steps = iterations - self._iterations, mapper.times.steps
         made = steps - self._steps
-        losses = (sums - self._losses) / made if made > 0 else np.full(len(sums), np.nan)
+        losses = ((sums - self._losses) / made).tolist() if made > 0 else [math.nan] * len(_LOSSES)
         self._rows.extend((frame.frame_index, times.wall, 1e3 * seconds))
         self._rows.extend((1e3 * (spent - self._times)).tolist())
         self._rows.extend((count, is_keyframe, gaussians, resident_bytes() / 1e6))
-        self._rows.extend(losses.tolist())
+        self._rows.extend(losses)
         self._times, self._losses, self._iterations = spent, sums, iterations
         self._steps = steps
-        return StepReport(frame, is_keyframe, gaussians, mapper.last_psnr, seconds, float(losses[0]))
+        pose = np.full((4, 4), np.nan) if T_world_camera is None else T_world_camera
+        return StepReport(frame, is_keyframe, gaussians, mapper.last_psnr, seconds, losses[0], pose)
 
     def table(self) -> np.ndarray:
         """All rows, float64 [n, columns]."""
@@ -94,10 +98,6 @@ class StepLog:
         for row in self.table().tolist():
             text.write(",".join(f"{value:.6g}" if value % 1 else str(int(value)) for value in row) + "\n")
         return text.getvalue()
-
-
-def _spent(times: SlamTimes, loops_s: float, parts: MapperTimes) -> np.ndarray:
-    return np.array([times.tracking, loops_s, *(getattr(parts, part) for part in _PARTS)])
 
 
 def read_table(path: Path) -> dict[str, np.ndarray]:

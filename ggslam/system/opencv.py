@@ -3,28 +3,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ContextDecorator
 
 import cv2
 
 from ggslam.errors import GgslamError, MemoryFullError, OpenCvError
 
 
-@contextmanager
-def opencv_errors(place: object, kind: type[GgslamError] = OpenCvError) -> Iterator[None]:
+class opencv_errors(ContextDecorator):
     """Turns `cv2.error` inside into an error of ours that names `place` (its text is asked for only then).
 
+    Args:
+        place: where it happens.
+        kind: of the error; where the pixels of a file may be the reason, that is `SequenceError`.
+
     Raises:
-        GgslamError: of `kind`; where the pixels of a file may be the reason, that is `SequenceError`.
+        GgslamError: of `kind`.
         MemoryFullError: memory is full.
     """
-    try:
-        yield
-    except cv2.error as error:
+
+    def __init__(self, place: object, kind: type[GgslamError] = OpenCvError) -> None:
+        self._place, self._kind = place, kind
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, *trace: object) -> None:
+        if not isinstance(error, cv2.error):
+            return
         if error.code == cv2.Error.StsNoMem:
-            raise MemoryFullError(f"{place}: memory is full: {opencv_reason(error)}") from None
-        raise kind(f"{place}: OpenCV: {opencv_reason(error)}") from error
+            raise MemoryFullError(f"{self._place}: memory is full: {opencv_reason(error)}") from None
+        raise self._kind(f"{self._place}: OpenCV: {opencv_reason(error)}") from error
 
 
 def opencv_reason(error: Exception) -> str:

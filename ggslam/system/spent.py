@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ContextDecorator, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from typing import Any
 
 from ggslam.system.energy import EnergyMeter
 
@@ -99,12 +100,24 @@ class Spent:
 _COUNTED: ContextVar[Spent | None] = ContextVar("counted", default=None)
 
 
-@contextmanager
-def part(name: str, whole: bool = False) -> Iterator[None]:
-    """The block is a part of what `Spent.count_parts` counts, if this thread is counted; else nothing."""
-    spent = _COUNTED.get()
-    if spent is None:
-        yield
-        return
-    with spent.part(name, whole):
-        yield
+class part(ContextDecorator):
+    """The block is a part of what `Spent.count_parts` counts, if this thread is counted; else nothing.
+
+    Args:
+        name, whole: see `Spent.part`.
+    """
+
+    def __init__(self, name: str, whole: bool = False) -> None:
+        self._name, self._whole = name, whole
+        self._counted: AbstractContextManager[None] | None = None
+
+    def __enter__(self) -> None:
+        spent = _COUNTED.get()
+        if spent is not None:
+            self._counted = spent.part(self._name, self._whole)
+            self._counted.__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        if self._counted is not None:
+            counted, self._counted = self._counted, None
+            counted.__exit__(*error)

@@ -62,9 +62,9 @@ class GicpTracker(Tracker):
         self._median_depth = None
 
     @classmethod
-    def with_state(cls, state: TrackerState) -> GicpTracker:
-        """A tracker that works with the state of another."""
-        tracker = cls(state.camera, state.settings, state.context)
+    def with_state(cls, state: TrackerState, engine: TrackingEngine | None = None) -> GicpTracker:
+        """A tracker that works with the state of another; `engine` as of the constructor."""
+        tracker = cls(state.camera, state.settings, state.context, engine=engine)
         tracker.state = state
         return tracker
 
@@ -83,26 +83,27 @@ class GicpTracker(Tracker):
 
     def track(self, frame: Frame) -> TrackingResult:
         """See `Tracker.track`."""
-        target, motion = self.target, self.state.motion
-        if self.noise is None:
-            self.noise = estimate_noise(frame.depth, self.camera)
-        noise = self.noise or DepthNoise()
+        state = self.state
+        target, motion = state.target, state.motion
+        if state.noise is None:
+            state.noise = estimate_noise(frame.depth, state.camera)
+        noise = state.noise or DepthNoise()
         points = self._points(frame.depth, noise)
         motion.wary = max(0, motion.wary - 1)
         view = FeatureView(frame.color, frame.depth, motion.T_world_camera)
-        motion.watch(frame.color, self.camera)
-        small, still = SmallFrame.of(frame.color, frame.depth), self.state.still
+        motion.watch(frame.color, state.camera)
+        small, still = SmallFrame.of(frame.color, frame.depth), state.still
         if target is None:
             still.renew(small, motion.T_world_camera)
             return self._begin(view, points)
-        self.noise = noise  # what could not be measured before the first keyframe is taken as usual
+        state.noise = noise  # what could not be measured before the first keyframe is taken as usual
         if not motion.lost and still.holds(small, noise):
             stayed = self._stay(view, points, target)
             if stayed is not None:
                 return stayed
         judge, found, reason = self._locate(view, points, target)
         if not motion.wary and found.photometric_share > 0 and motion.is_sudden(found.photometric_residual):
-            motion.wary = self.settings.recovery.wary_frames
+            motion.wary = state.settings.recovery.wary_frames
             points = self._points(frame.depth, noise)
             judge, found, reason = self._locate(view, points, target)
         if not judge.is_acceptable(found, points):
@@ -114,7 +115,7 @@ class GicpTracker(Tracker):
         motion.follow(view, T)
         if found.photometric_share > 0:
             motion.note_greys(found.photometric_residual)
-        motion.remember(view, points, self.settings)
+        motion.remember(view, points, state.settings)
         status = TrackingStatus.DEGENERATE if found.degenerate else TrackingStatus.OK
         status = TrackingStatus.RECOVERED if reason else status
         if doubt:
@@ -138,34 +139,36 @@ class GicpTracker(Tracker):
         return TrackingResult.by_gicp(T.copy(), TrackingStatus.OK, "", points, held, still=True)
 
     def _points(self, depth: np.ndarray, noise: DepthNoise) -> PointSource:
-        settings = self.settings.points
-        if self.state.motion.wary:
-            near = min(settings.near_weight, self.settings.recovery.near_weight)
+        state = self.state
+        settings = state.settings.points
+        if state.motion.wary:
+            near = min(settings.near_weight, state.settings.recovery.near_weight)
             settings = dataclasses.replace(settings, near_weight=near)
         points = self.engine.points(depth, settings, noise)
-        if self.settings.noise is None and self.state.residuals.will_be_due():
+        if state.settings.noise is None and state.residuals.will_be_due():
             points.expect_look()
         return points
 
     def _look_at_residuals(self, points: PointSource, found: AlignmentResult) -> None:
         """Noise that was measured on the first frame is taken to be larger where frames do not lie on one another."""
-        if self.settings.noise is None and self.noise is not None and self.state.residuals.due():
-            self.noise = self.state.residuals.observe_medians(found.matches.medians(points), self.noise)
+        state = self.state
+        if state.settings.noise is None and state.noise is not None and state.residuals.due():
+            state.noise = state.residuals.observe_medians(found.matches.medians(points), state.noise)
 
     def _locate(
         self, view: FeatureView, points: PointSource, target: GicpTarget
     ) -> tuple[PoseJudge, AlignmentResult, str]:
         """The best alignment, which start it came from (empty: constant velocity, or features after a wide step), and
         who judged it."""
-        depth = points.median_depth_if_known()
-        expected = self._median_depth if depth is None else depth
+        state, known = self.state, points.median_depth_if_known()
+        expected = self._median_depth if known is None else known
         mode = self._mode(points.median_depth if expected is None else expected)
-        judge = PoseJudge(view, self.state.motion, self.camera, self.settings.recovery, expected)
+        judge = PoseJudge(view, state.motion, state.camera, state.settings.recovery, expected)
         found = self._locate_by(mode, judge, points, target)
-        if depth is None:  # it is known now, and seldom so far from the frame's before that the mode is another one
-            actual = self._mode(points.median_depth)
+        self._median_depth = depth = points.median_depth
+        if known is None:  # it is known now, and seldom so far from the frame's before that the mode is another one
+            actual = self._mode(depth)
             found = found if actual == mode else self._locate_by(actual, judge, points, target)
-        self._median_depth = points.median_depth
         return judge, *found
 
     def _locate_by(
@@ -203,12 +206,13 @@ class GicpTracker(Tracker):
 
     def _mode(self, median_depth: float) -> PhotometricMode:
         """The photometric mode with "auto" decided."""
-        settings = self.settings.photometric
+        state, settings = self.state, self.state.settings.photometric
         if settings.mode != "auto":
             return settings.mode
-        noise = self._noise().sigma(median_depth)
-        if self.settings.noise is None:  # smooth depth may be wrong: it is trusted once residuals have shown its error
-            shown = self.state.residuals.sigma
+        assert state.noise is not None
+        noise = state.noise.sigma(median_depth)
+        if state.settings.noise is None:  # smooth depth may be wrong: it is trusted once residuals have shown its error
+            shown = state.residuals.sigma
             noise = math.inf if shown is None else max(shown, noise)
         return "always" if noise > settings.noisy_m else "degenerate"
 
@@ -216,8 +220,11 @@ class GicpTracker(Tracker):
         self, points: PointSource, target: GicpTarget, guess: np.ndarray, photometric: PhotometricSource | None,
         coarse: bool = True,
     ) -> AlignmentResult:  # fmt: skip
-        settings = self.settings.align if coarse else dataclasses.replace(self.settings.align, coarse_iterations=0)
-        return self.engine.align(points, target, guess, settings, self._noise(), photometric)
+        settings, noise = self.state.settings.align, self.state.noise
+        assert noise is not None
+        if not coarse:
+            settings = dataclasses.replace(settings, coarse_iterations=0)
+        return self.engine.align(points, target, guess, settings, noise, photometric)
 
     def _noise(self) -> DepthNoise:
         assert self.noise is not None
@@ -225,8 +232,8 @@ class GicpTracker(Tracker):
 
     def _photometric_part(self, view: FeatureView) -> PhotometricSource | None:
         """Textured points of the view and the reference; None without either, as far as is known."""
-        settings, least = self.settings.photometric, GicpTrackerTuning.min_textured
-        greys, earlier = self.engine.greys, self.state.motion.reference_view
+        state, greys, least = self.state, self.engine.greys, GicpTrackerTuning.min_textured
+        settings, earlier = state.settings.photometric, state.motion.reference_view
         if greys is not None:
             return None if earlier is None else greys.part(view, earlier, settings, self._shrink_factor(), least)
         reference = self._current_reference()
@@ -244,7 +251,7 @@ class GicpTracker(Tracker):
 
     def _shrink_factor(self) -> int:
         """By how much images are reduced for their grey values."""
-        return self.settings.photometric.shrink * max(1, round(self.camera.width / 320))
+        return self.state.settings.photometric.shrink * max(1, round(self.state.camera.width / 320))
 
     def _shrink(self, view: FeatureView) -> GreyDepth:
         return GreyDepth.from_images(view.color, view.depth, self.camera, self._shrink_factor())

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dsyevd
 
-from ggslam.scene.poses import skew
 from ggslam.tracking.points import FramePoints
 from ggslam.tracking.settings import DepthNoise
+
+_SIX = np.eye(6)
 
 
 def about_point(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -18,8 +21,9 @@ def about_point(information: np.ndarray, centre: np.ndarray) -> np.ndarray:
     A twist (v, w) about the point moves the centre, which lies at `centre` [3] from it, by v + w x centre; so
     v_centre = v - [centre]x w.
     """
-    A = np.eye(6)
-    A[:3, 3:] = -skew(centre)
+    x, y, z = centre.tolist()
+    A = _SIX.copy()
+    A[0, 4], A[0, 5], A[1, 3], A[1, 5], A[2, 3], A[2, 4] = z, -y, -z, x, y, -x  # -[centre]x
     return A.T @ information @ A
 
 
@@ -61,9 +65,13 @@ def observability(
     point's information by its own noise. An eigenvalue is then the mean of (normal . motion)^2: the share of points
     that see the direction. Points that are no numbers see none.
     """
-    if not spread.total or not np.isfinite([spread.total, spread.radius, *spread.centroid, *information.ravel()]).all():
-        return np.zeros(6), np.eye(6)
+    numbers = (spread.total, spread.radius, *spread.centroid.tolist(), *information.ravel().tolist())
+    if not spread.total or not all(map(math.isfinite, numbers)):
+        return np.zeros(6), _SIX.copy()
     about = about_point(information, -R_world_camera @ spread.centroid)
     scale = np.array([1.0, 1.0, 1.0] + [1.0 / max(spread.radius, 1e-3)] * 3)
-    values, vectors = np.linalg.eigh(about * np.outer(scale, scale) / spread.total)
+    # What np.linalg.eigh calls.
+    values, vectors, failed = dsyevd(about * (scale[:, None] * scale) / spread.total, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("eigenvalues of an alignment's information do not converge")
     return values, vectors[:, values < limit].T

@@ -15,6 +15,7 @@ from ggslam.abi.arrays import address
 from ggslam.native.loader import NativeContext, load_library
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, Points32
+from ggslam.system.medians import median
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import UNBOUNDED, DepthNoise, PointSettings
@@ -78,7 +79,7 @@ class FramePoints:
     @property
     def median_depth(self) -> float:
         """Median depth in metres; 0 without points."""
-        return float(np.median(self.z)) if len(self.points) else 0.0
+        return median(self.z) if len(self.points) else 0.0
 
     @property
     def z(self) -> np.ndarray:
@@ -168,7 +169,7 @@ def largest_weight(depth: np.ndarray, settings: PointSettings, noise: DepthNoise
         return settings.near_weight
     z = depth[::stride, ::stride]
     z = z[(z >= settings.min_depth) & (z <= settings.max_depth)]
-    usual = noise.sigma(1.0) / noise.sigma(float(np.median(z))) if len(z) else 1.0
+    usual = noise.sigma(1.0) / noise.sigma(median(z)) if len(z) else 1.0
     return settings.near_weight * usual**2
 
 

@@ -10,9 +10,8 @@ from functools import cached_property
 import numpy as np
 
 from ggslam.features.orb import FeatureView
-from ggslam.geometry.moved_depth import largest_shift
+from ggslam.geometry.moved_depth import shift_between
 from ggslam.scene.camera import Camera
-from ggslam.scene.poses import inverse
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.feature_hold import hold_to_features
 from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus
@@ -57,11 +56,6 @@ class PoseJudge:
         """Features that the frame shares with the last located ones."""
         return SharedFeatures(self.view, self.motion.views, self.camera, self.settings.features)
 
-    @property
-    def has_matched(self) -> bool:
-        """Whether features were asked for."""
-        return "features" in self.__dict__
-
     # --- starts ------------------------------------------------------------------------------------------------------
 
     def first_start(self) -> tuple[np.ndarray, bool]:
@@ -94,7 +88,7 @@ class PoseJudge:
     def _shift(self, T_one: np.ndarray, T_other: np.ndarray) -> float:
         """By what share of its width the image shifts between two poses [4, 4]."""
         depth_m = min(self.depth_m or JudgeTuning.near_m, JudgeTuning.near_m)
-        return largest_shift(inverse(T_one) @ T_other, self.camera, depth_m) / self.camera.width
+        return shift_between(T_one, T_other, self.camera, depth_m) / self.camera.width
 
     # --- witnesses ---------------------------------------------------------------------------------------------------
 
@@ -108,7 +102,7 @@ class PoseJudge:
 
     def is_vouched(self, found: AlignmentResult) -> bool:
         """Whether features, if they were asked, vouch for a pose."""
-        if found.status is AlignmentStatus.LOST or not self.has_matched:
+        if found.status is AlignmentStatus.LOST or "features" not in self.__dict__:
             return False
         return self.features.vouch(found.T_world_camera)
 
@@ -137,7 +131,9 @@ class PoseJudge:
 
     def jump(self, T_world_camera: np.ndarray) -> str:
         """Why the path jumps at a pose [4, 4], as far as features were asked; empty if it does not."""
-        return self.features.contradict(T_world_camera, SharedFeatureTuning.jump_slack) if self.has_matched else ""
+        if "features" not in self.__dict__:
+            return ""
+        return self.features.contradict(T_world_camera, SharedFeatureTuning.jump_slack)
 
     def _matches_what_was_seen(self, found: AlignmentResult, points: PointSource) -> bool:
         """Whether the overlap is convincing for so much as the last views show of the frame: a fast turn leaves

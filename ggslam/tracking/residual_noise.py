@@ -8,6 +8,7 @@ They show where a frame is laid onto the surface that frames before have measure
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Final
 
 import numpy as np
@@ -65,11 +66,9 @@ class ResidualNoise:
     @property
     def sigma(self) -> float | None:
         """Robust standard deviation in metres of the distances in the latest looks; None: too few so far."""
-        return (
-            float(np.median([sigma for _, sigma in self.residuals]))
-            if len(self.residuals) >= ResidualNoiseTuning.min_measurements
-            else None
-        )
+        if len(self.residuals) < ResidualNoiseTuning.min_measurements:
+            return None
+        return median([sigma for _, sigma in self.residuals])
 
     def due(self) -> bool:
         """Whether the next frame is looked at; counts it."""
@@ -109,10 +108,10 @@ class ResidualNoise:
             / max(noise.sigma(z), ResidualNoiseTuning.surface_sigma_m * min(1, z / ResidualNoiseTuning.room_depth_m))
             for z, sigma in self.residuals
         ]
-        factor = float(np.median(ratios))
+        factor = median(ratios)
         if factor < ResidualNoiseTuning.max_factor:
             return noise
-        depth, shown = (float(np.median(values)) for values in zip(*self.residuals, strict=True))
+        depth, shown = (median(values) for values in zip(*self.residuals, strict=True))
         self.residuals = []
         larger = larger_noise(noise, depth, shown)
         self.hidden *= larger.sigma(depth) / noise.sigma(depth)

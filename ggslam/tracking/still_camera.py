@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from ggslam.system.array_forms import DepthImage, Pose
+from ggslam.system.medians import median
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import DepthNoise
@@ -113,8 +114,10 @@ def is_still(anchor: SmallFrame, now: SmallFrame, noise: DepthNoise) -> bool:
     if anchor.grey.shape != now.grey.shape:
         return False
     smooth = cv2.GaussianBlur(anchor.grey, (3, 3), 0.7)
-    gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
-    rows, columns = np.nonzero((gx * gx + gy * gy > StillTuning.min_gradient**2) & (anchor.depth > 0) & (now.depth > 0))
+    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    textured = (gx * gx + gy * gy > StillTuning.min_gradient**2) & (anchor.depth > 0) & (now.depth > 0)
+    rows, columns = textured.nonzero()
     if len(rows) < StillTuning.min_pixels:
         return False
     step = max(1, len(rows) // StillTuning.max_pixels)
@@ -122,7 +125,7 @@ def is_still(anchor: SmallFrame, now: SmallFrame, noise: DepthNoise) -> bool:
     gx, gy = gx[rows, columns], gy[rows, columns]
     difference = cv2.GaussianBlur(now.grey, (3, 3), 0.7)[rows, columns] - smooth[rows, columns]
     slope = np.hypot(gx, gy)
-    stays = np.abs(difference - np.median(difference)) < StillTuning.max_flow_pixels * slope
+    stays = np.abs(difference - median(difference)) < StillTuning.max_flow_pixels * slope
     if not (_is_all_over(rows, columns, stays, anchor.grey.shape) and _stays_each_way(gx / slope, gy / slope, stays)):
         return False
     shifts = _shifts(rows, columns, gx, gy, smooth[rows, columns], difference, stays, anchor.grey.shape)
@@ -139,10 +142,9 @@ def _is_all_over(rows: np.ndarray, columns: np.ndarray, stays: np.ndarray, shape
     textured = np.bincount(cells, minlength=StillTuning.cells**2)
     still = np.bincount(cells[stays], minlength=StillTuning.cells**2)
     counted = textured >= StillTuning.min_cell_pixels
-    return bool(
-        counted.sum() >= StillTuning.cells
-        and (still[counted] >= StillTuning.min_still_share * textured[counted]).mean() >= StillTuning.min_still_cells
-    )
+    stay = counted & (still >= StillTuning.min_still_share * textured)
+    count = np.add.reduce(counted)
+    return bool(count >= StillTuning.cells and np.add.reduce(stay) >= StillTuning.min_still_cells * count)
 
 
 def _stays_each_way(x: np.ndarray, y: np.ndarray, stays: np.ndarray) -> bool:

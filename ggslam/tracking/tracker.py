@@ -6,6 +6,7 @@ from __future__ import annotations
 import enum
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -76,7 +77,7 @@ class TrackingResult:
             T_world_camera, status, found.overlap, found.rmse, reason, points, found.information, found, still
         )
 
-    @property
+    @cached_property
     def median_depth_m(self) -> float:
         """Of the frame's points, metres."""
         return self.points.median_depth

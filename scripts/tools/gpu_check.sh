@@ -7,7 +7,7 @@
 #   FOLDER=...     where the log of each step goes (default: build/gpu_check)
 #   ARCHIVE=...    also puts all of that into one file .tar.gz at the end, whatever happened
 #   STEPS="..."    which steps to run, in this order whatever is said:
-#                    machine build compile tests slam realtime profile loops bench training volumes
+#                    machine build compile tests slam realtime profile loops bench training volumes frontends
 #   SHORT=1        less of everything, for ten minutes in all (tests: those that need the GPU); no step begins or goes
 #                  on after LIMIT seconds
 #   LIMIT=...      seconds; 0: none (default: 0, with SHORT 540)
@@ -17,6 +17,7 @@
 #   BENCH="..."    arguments of scripts/benchmarks/bench_cuda_render.py
 #   TRAINING="..." arguments of scripts/benchmarks/bench_cuda_training.py
 #   VOLUMES="..."  arguments of scripts/benchmarks/bench_cuda_volumes.py
+#   FRONTENDS="..." arguments of scripts/benchmarks/bench_frontends.py; the step needs recordings
 #   SANITIZE=1     runs a few tests under compute-sanitizer's memcheck, racecheck and synccheck, too (minutes)
 set -u
 cd "$(dirname "$0")/../.."
@@ -28,8 +29,8 @@ mkdir -p "$folder"
 for place in "${DATA:-}" "${GGSLAM_DATA:-}" ../shared/data shared/data build/recordings; do
   [ -z "$place" ] || [ ! -d "$place" ] || { export GGSLAM_DATA=$place && break; }
 done
-wanted=${STEPS:-machine build compile tests slam realtime profile loops bench training volumes}
-export PICK="not slow" SLAM=${SLAM:-} BENCH=${BENCH:-} TRAINING=${TRAINING:-} VOLUMES=${VOLUMES:-} LOOPS=""
+wanted=${STEPS:-machine build compile tests slam realtime profile loops bench training volumes frontends}
+export PICK="not slow" SLAM=${SLAM:-} BENCH=${BENCH:-} TRAINING=${TRAINING:-} VOLUMES=${VOLUMES:-} FRONTENDS=${FRONTENDS:-} LOOPS=""
 limit=${LIMIT:-0}
 if [ -n "${SHORT:-}" ]; then
   limit=${LIMIT:-540}
@@ -168,9 +169,19 @@ volumes() {
   "$python" scripts/benchmarks/bench_cuda_volumes.py $VOLUMES
 }
 
-export -f missing machine build compile tests sanitize run_slam slam realtime profile loops bench training volumes
+frontends() {
+  if [ -z "${GGSLAM_DATA:-}" ]; then
+    echo "left out: no recordings"
+    return 1
+  fi
+  # shellcheck disable=SC2086
+  "$python" scripts/benchmarks/bench_frontends.py "$GGSLAM_DATA" --device cuda --no-lidar $FRONTENDS
+}
+
+export -f missing machine build compile tests sanitize run_slam slam realtime profile loops bench training volumes \
+  frontends
 [ -z "${SANITIZE:-}" ] || wanted="$wanted sanitize"
-for name in machine build compile tests sanitize slam realtime profile loops bench training volumes; do
+for name in machine build compile tests sanitize slam realtime profile loops bench training volumes frontends; do
   step "$name" "$name"
 done
 echo "seconds:$times"

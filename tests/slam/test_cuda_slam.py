@@ -32,6 +32,7 @@ from ggslam.slam.parts import run_library
 from ggslam.slam.realtime import RealtimeSlam
 from ggslam.slam.result import SlamResult
 from ggslam.slam.slam import Slam
+from ggslam.tracking.edges_planes.tracker import FeatureTracker
 
 FRAMES = 3
 
@@ -71,6 +72,18 @@ def test_same_run_as_on_the_cpu(
     assert slam.mapper.last_psnr == pytest.approx(expected_slam.mapper.last_psnr, abs=0.2)
     assert slam.mapper.losses.total == pytest.approx(expected_slam.mapper.losses.total, rel=0.03)
     assert found.gaussians.means.device.type == "cpu"
+
+
+@pytest.mark.long("the whole loop under emulation")
+def test_edges_and_planes_are_tracked_as_on_the_cpu(frames: list[Frame], cuda_library: CudaLibrary) -> None:
+    settings = config(
+        "identity.enabled=false", "keyframes.max_gap=2", "tracker=edges_planes", "edges_planes.align.budget_ms=0"
+    )
+    slam, found = run(frames, settings, cuda_library)
+    _, expected = run(frames, settings, None)
+    assert isinstance(slam.tracker, FeatureTracker) and slam.tracker.device_engine is not None
+    assert len(found.keyframes) == len(expected.keyframes) > 1
+    assert np.abs(found.trajectory() - expected.trajectory()).max() < 1e-3
 
 
 @pytest.mark.long("the whole loop under emulation")

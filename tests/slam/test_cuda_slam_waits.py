@@ -19,14 +19,18 @@ SETTINGS = ["device=cuda", "mapping.iterations_per_frame=1", "mapping.first_fram
 
 
 @pytest.mark.long("the whole loop under emulation")
-@pytest.mark.parametrize("schedule", ["sampled", "votes"])
-def test_the_host_waits_for_a_frame_once(room: Path, schedule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("setting", "scale"), [
+    ("identity.schedule=sampled", 0.42), ("identity.schedule=votes", 0.42), ("tracker=edges_planes", 1.0),
+])  # fmt: skip
+def test_the_host_waits_for_a_frame_once(
+    room: Path, setting: str, scale: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """For its pose; at a keyframe once more, for what the map shows of objects and the number of new Gaussians. Looks
     at the residuals of tracking, which are rare, wait besides."""
     monkeypatch.setattr(ResidualNoise, "due", lambda self: False)
-    frames = list(open_sequence(room, scale=0.42).stream())[:6]
+    frames = list(open_sequence(room, scale=scale).stream())[:6]
     with DeviceWatch() as watch:
-        slam = Slam(frames[0].camera, load_config(None, [*SETTINGS, f"identity.schedule={schedule}"]), has_masks=True)
+        slam = Slam(frames[0].camera, load_config(None, [*SETTINGS, setting]), has_masks=True)
         kinds = []
         for frame in frames:
             watch.forget()

@@ -42,6 +42,27 @@ struct SightJob {
   double* z;
 };
 
+// A depth image of a camera, and its pose.
+struct LocatedDepth {
+  const float* depth;         // [height, width], metres, 0 where unknown
+  double T_world_camera[12];  // rows of [R t]
+};
+
+// The newest view of a camera and some before it, compared with one another to find what is fixed to the camera.
+struct FixedToCameraJob {
+  LocatedDepth newest;
+  const LocatedDepth* earlier;
+  int32_t count;       // of them
+  int32_t height, width;
+  double fx, fy, cx, cy;
+  SightMargin same;    // how far depths of one surface may differ
+  SightMargin past;    // how much farther what is seen has to be at a place that is looked past
+  double least_shift;  // in pixels, of a part of the world from one view to the other: with less, it says nothing
+  // Results [3, height, width]: to each is added how many of the 2 `count` comparisons say of a pixel that its surface is
+  // fixed to the camera; that its depth is what it was there in the image; that it is where a part of the world has to be.
+  int32_t* counts;
+};
+
 // What a depth image [height, width] has about places `factor` pixels apart. Place (i, j) stands for the pixels
 // [i factor, (i + 1) factor) x [j factor, (j + 1) factor); h = height / factor, w = width / factor.
 struct DepthPlacesJob {
@@ -96,5 +117,6 @@ struct PlacesEvidenceJob {
 
 // Each returns 0. Images are not empty, and `factor` is at most their sides.
 GGSLAM_EXPORT int ggslam_sight(void* context, const ggslam::SightJob* job);
+GGSLAM_EXPORT int ggslam_fixed_to_camera(const ggslam::FixedToCameraJob* job);
 GGSLAM_EXPORT int ggslam_depth_places(void* context, const ggslam::DepthPlacesJob* job);
 GGSLAM_EXPORT int ggslam_places_evidence(void* context, const ggslam::PlacesEvidenceJob* job);

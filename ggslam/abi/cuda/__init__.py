@@ -9,7 +9,10 @@ from typing import Any
 from ggslam.abi.core import DECLARED as CORE
 from ggslam.abi.headers import Declarations
 
-HEADERS = ("common", "growth", "mapping", "rendering", "sampled_identity", "sight", "tracking", "training", "volumes")
+HEADERS = (
+    "common", "growth", "mapping", "rendering", "sampled_identity", "sight", "edges_planes", "tracking", "training",
+    "volumes",
+)  # fmt: skip
 DECLARED = Declarations(Path(__file__).parent, HEADERS, CORE.structures)
 globals().update(DECLARED.names)
 

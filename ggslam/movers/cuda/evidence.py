@@ -10,18 +10,19 @@ evidence is made anew, for which the host waits.
 from __future__ import annotations
 
 import ctypes
+from bisect import bisect_right
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 
-from ggslam.abi.core import SightMargin
 from ggslam.abi.cuda import EVIDENCE_PLANES, MOST_EARLIER, EvidencePart, MoverEvidenceFound, MoverEvidenceJob
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.cuda.transfers import Upload, download
 from ggslam.movers.cuda.views import CudaView, ViewRing
 from ggslam.movers.evidence import Evidence, EvidenceRequest, HostEvidence, ages_and_parts
+from ggslam.movers.settings import MoverSettings
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.sight.margin import Margin
@@ -67,6 +68,7 @@ class CudaEvidence:
         pinned = torch.zeros(self._found.numel(), dtype=torch.uint8, pin_memory=device.type == "cuda")
         self._arrived = pinned
         self._pose = pinned.numpy()[:96].view(np.float64)
+        self._apart = np.zeros(12)
         self._novel = pinned.numpy()[96:100].view(np.int32)
         self._job = job = tracking.evidence
         job.found, job.arrived, job.device = self._found.data_ptr(), pinned.data_ptr(), device.index or 0
@@ -74,13 +76,14 @@ class CudaEvidence:
         self._slots, self._parts = self._of_job("slots", np.int32), self._of_job("parts", np.int32)
         self._given = self._of_job("given_pose", np.float64)
         self._margin: Margin | None = None
+        self._asks, self._settings = -1, MoverSettings()  # ages, and settings, that `_parts` are of
         self._prepared: EvidenceRequest | None = None
 
     def prepare(self, request: EvidenceRequest) -> None:
         """See `EvidenceSource`."""
         self._prepared = None
-        self._tracking.bring_evidence(False)
         if self._is_for_the_host(request):
+            self._tracking.bring_evidence(False)
             return
         self._fill(request)
         self._job.moved = None
@@ -94,7 +97,7 @@ class CudaEvidence:
         """See `EvidenceSource`."""
         prepared, self._prepared = self._prepared, None
         self._tracking.bring_evidence(False)
-        if self._is_for_the_host(request):
+        if request is not prepared and self._is_for_the_host(request):
             return self._host.look(request, T_world_camera, moved, context)
         job, address = self._job, self._tracking.depth_address(request.depth)
         if moved is not None or address is None or not self._is_made(request, prepared, T_world_camera):
@@ -134,11 +137,12 @@ class CudaEvidence:
         """Whether the last alignment made what is asked for."""
         if prepared is None or prepared.depth is not request.depth or prepared.earlier is not request.earlier:
             return False
-        if prepared.margin != request.margin:
+        if prepared is not request and prepared.margin != request.margin:
             return False
-        pose, most = self._pose, CudaEvidenceTuning.same_pose
-        off = max(np.abs(pose[:9] - T[:3, :3].ravel()).max(), np.abs(pose[9:] - T[:3, 3]).max())
-        return bool(off <= most)  # what is not a number is not
+        self._apart[:9], self._apart[9:] = T[:3, :3].ravel(), T[:3, 3]
+        self._apart -= self._pose
+        most = CudaEvidenceTuning.same_pose
+        return bool(np.maximum.reduce(np.abs(self._apart)) <= most)  # what is not a number is not
 
     def _fill(self, request: EvidenceRequest) -> None:
         """Sets what is asked of the kernels but for depth and pose."""
@@ -146,17 +150,18 @@ class CudaEvidence:
         if self._ring is None or not self._has_room(request):
             self._make_room(request.camera, request.factor, request.ages[-1] + 2)
         assert self._ring is not None
-        if self._margin != request.margin:
-            m = self._margin = request.margin
-            job.margin = SightMargin(m.least, m.share, m.sigmas, m.constant, m.square)
-        ages, earlier = ages_and_parts(request), request.earlier
-        n = job.count = len(ages)
+        if self._margin is not request.margin and self._margin != request.margin:
+            self._margin, job.margin = request.margin, request.margin.native()
+        earlier = request.earlier
+        n = job.count = bisect_right(request.ages, len(earlier))
+        if n != self._asks or request.settings is not self._settings:
+            ages = ages_and_parts(request)
+            self._parts[:n] = [EvidencePart.LEFT * left + EvidencePart.STAYED * stayed for _, left, stayed in ages]
+            self._asks, self._settings = n, request.settings
         job.slot, job.fewest_passed = self._ring.next_slot(earlier), request.settings.min_passed
         # The newest is in the slot before: views lie one after the other.
-        slots = [(job.slot - age) % self._ring.slots for age, _, _ in ages]
-        self._slots[:n] = slots
-        self._parts[:n] = [EvidencePart.LEFT * left + EvidencePart.STAYED * stayed for _, left, stayed in ages]
-        self._T_earlier[:n] = self._ring.T_camera_world[slots]
+        slots = (job.slot - np.array(request.ages[:n], int)) % self._ring.slots
+        self._slots[:n], self._T_earlier[:n] = slots, self._ring.T_camera_world[slots]
 
     def _make_room(self, camera: Camera, factor: int, slots: int) -> None:
         """Memory for frames of a camera."""

@@ -14,11 +14,12 @@ import numpy as np
 from ggslam.geometry.image_parts import parts_with_seeds
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, separation
-from ggslam.sight.fixed_to_camera import compare_views, shrink_depth
+from ggslam.scene.poses import separation
+from ggslam.sight.fixed_to_camera import count_comparisons, shrink_depth
 from ggslam.slam.filters.frame_filter import FrameFilter
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import DepthImage, Form, Mask, Pose
+from ggslam.system.medians import median
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import DepthNoise
@@ -69,7 +70,8 @@ class CameraFixtures(FrameFilter):
         changes: how many times `mask` has changed.
         views: frames that were compared.
         comparisons: of one of them with another.
-        counts: int32 [3, h, w], comparisons that say of a pixel that it is fixed, still, of the world (`PairEvidence`).
+        counts: int32 [3, h, w], comparisons that say of a pixel that it is fixed, still, of the world, see
+            `count_comparisons`.
         latest: depth as compared, and pose, of the latest views.
     """
 
@@ -130,20 +132,16 @@ class CameraFixtures(FrameFilter):
         if self.latest:
             moved, turned = separation(self.latest[-1][1], T_world_camera)
             known = depth[:: 2 * factor, :: 2 * factor]
-            median = float(np.median(known[known > 0])) if (known > 0).any() else 0.0
-            if not median or (moved < FixtureTuning.apart_share * median and turned < FixtureTuning.apart_deg):
+            known = known[known > 0]
+            if not len(known):
+                return
+            if moved < FixtureTuning.apart_share * median(known) and turned < FixtureTuning.apart_deg:
                 return
         small, smaller = shrink_depth(depth, camera, factor)
         if self.counts is None:
             self.counts = np.zeros((3, *small.shape), np.int32)
-        for other, T_world_other in self.latest:
-            T_other_camera = inverse(T_world_other) @ T_world_camera
-            for found in (
-                compare_views(small, other, T_other_camera, smaller),
-                compare_views(other, small, inverse(T_other_camera), smaller),
-            ):
-                self.counts += np.stack([found.fixed, found.still, found.world])
-                self.comparisons += 1
+        count_comparisons(small, T_world_camera, self.latest, smaller, self.counts)
+        self.comparisons += 2 * len(self.latest)
         self.latest, self.views = (
             [*self.latest[1 - FixtureTuning.earlier_views :], (small, T_world_camera.copy())],
             self.views + 1,
@@ -163,7 +161,7 @@ class CameraFixtures(FrameFilter):
         found = parts_with_seeds(
             candidates & (fixed >= FixtureTuning.seed_views), candidates, FixtureTuning.min_seed_share
         )
-        if found.mean() < FixtureTuning.min_image_share:
+        if np.count_nonzero(found) < FixtureTuning.min_image_share * found.size:
             return
         grown = cv2.dilate(found.astype(np.uint8), np.ones((3, 3), np.uint8))
         large = cv2.resize(grown, (grown.shape[1] * factor, grown.shape[0] * factor), interpolation=cv2.INTER_NEAREST)
@@ -177,7 +175,7 @@ class CameraFixtures(FrameFilter):
                 distance = float(np.percentile(own, 90))
                 self.nearest = (
                     FixtureTuning.flying_pixel_factor * distance
-                    if distance < FixtureTuning.max_scene_share * float(np.median(scene))
+                    if distance < FixtureTuning.max_scene_share * median(scene)
                     else 0.0
                 )
 

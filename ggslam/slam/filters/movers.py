@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ggslam.geometry.moved_depth import largest_shift
+from ggslam.geometry.moved_depth import shift_between
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN
 from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor, grow
 from ggslam.movers.recent import RecentFrame
@@ -17,7 +17,6 @@ from ggslam.movers.tracks import MoverTracks
 from ggslam.movers.trail import gone_since
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sight.margin import Margin
 from ggslam.sight.places import CoarseView
@@ -47,7 +46,7 @@ DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
 
 
-@savable(not_saved="_reads_masks _margin context")
+@savable(not_saved="_reads_masks _noise _margin context")
 class MoverFilter(FrameFilter):
     """Detects movers in each located frame, if the settings ask for it.
 
@@ -68,6 +67,7 @@ class MoverFilter(FrameFilter):
         """What was found in the frames so far."""
         self.tracks = MoverTracks()
         """The movers one by one."""
+        self._noise: DepthNoise | None = None
         self._margin = _margin(settings, DepthNoise())
         self._before = None
         """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
@@ -98,25 +98,25 @@ class MoverFilter(FrameFilter):
 
     def expect(self, frame: Frame) -> Frame:
         """The frame to locate: without depth where something is expected to move."""
-        if not self.active:
+        if not self.detector.settings.enabled:
             return frame
         self.detector.prepare(frame, self._margin)
-        return self.detector.expect(frame)
+        return frame if self.detector.expected is None else self.detector.expect(frame)
 
     def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
         """The frame without depth where something moves, which `Frame.moving` tells, and the result without points
         of it."""
-        if not self.active:
+        if not self.detector.settings.enabled:
             return frame, result
         result = self._look(frame, result, noise)
-        return self.detector.clean(frame), result
+        return frame if self.detector.mask is None else self.detector.clean(frame), result
 
     def _look(self, frame: Frame, result: TrackingResult, noise: DepthNoise | None) -> TrackingResult:
         """Finds what moves in a frame that was located; returns the result without points of it."""
-        noise = noise or DepthNoise()
-        self._margin = _margin(self.detector.settings, noise)
+        if noise is not self._noise:
+            self._noise, self._margin = noise, _margin(self.detector.settings, noise or DepthNoise())
         known = result.status not in DOUBTFUL
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
         T_world_camera = result.T_world_camera if known else None
@@ -137,7 +137,7 @@ class MoverFilter(FrameFilter):
         before, self._before = self._before, None if T_world_camera is None else (frame.timestamp, T_world_camera)
         if before is None or T_world_camera is None or not frame.timestamp > before[0]:
             return False
-        shift = largest_shift(inverse(T_world_camera) @ before[1], frame.camera, depth_m)
+        shift = shift_between(T_world_camera, before[1], frame.camera, depth_m)
         return shift > MoverFilterTuning.max_shift_per_s * frame.camera.width * (frame.timestamp - before[0])
 
     def after_insertion(self, removal: MapRemoval, newest: Frame) -> None:

@@ -29,6 +29,9 @@ class ShutterTuning(Tuning):
     """Largest delay of depth that is corrected, as a share of the time between two frames."""
 
 
+_TOGETHER = np.eye(4)
+
+
 @savable()
 @dataclass
 class ShutterTimes(FrameFilter):
@@ -54,7 +57,7 @@ class ShutterTimes(FrameFilter):
 
     def clean(self, frame: Frame) -> Frame:
         """The frame with depth as of the time of its colour: itself if they are together, or hardly anything moves."""
-        self.time, self.T_color_depth = frame.timestamp + frame.depth_delay, np.eye(4)
+        self.time, self.T_color_depth = frame.timestamp + frame.depth_delay, _TOGETHER
         if not frame.depth_delay or self.motion is None or not 0 < self.interval <= ShutterTuning.max_interval_s:
             return frame
         share = frame.depth_delay / self.interval

@@ -96,11 +96,7 @@ class CudaTrackingEngine:
         Raises:
             ValueError: `depth` has another shape than the camera.
         """
-        check_depth(depth, self.camera)
-        before = None if self._pending is None else self._pending()
-        if before is not None:
-            self._extract(before)
-        self._depth.send(depth)
+        self.send_depth(depth)
         stride = grid_stride(int(np.count_nonzero(self._depth.staged > 0)), settings.count)
         arguments = native_points_settings(self.camera, settings, noise, stride, depth)
         border = arguments.window * arguments.window_step
@@ -110,13 +106,33 @@ class CudaTrackingEngine:
         room = columns * rows
         found = CudaPoints(room, self._point_blocks.take(words_for(room)), self._extract, self._ring)
         job = self._job.points
-        job.settings, job.columns, job.rows, job.out = arguments, columns, rows, found.arrays()
+        job.settings, job.columns, job.rows, job.out = arguments, columns, rows, found.arrays
         if self._grid != (columns, rows):
             size = self.library.functions.ggslam_cuda_depth_points_bytes(ctypes.byref(job))
             job.workspace = self._memory.block("points", size).data_ptr()
             self._grid = columns, rows
         self._pending = weakref.ref(found)
         return found
+
+    def send_depth(self, depth: np.ndarray) -> None:
+        """Sends a frame's depth image ahead of what is made of it.
+
+        Args:
+            depth: float32 [H, W], metres, 0 where unknown.
+
+        Raises:
+            ValueError: `depth` has another shape than the camera.
+        """
+        check_depth(depth, self.camera)
+        before = None if self._pending is None else self._pending()
+        if before is not None:
+            self._extract(before)
+        self._depth.send(depth)
+
+    @property
+    def depth_on_device(self) -> int:
+        """Where depth images are on the device."""
+        return self._depth.address
 
     def align(
         self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
@@ -131,7 +147,7 @@ class CudaTrackingEngine:
             raise TypeError("expected points that are on the device")
         job, align, room = self._job, self._job.align, source.room
         matched = self._match_blocks.take(2 * max(1, room))
-        align.points, align.room = source.arrays(), room
+        align.points, align.room = source.arrays, room
         align.match, align.squared_distance = matched.address, matched.address + 4 * max(1, room)
         self._guess_rotation[...] = T_world_camera_guess[:3, :3]
         self._guess_translation[...] = T_world_camera_guess[:3, 3]
@@ -143,11 +159,13 @@ class CudaTrackingEngine:
         job.looks = source.looks
         align.stream = self.library.stream(self.device)
         self.library.call("track_wait", self._reference)
+        self._depth.note_arrival()
         self._target.note_made()
         source.note_extracted()
         found = self._found.copy()
         source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
         if isinstance(photometric, CudaPhotometricPart):
+            self.greys.color.note_arrival()
             photometric.textured = int(found[AlignResult.TEXTURED])
         return cuda_alignment(found, matched, max(1, room), source.looks, settings)
 
@@ -157,7 +175,7 @@ class CudaTrackingEngine:
 
     def depth_address(self, depth: np.ndarray) -> int | None:
         """Where a frame's depth is on the device, if this very array was sent last."""
-        return self._depth.address if self._depth.holds(depth) else None
+        return self._depth.address if self._depth.image is depth else None
 
     def bring_evidence(self, wanted: bool) -> None:
         """Whether each alignment from now on makes `evidence` as well, of the depth on the device at the pose that it
@@ -193,13 +211,7 @@ class CudaTrackingEngine:
         if part is None:
             align.photometric_points.count = 0
         elif isinstance(part, CudaPhotometricPart):
-            reference, greys = self.greys.prepare(part)
-            if reference is not None:
-                job.reference, job.makes_reference = reference, 1
-            if greys is not None:
-                job.greys, job.makes_greys = greys, 1
-            align.photometric_points, align.textured = self.greys.points
-            align.reference, align.least_textured = self.greys.reference, part.least
+            self.greys.prepare(part, job)
         elif isinstance(part, PhotometricPart):
             self._host_greys.send(part, align)
         else:

@@ -30,21 +30,24 @@ class FrameUpload:
         self.address = self._memory.data_ptr()
         """On the device."""
         self._sent = Marker(device)
-        self._image: np.ndarray | None = None
+        self._under_way = False
+        self.image: np.ndarray | None = None
+        """The very array that was sent last."""
 
     def send(self, image: np.ndarray) -> None:
-        """Starts to send an image; the host waits only if the last one is still on its way."""
-        self._sent.wait_if_ahead()
-        np.copyto(self.staged, image)
+        """Starts to send an image. The host waits for the last one, unless `note_arrival` told that it is there."""
+        if self._under_way:
+            self._sent.set()
+            self._sent.wait_if_ahead()
+        self.staged[...] = image
         self._memory.copy_(self._staged, non_blocking=True)
-        self._sent.set()
-        self._image = image
+        self._under_way, self.image = True, image
+
+    def note_arrival(self) -> None:
+        """The host has waited for the stream that the last image was sent on."""
+        self._under_way = False
 
     def have(self, image: np.ndarray) -> None:
         """The same, unless this very array was sent last."""
-        if not self.holds(image):
+        if self.image is not image:
             self.send(image)
-
-    def holds(self, image: np.ndarray) -> bool:
-        """Whether this very array was sent last."""
-        return self._image is image

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ggslam.abi import core as structures
-from ggslam.abi.cuda import GreyJob
+from ggslam.abi.cuda import GreyJob, TrackJob
 from ggslam.cuda.library import CudaLibrary
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.features.orb import FeatureView
@@ -80,7 +80,8 @@ class CudaGreys:
     def __init__(self, library: CudaLibrary, device: torch.device, camera: Camera, depth: FrameUpload) -> None:
         self._library, self._device, self._camera = library, device, camera
         self._depth = depth
-        self._color = FrameUpload((camera.height, camera.width, 3), np.uint8, device)
+        self.color = FrameUpload((camera.height, camera.width, 3), np.uint8, device)
+        """Where the frame's colour is sent to."""
         self._others: tuple[FrameUpload, FrameUpload] | None = None
         self._memory = GrowingMemory(device)
         self._images: list[_Image] = []
@@ -89,23 +90,26 @@ class CudaGreys:
         self._job = GreyJob()
         self._filled_for: tuple[PhotometricSettings, int] | None = None
         self._small = camera
-        self._view = structures.PhotometricReferenceView()
+        self.reference = structures.PhotometricReferenceView()
+        """The one that `prepare` was asked for last, as an alignment takes it."""
+        self.points = structures.PhotometricPoints()
+        """Where the textured points of the frame are made."""
         self._view_of: tuple[np.ndarray, int] | None = None
 
     def part(
         self, view: FeatureView, reference: FeatureView, settings: PhotometricSettings, shrink: int, least: int
     ) -> CudaPhotometricPart | None:
         """The photometric part of a frame; None if an alignment has told that it has not enough texture."""
-        if self._part is None or not self._part.is_of(view, reference, settings, shrink):
-            self._part = CudaPhotometricPart(view, reference, settings, shrink, least)
-        return self._part if self._part.has_texture else None
+        if self._part is not None and self._part.is_of(view, reference, settings, shrink):
+            return self._part if self._part.has_texture else None
+        self._part = CudaPhotometricPart(view, reference, settings, shrink, least)
+        return self._part
 
-    def prepare(self, part: CudaPhotometricPart) -> tuple[GreyJob | None, GreyJob | None]:
-        """What has to be made before the part is used, of the reference and of the frame; None: it is there. Images
-        that this takes are on their way to the device."""
+    def prepare(self, part: CudaPhotometricPart, job: TrackJob) -> None:
+        """Sets what an alignment compares, and what has to be made before of the reference and of the frame, unless it
+        is there. Images that this takes are on their way to the device."""
         self._fill(part.settings, part.shrink)
         reference = self._image_of(part.reference, part.shrink)
-        made = None
         if reference is None:
             reference = self._place_for(part.reference, part.shrink, part.view)
             if self._others is None:
@@ -113,25 +117,17 @@ class CudaGreys:
                 self._others = (
                     FrameUpload((*shape, 3), np.uint8, self._device), FrameUpload(shape, np.float32, self._device)
                 )  # fmt: skip
-            made = self._job_for(part.reference, reference, *self._others, chooses=False)
-        greys = None
+            job.reference = self._job_for(part.reference, reference, *self._others, chooses=False)
+            job.makes_reference = 1
         if self._made is not part:
             image = self._image_of(part.view, part.shrink) or self._place_for(part.view, part.shrink, part.reference)
-            greys = self._job_for(part.view, image, self._color, self._depth, chooses=True)
+            job.greys = self._job_for(part.view, image, self.color, self._depth, chooses=True)
+            job.makes_greys = 1
             self._made = part
         self._set_reference(reference, part.reference)
-        return made, greys
-
-    @property
-    def reference(self) -> structures.PhotometricReferenceView:
-        """What `prepare` was asked for last, as an alignment takes it."""
-        return self._view
-
-    @property
-    def points(self) -> tuple[structures.PhotometricPoints, int]:
-        """The textured points and where their number is, of the frame that `prepare` was asked for last."""
-        job = self._job
-        return structures.PhotometricPoints(job.points, job.intensity, job.most_points), job.count
+        align = job.align
+        align.photometric_points, align.textured = self.points, self._job.count
+        align.reference, align.least_textured = self.reference, part.least
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
@@ -149,6 +145,7 @@ class CudaGreys:
         points = self._memory.block("points", _COUNT_BYTES + 16 * most).data_ptr()
         job.count, job.points = points, points + _COUNT_BYTES
         job.intensity = job.points + 12 * most
+        self.points = structures.PhotometricPoints(job.points, job.intensity, most)
         size = self._library.functions.ggslam_cuda_grey_bytes(ctypes.byref(job))
         job.workspace = self._memory.block("workspace", size).data_ptr()
         pixels = 4 * camera.width * camera.height
@@ -185,7 +182,7 @@ class CudaGreys:
         T, address = view.T_world_camera, image.memory.data_ptr()
         if self._view_of is not None and self._view_of[0] is T and self._view_of[1] == address:
             return
-        T_reference_world, small, out = inverse(T), self._small, self._view
+        T_reference_world, small, out = inverse(T), self._small, self.reference
         out.pixels, out.width, out.height = address, small.width, small.height
         out.fx, out.fy, out.cx, out.cy = small.fx, small.fy, small.cx, small.cy
         out.rotation[:] = T_reference_world[:3, :3].ravel().tolist()

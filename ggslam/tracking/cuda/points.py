@@ -39,6 +39,12 @@ class CudaPoints:
 
     def __init__(self, room: int, block: Block, extract: Callable[[CudaPoints], None], ring: FetchRing) -> None:
         self.room, self.block = room, block
+        header, words = block.address, 4 * room
+        first = header + 4 * _BEGIN
+        self.arrays = PointArrays(
+            header, first, first + 3 * words, first + 6 * words, first + 12 * words, first + 14 * words
+        )
+        """Addresses on the device, while this object is alive."""
         self.looks = False
         """Whether an alignment tells the medians of what was matched, see `expect_look`."""
         self._extract: Callable[[CudaPoints], None] | None = extract
@@ -46,12 +52,6 @@ class CudaPoints:
         self._header: tuple[int, float] | None = None
         self._fetch: Fetch | None = None
         self._points: FramePoints | None = None
-
-    def arrays(self) -> PointArrays:
-        """Addresses on the device; this object must stay alive."""
-        header, room = self.block.address, 4 * self.room
-        first = header + 4 * _BEGIN
-        return PointArrays(header, first, first + 3 * room, first + 6 * room, first + 12 * room, first + 14 * room)
 
     @property
     def is_extracted(self) -> bool:
@@ -83,7 +83,8 @@ class CudaPoints:
     @property
     def median_depth(self) -> float:
         """Median depth in metres, 0 without points. Waits for the device if the points were not aligned yet."""
-        return self._known_header()[1]
+        header = self._header
+        return self._known_header()[1] if header is None else header[1]
 
     def median_depth_if_known(self) -> float | None:
         """Median depth in metres; None before the points were aligned."""

@@ -16,8 +16,14 @@ _PLACES = np.zeros((6, 6), np.intp)
 """Where entry (i, j) of a symmetric matrix is in its upper triangle, row by row."""
 _PLACES[np.triu_indices(6)] = range(21)
 _PLACES += np.triu(_PLACES, 1).T
+_STILL = np.eye(4)
 _TOTAL = AlignResult.SPREAD_TOTAL
 _CENTROID = slice(AlignResult.CENTROID, AlignResult.RADIUS)
+
+
+def symmetric6(triangle: np.ndarray) -> np.ndarray:
+    """The symmetric matrix [6, 6] whose upper triangle the first 21 numbers are, row by row."""
+    return triangle[_PLACES]
 
 
 class CudaMatches:
@@ -59,9 +65,9 @@ def cuda_alignment(
         looks: whether the kernels told the medians of the matched points.
         settings: that it was made with.
     """
-    T = np.eye(4)
+    T = _STILL.copy()
     T[:3, :3], T[:3, 3] = found[:9].reshape(3, 3), found[9:12]
-    information = found[AlignResult.INFORMATION :][_PLACES]
+    information = symmetric6(found[AlignResult.INFORMATION :])
     value = found.tolist()
     spread = PointSpread(value[_TOTAL], found[_CENTROID], value[AlignResult.RADIUS])
     usable = value[AlignResult.USABLE] != 0

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, Protocol
 
 import torch
 from torch import Tensor
@@ -26,6 +26,26 @@ HALF: Final = 5
 WINDOW = 2 * HALF + 1
 _NOISE_GAIN = float(2 * HALF + (2 * HALF) ** 2)
 """Variance of the sum of 10 neighbours minus 10 times the point, in variances of a point."""
+
+
+class Scan(Protocol):
+    """What a tracker asks of the features of one scan, wherever they are."""
+
+    @property
+    def plane_count(self) -> int:
+        """Number of planes."""
+
+    @property
+    def edge_count(self) -> int:
+        """Number of edges."""
+
+    @property
+    def median_depth(self) -> float:
+        """Of the planes, along the third axis (a camera's depth), metres; 0 without planes."""
+
+    @property
+    def median_distance(self) -> float:
+        """Of the planes from the sensor, metres; 0 without planes."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +70,16 @@ class ScanFeatures:
 
     def __len__(self) -> int:
         return len(self.planes) + len(self.edges)
+
+    @property
+    def plane_count(self) -> int:
+        """See `Scan`."""
+        return len(self.planes)
+
+    @property
+    def edge_count(self) -> int:
+        """See `Scan`."""
+        return len(self.edges)
 
     def to(self, device: torch.device | str) -> ScanFeatures:
         """The same on another device."""
@@ -81,12 +111,12 @@ class ScanFeatures:
 
     @cached_property
     def median_depth(self) -> float:
-        """Of the planes, along the third axis (a camera's depth), metres; 0 without planes."""
+        """See `Scan`."""
         return float(self.planes[:, 2].median()) if len(self.planes) else 0.0
 
     @cached_property
     def median_distance(self) -> float:
-        """Of the planes from the sensor, metres; 0 without planes."""
+        """See `Scan`."""
         return float(self.planes.square().sum(1).median().sqrt()) if len(self.planes) else 0.0
 
 
@@ -111,6 +141,11 @@ class ScanLines:
     distances: Tensor
     sigmas: Tensor
     plane_lines: int
+
+
+def dither(lines: int, places: int) -> Tensor:
+    """What decides among planes that are as flat as can be seen, float32 [lines, places] from 0.5 to 1."""
+    return 0.5 + 0.5 * torch.rand(lines, places, generator=torch.Generator().manual_seed(0))
 
 
 class LineScanner:
@@ -142,8 +177,7 @@ class LineScanner:
         self._step, self._limit = buffer(lines, columns - 1), buffer(lines, columns - 1)
         self._gaps = buffer(lines, columns - 1)
         self._scores = buffer(lines, padded)
-        random = torch.rand(lines, self._inner, generator=torch.Generator().manual_seed(0))
-        self._dither = (0.5 + 0.5 * random).to(device)
+        self._dither = dither(lines, self._inner).to(device)
         positions = torch.arange(lines, device=device)[:, None] * columns + torch.arange(padded, device=device) + HALF
         self._positions = positions.view(lines, settings.segments, self._segment)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -24,6 +25,46 @@ class ScanPatchTuning(Tuning):
     """A patch has (2 `half_patch` + 1)^2 pixels."""
 
 
+@dataclass(frozen=True)
+class LineLayout:
+    """Which rows and columns of an image are scanned, and which pixels of them. Rows come first; all lines have one
+    length, and short ones end in missing points.
+
+    Attributes:
+        pitch: distance of the pixels of a line.
+        row_step, column_step: distance of the rows, and of the columns; the first one is half of that from the border.
+            0: no columns.
+        rows, lines: numbers of rows, and of rows and columns.
+        length: points of a line.
+    """
+
+    pitch: int
+    row_step: int
+    column_step: int
+    rows: int
+    lines: int
+    length: int
+
+    @classmethod
+    def of(cls, camera: Camera, settings: ExtractionSettings) -> LineLayout:
+        """For images of a camera."""
+        pitch, scale = max(1, round(camera.width / 320)), camera.width / 320
+        row = max(1, round(settings.row_step * scale))
+        column = max(1, round(settings.column_step * scale)) if settings.column_step else 0
+        rows, columns = len(range(row // 2, camera.height, row)), 0
+        length = math.ceil(camera.width / pitch)
+        if column:
+            columns = len(range(column // 2, camera.width, column))
+            length = max(length, math.ceil(camera.height / pitch))
+        return cls(pitch, row, column, rows, rows + columns, length)
+
+    def views(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Scanned rows and columns [L, C] of an image."""
+        row, column = self.row_step, self.column_step
+        rows = image[row // 2 :: row, :: self.pitch]
+        return rows, image[:: self.pitch, column // 2 :: column].T if column else rows[:0]
+
+
 class DepthImageFeatures:
     """Edges and planes of depth images of one camera.
 
@@ -39,8 +80,9 @@ class DepthImageFeatures:
     def __init__(self, camera: Camera, settings: ExtractionSettings, device: torch.device | str = "cpu") -> None:
         self.camera, self.settings = camera, settings
         self._device = torch.device(device)
-        self._pitch = max(1, round(camera.width / 320))
-        self._lines = _PixelLines(camera, settings, self._pitch, self._device)
+        layout = LineLayout.of(camera, settings)
+        self._pitch = layout.pitch
+        self._lines = _PixelLines(camera, settings, layout, self._device)
         self._depth = torch.zeros(camera.height, camera.width, device=self._device)
         half = ScanPatchTuning.half_patch
         offsets = torch.arange(-half, half + 1, device=self._device) * (settings.patch_step * self._pitch)
@@ -51,7 +93,7 @@ class DepthImageFeatures:
         self._design = torch.stack([du, dv, ones], 1)
         self._solve = self._design / self._design.square().sum(0)  # the three columns are orthogonal
         self._margin = int(offsets[-1])
-        self._segments = _DepthSegments(camera, settings, self._pitch) if settings.segment_angle_deg else None
+        self._segments = DepthSegments(camera, settings, self._pitch) if settings.segment_angle_deg else None
 
     @torch.inference_mode()
     def extract(self, depth: np.ndarray, noise: DepthNoise) -> ScanFeatures:
@@ -79,9 +121,7 @@ class DepthImageFeatures:
         )  # fmt: skip
 
     def _disc(self, z: Tensor) -> Tensor:
-        half = ScanPatchTuning.half_patch
-        spread = math.sqrt(half * (half + 1) / 3) * self.settings.patch_step * self._pitch  # of -half..half
-        return z * (spread / self.camera.fx)
+        return z * disc_per_depth(self.camera, self.settings, self._pitch)
 
     def _rays(self, pixels: Tensor) -> Tensor:
         """Viewing rays with z = 1 of positions in the flat image, [n, 3]."""
@@ -115,28 +155,43 @@ class DepthImageFeatures:
         return (rays * z[:, None]).index_select(0, kept), normals.index_select(0, kept), z.index_select(0, kept)
 
 
-class _DepthSegments:
+def disc_per_depth(camera: Camera, settings: ExtractionSettings, pitch: int) -> float:
+    """Standard deviation of a patch along the surface, per metre of depth."""
+    half = ScanPatchTuning.half_patch
+    spread = math.sqrt(half * (half + 1) / 3) * settings.patch_step * pitch  # of -half..half
+    return spread / camera.fx
+
+
+class DepthSegments:
     """Leaves small segments out of depth images of one camera. Of each square of `pitch` x `pitch` pixels the first one
-    speaks for all."""
+    speaks for all.
+
+    Args:
+        camera: of the images.
+        settings: limits.
+        pitch: see above.
+    """
 
     def __init__(self, camera: Camera, settings: ExtractionSettings, pitch: int) -> None:
         self._pitch, self._least, self._sigmas = pitch, settings.segment_pixels, settings.segment_sigmas
         rays = camera.rays()[::pitch, ::pitch].astype(np.float64)
         lengths = np.linalg.norm(rays, axis=2)
         rays /= lengths[..., None]
-        self._lengths = lengths.astype(np.float32)
+        self.lengths = lengths.astype(np.float32)
+        """Of the viewing rays with z = 1, float32 [H, W] of the squares."""
         across, down = (
             np.arcsin(np.linalg.norm(np.cross(one, other), axis=2).clip(max=1))
             for one, other in ((rays[:, :-1], rays[:, 1:]), (rays[:-1], rays[1:]))
         )
-        self._segments = RangeSegments(across, down, settings.segment_angle_deg)
+        self.segments = RangeSegments(across, down, settings.segment_angle_deg)
+        """Of the squares."""
 
     def without_small(self, depth: np.ndarray, noise: DepthNoise) -> np.ndarray:
         """Depth [H, W], metres, 0 where it is unknown or in a small segment. Noise does not part a surface."""
         coarse = depth[:: self._pitch, :: self._pitch]
         z = np.where(np.isfinite(coarse), coarse, 0).astype(np.float32)
         apart = np.float32(self._sigmas) * (noise.constant + noise.square * z * z)
-        kept = self._segments.without_small(z * self._lengths, self._least, apart)
+        kept = self.segments.without_small(z * self.lengths, self._least, apart)
         if self._pitch > 1:
             height, width = depth.shape
             kept = kept.repeat(self._pitch, 0).repeat(self._pitch, 1)[:height, :width]
@@ -154,12 +209,12 @@ def plain_features(planes: Tensor, edges: Tensor, plane_sigmas: Tensor, edge_sig
 class _PixelLines:
     """Rows and, after them, columns of an image as scan lines of one length; short ones end in missing points."""
 
-    def __init__(self, camera: Camera, settings: ExtractionSettings, pitch: int, device: torch.device) -> None:
+    def __init__(
+        self, camera: Camera, settings: ExtractionSettings, layout: LineLayout, device: torch.device
+    ) -> None:  # fmt: skip
         flat = torch.arange(camera.height * camera.width, device=device).view(camera.height, camera.width)
-        self._settings, self._pitch, self._scale = settings, pitch, camera.width / 320
-        rows, columns = self._views(flat)
-        self._rows, length = len(rows), max(rows.shape[1], columns.shape[1])
-        shape = (len(rows) + len(columns), length)
+        self._settings, self._layout, self._rows = settings, layout, layout.rows
+        shape = (layout.lines, layout.length)
         self._pixels = torch.zeros(shape, dtype=torch.int64, device=device)
         self._rays = torch.zeros(3, *shape, device=device)
         self._points, self._z, self._sigma = torch.zeros_like(self._rays), *torch.zeros(2, *shape, device=device)
@@ -169,15 +224,8 @@ class _PixelLines:
         self._rays = torch.stack([x, y, torch.ones_like(x)]).float()
         self._scanner = LineScanner(*shape, settings, device)
 
-    def _views(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Scanned rows and columns [L, C] of an image."""
-        row = max(1, round(self._settings.row_step * self._scale))
-        column = max(1, round(self._settings.column_step * self._scale)) if self._settings.column_step else 0
-        rows = image[row // 2 :: row, :: self._pitch]
-        return rows, image[:: self._pitch, column // 2 :: column].T if column else rows[:0]
-
     def _fill(self, out: Tensor, image: Tensor) -> None:
-        rows, columns = self._views(image)
+        rows, columns = self._layout.views(image)
         out[: self._rows, : rows.shape[1]] = rows
         out[self._rows :, : columns.shape[1]] = columns
 

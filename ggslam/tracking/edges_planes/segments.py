@@ -28,8 +28,9 @@ class RangeSegments:
 
     def __init__(self, across: np.ndarray | float, down: np.ndarray | float, angle_deg: float) -> None:
         angles = [np.asarray(angle, float) for angle in (down, across)]
-        self._trigonometry = [(np.sin(a).astype(np.float32), (1 - np.cos(a)).astype(np.float32)) for a in angles]
-        self._tangent = np.float32(math.tan(math.radians(angle_deg)))
+        self.trigonometry = [(np.sin(a).astype(np.float32), (1 - np.cos(a)).astype(np.float32)) for a in angles]
+        """Sine and 1 - cosine of the angles, float32, in a column and in a row."""
+        self.tangent = np.float32(math.tan(math.radians(angle_deg)))
 
     def labels(self, ranges: np.ndarray, noise: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Segments of a range image.
@@ -50,7 +51,7 @@ class RangeSegments:
         for axis, part in ((1, cells[::2, 1::2]), (0, cells[1::2, ::2])):
             one, other = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)
             allowed = np.float32(0) if noise is None else np.maximum(noise[one], noise[other])
-            part[:] = self._are_one(ranges[one], ranges[other], allowed, *self._trigonometry[axis])
+            part[:] = self._are_one(ranges[one], ranges[other], allowed, *self.trigonometry[axis])
         count, labels = cv2.connectedComponents(cells, connectivity=4, ltype=cv2.CV_32S)
         own = np.ascontiguousarray(labels[::2, ::2])
         return own, np.bincount(own.reshape(-1), minlength=count)
@@ -70,5 +71,5 @@ class RangeSegments:
         far, near = np.maximum(one, other), np.minimum(one, other)
         # tan(beta) without its division; 1 - cos(alpha), as the cosine of a fine camera is 1 in single precision
         apart = np.maximum(far - near - allowed, 0)
-        return (near > 0) & (near * sine > self._tangent * (apart + near * versine))
+        return (near > 0) & (near * sine > self.tangent * (apart + near * versine))
 

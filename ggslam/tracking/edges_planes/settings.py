@@ -138,7 +138,7 @@ class FeatureAlignSettings(FeatureAlignTuning):
 
     budget_ms: float = setting(10.0, 0, 1e6, "ms")
     """Time for one frame, from image to pose and local map; 0: no limit. A step that would exceed it is skipped; only a
-    frame that would be lost may take longer."""
+    frame that would be lost may take longer. A GPU has no limit."""
 
 
 @tuning_class(frozen=True)
@@ -160,7 +160,7 @@ class FeatureTrackerTuning:
     """Numbers of the tracker of edges and planes."""
 
     device: str = "cpu"
-    """Torch device of features, local map and alignment."""
+    """Torch device of features, local map and alignment where the run is on the CPU; on a GPU kernels do this."""
 
 
 @settings_class(frozen=True)

@@ -14,7 +14,8 @@ from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.system.savable import savable
 from ggslam.tracking.edges_planes.alignment import FeatureAlignment
-from ggslam.tracking.edges_planes.extraction import ScanFeatures
+from ggslam.tracking.edges_planes.engine import DeviceFeatures
+from ggslam.tracking.edges_planes.extraction import Scan
 from ggslam.tracking.edges_planes.local_map import LocalFeatureMap
 from ggslam.tracking.edges_planes.scans import DepthImageFeatures
 from ggslam.tracking.edges_planes.settings import FeatureTrackerSettings
@@ -44,7 +45,7 @@ class FeatureCounts:
     inner_iterations: int = 0
 
 
-@savable(not_saved="features _extractor")
+@savable(not_saved="features _extractor _device_engine")
 class FeatureTracker(Tracker):
     """Constant velocity, then edges and planes against a local map of their own, within a budget of time.
 
@@ -58,6 +59,7 @@ class FeatureTracker(Tracker):
         features: of this front-end.
         context: threads of the compiled core to work on.
         T_world_camera: pose of the first frame.
+        engine: does the work on a device; None: torch and the compiled core do.
     """
 
     def __init__(
@@ -67,14 +69,21 @@ class FeatureTracker(Tracker):
         features: FeatureTrackerSettings | None = None,
         context: NativeContext | None = None,
         T_world_camera: np.ndarray | None = None,
+        engine: DeviceFeatures | None = None,
     ) -> None:
         super().__init__(TrackerState.begin(camera, settings, context, T_world_camera))
-        self._gicp = GicpTracker.with_state(self.state)
+        self._gicp = GicpTracker.with_state(self.state, None if engine is None else engine.tracking)
         self.features = features or FeatureTrackerSettings()
-        self.local_map = LocalFeatureMap(self.features)
+        self.local_map = LocalFeatureMap(self.features, engine)
         self.counts = FeatureCounts()
         """Of the newest frame."""
-        self._extractor = DepthImageFeatures(camera, self.features.extraction, self.features.device)
+        self._device_engine = engine
+        self._extractor = engine or DepthImageFeatures(camera, self.features.extraction, self.features.device)
+
+    @property
+    def device_engine(self) -> DeviceFeatures | None:
+        """Does the work on a device; None: there is none."""
+        return self._device_engine
 
     def track(self, frame: Frame) -> TrackingResult:
         """See `Tracker.track`."""
@@ -83,16 +92,18 @@ class FeatureTracker(Tracker):
         if self.noise is None:
             self.noise = estimate_noise(frame.depth, self.camera)
         scan = self._extractor.extract(frame.depth, self.noise or DepthNoise())
-        points = DeferredPoints(lambda: self._points(frame), scan.median_depth)
         view = FeatureView(frame.color, frame.depth, motion.T_world_camera)
-        self.counts = FeatureCounts(len(scan.planes), len(scan.edges))
         if self.local_map.is_empty:
-            return self._start_in_target(frame, scan) if motion.lost else self._begin_map(view, points, scan)
+            self.counts = FeatureCounts(scan.plane_count, scan.edge_count)
+            if motion.lost:
+                return self._start_in_target(frame, scan)
+            return self._begin_map(view, self._points(frame, scan), scan)
         self.noise = self.noise or DepthNoise()
         found = self.local_map.align(scan, motion.predict())
-        self.counts = replace(
-            self.counts, outer_iterations=found.outer_iterations, inner_iterations=found.inner_iterations
+        self.counts = FeatureCounts(
+            scan.plane_count, scan.edge_count, found.outer_iterations, found.inner_iterations
         )
+        points = self._points(frame, scan)
         convincing = self.local_map.is_convincing(found)
         if not convincing and found.usable and not motion.lost:
             self.local_map.clock.lift()  # to be late is better than to be lost
@@ -138,23 +149,28 @@ class FeatureTracker(Tracker):
         self.local_map.clear()
         self.local_map.add(self._extractor.extract(view.depth, self.noise or DepthNoise()), T_world_camera)
 
-    def _points(self, frame: Frame) -> FramePoints:
+    def _points(self, frame: Frame, scan: Scan) -> DeferredPoints:
+        """The frame's points, for who reads them: by the compiled core, as that may be another thread than the one that
+        a device serves."""
+        return DeferredPoints(lambda: self._extract_points(frame), scan.median_depth)
+
+    def _extract_points(self, frame: Frame) -> FramePoints:
         return extract_points(frame.depth, self.camera, self.settings.points, self.noise or DepthNoise(), self.context)
 
-    def _start_in_target(self, frame: Frame, scan: ScanFeatures) -> TrackingResult:
+    def _start_in_target(self, frame: Frame, scan: Scan) -> TrackingResult:
         """Nothing of its own to hold on to, but a map that someone else made: see `start_lost`."""
         result = self._gicp.track(frame)
         if result.status is not TrackingStatus.LOST:
             self.local_map.add(scan, result.T_world_camera)
         return result
 
-    def _begin_map(self, view: FeatureView, points: PointSource, scan: ScanFeatures) -> TrackingResult:
+    def _begin_map(self, view: FeatureView, points: PointSource, scan: Scan) -> TrackingResult:
         result = self._begin(view, points)
         if result.status is not TrackingStatus.LOST:
             self.local_map.add(scan, result.T_world_camera)
         return result
 
-    def _search(self, view: FeatureView, scan: ScanFeatures, found: FeatureAlignment) -> tuple[FeatureAlignment, str]:
+    def _search(self, view: FeatureView, scan: Scan, found: FeatureAlignment) -> tuple[FeatureAlignment, str]:
         """The first convincing alignment from other starts, and which start it was; without one the alignment given,
         and no name. The budget does not count here."""
         self.local_map.clock.lift()
@@ -172,7 +188,7 @@ class FeatureTracker(Tracker):
                 yield f"features of view {number}", pose.T_world_camera
 
     def _accept(
-        self, view: FeatureView, points: PointSource, scan: ScanFeatures, found: FeatureAlignment, reason: str
+        self, view: FeatureView, points: PointSource, scan: Scan, found: FeatureAlignment, reason: str
     ) -> TrackingResult:
         T = found.T_map_sensor
         self.state.motion.follow(view, T)
@@ -198,7 +214,7 @@ class FeatureTracker(Tracker):
     def _may_ask_gicp(self) -> bool:
         return self.features.gicp_fallback and self.target is not None
 
-    def _ask_gicp(self, frame: Frame, scan: ScanFeatures, found: FeatureAlignment, convincing: bool) -> TrackingResult:
+    def _ask_gicp(self, frame: Frame, scan: Scan, found: FeatureAlignment, convincing: bool) -> TrackingResult:
         """The frame as G-ICP sees it. After being lost the local map begins anew: the camera may be elsewhere."""
         was_lost = self.state.motion.lost
         result = self._gicp.track(frame)

@@ -22,19 +22,28 @@ __device__ inline unsigned sum_over_block(unsigned value, unsigned (&room)[kThre
   return sum;
 }
 
-// Median of the `used` numbers among places 0 to n - 1 whose bits are not kLeftOut, the mean of the two middle ones if
-// they are even in number; 0 without any. Only thread 0 of the block, which has kMedianThreads, gets it.
+// Bits of the lower of the two middle ones of the `used` numbers among places 0 to n - 1 whose bits are not kLeftOut. All
+// threads of the block, which has kMedianThreads, get it.
 template <class Bits>
-__device__ inline float block_median(int n, int used, const Bits& bits_of, unsigned (&room)[kMedianThreads / kWarp]) {
-  const int thread = static_cast<int>(threadIdx.x);
+__device__ inline std::uint32_t block_lower_median(int n, int used, const Bits& bits_of,
+                                                   unsigned (&room)[kMedianThreads / kWarp]) {
   const unsigned rank = static_cast<unsigned>(max(used - 1, 0) / 2);
   std::uint32_t lower = 0;  // the largest value that at most `rank` numbers are below
   for (int bit = 30; bit >= 0; --bit) {
     const std::uint32_t candidate = lower | std::uint32_t{1} << bit;
     unsigned below = 0;
-    for (int i = thread; i < n; i += kMedianThreads) below += bits_of(i) < candidate;
+    for (int i = static_cast<int>(threadIdx.x); i < n; i += kMedianThreads) below += bits_of(i) < candidate;
     if (sum_over_block<kMedianThreads>(below, room) <= rank) lower = candidate;
   }
+  return lower;
+}
+
+// Median of the same numbers, the mean of the two middle ones if they are even in number; 0 without any. Only thread 0
+// gets it.
+template <class Bits>
+__device__ inline float block_median(int n, int used, const Bits& bits_of, unsigned (&room)[kMedianThreads / kWarp]) {
+  const int thread = static_cast<int>(threadIdx.x);
+  const std::uint32_t lower = block_lower_median(n, used, bits_of, room);
   // Its upper neighbour in order: the same value if it is there often enough, else the least of the larger ones.
   unsigned up_to = 0;
   std::uint32_t above = 0x7f7fffffu;

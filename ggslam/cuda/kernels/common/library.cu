@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "abi/cuda/common.hpp"
+#include "abi/cuda/edges_planes.hpp"
 #include "abi/cuda/growth.hpp"
 #include "abi/cuda/mapping.hpp"
 #include "abi/cuda/rendering.hpp"

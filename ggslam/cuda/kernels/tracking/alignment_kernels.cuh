@@ -57,10 +57,7 @@ struct BlockView {
 
 __device__ inline void set_view(const double* rotation, const double* translation, double gain, double bias,
                                 BlockView& view) {
-#pragma unroll
-  for (int i = 0; i < 9; ++i) view.pose.rotation[i] = static_cast<float>(rotation[i]);
-#pragma unroll
-  for (int i = 0; i < 3; ++i) view.pose.translation[i] = static_cast<float>(translation[i]);
+  set_float_pose(rotation, translation, view.pose);
   view.gain = static_cast<float>(gain), view.bias = static_cast<float>(bias);
 }
 

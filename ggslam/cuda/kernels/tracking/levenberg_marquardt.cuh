@@ -4,15 +4,12 @@
 #pragma once
 #include "common/carver.cuh"
 #include "tracking/photometric_terms.cuh"
+#include "tracking/rigid_motion.cuh"
 
 namespace ggslam::cuda {
 
 constexpr int kUnknowns = 8;  // twist, gain, bias
-constexpr double kAcceptedRise = 1.05, kPi = 3.14159265358979323846;
-
-struct RigidPose {
-  double r[9], t[3];
-};
+constexpr double kAcceptedRise = 1.05;
 
 struct NormalEquations {
   double h[kUnknowns][kUnknowns];
@@ -32,86 +29,6 @@ struct AlignState {
   std::int32_t fresh;        // nothing was matched at this level yet
   std::int32_t converged, coarse_iterations, fine_iterations;
 };
-
-// exp of the twist (v, w) about the camera centre: the centre moves by v, the axes turn by exp(w).
-__device__ inline RigidPose moved(const RigidPose& pose, const double (&twist)[kUnknowns]) {
-  const double w[3] = {twist[3], twist[4], twist[5]};
-  const double angle = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
-  const bool small = angle < 1e-6;
-  const double turns = angle / kPi;  // sinpi and cospi do without the slow path that sin and cos have for large angles
-  const double a = small ? 1 - angle * angle / 6 : sinpi(turns) / angle;
-  const double b = small ? 0.5 - angle * angle / 24 : (1 - cospi(turns)) / (angle * angle);
-  const double k[9] = {0, -w[2], w[1], w[2], 0, -w[0], -w[1], w[0], 0};
-  double turn[9];
-#pragma unroll
-  for (int i = 0; i < 3; ++i)
-#pragma unroll
-    for (int j = 0; j < 3; ++j) {
-      const double kk = k[3 * i] * k[j] + k[3 * i + 1] * k[3 + j] + k[3 * i + 2] * k[6 + j];
-      turn[3 * i + j] = (i == j) + a * k[3 * i + j] + b * kk;
-    }
-  RigidPose out;
-#pragma unroll
-  for (int i = 0; i < 3; ++i) {
-#pragma unroll
-    for (int j = 0; j < 3; ++j)
-      out.r[3 * i + j] = turn[3 * i] * pose.r[j] + turn[3 * i + 1] * pose.r[3 + j] + turn[3 * i + 2] * pose.r[6 + j];
-    out.t[i] = pose.t[i] + twist[i];
-  }
-  return out;
-}
-
-__device__ inline void normalize_row(double* v) {
-  const double f = 1 / sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
-  v[0] *= f, v[1] *= f, v[2] *= f;
-}
-
-// Gram-Schmidt on the rows.
-__device__ inline void orthonormalize(double (&r)[9]) {
-  normalize_row(r);
-  const double dot = r[0] * r[3] + r[1] * r[4] + r[2] * r[5];
-#pragma unroll
-  for (int i = 0; i < 3; ++i) r[3 + i] -= dot * r[i];
-  normalize_row(r + 3);
-  r[6] = r[1] * r[5] - r[2] * r[4], r[7] = r[2] * r[3] - r[0] * r[5], r[8] = r[0] * r[4] - r[1] * r[3];
-}
-
-// Solves (H + damping diag(H)) x = b for the first n unknowns (6 or 8) by Cholesky, the others being 0; false if H is not
-// positive. Unknowns left out become equations x = 0, so that all indices are known to the compiler. Of the factor's
-// diagonal the reciprocals are kept: nothing is divided.
-__device__ inline bool solve(const NormalEquations& system, double damping, int n, double (&x)[kUnknowns]) {
-  double l[kUnknowns][kUnknowns], reciprocal[kUnknowns];
-  bool positive = true;
-#pragma unroll
-  for (int j = 0; j < kUnknowns; ++j)
-#pragma unroll
-    for (int i = j; i < kUnknowns; ++i) {
-      double sum = i < n ? system.h[i][j] : (i == j ? 1.0 : 0.0);
-      if (i == j) sum += damping * sum + 1e-12;
-#pragma unroll
-      for (int k = 0; k < j; ++k) sum -= l[i][k] * l[j][k];
-      if (i == j) {
-        positive = positive && sum > 0;
-        reciprocal[j] = rsqrt(sum);
-      } else {
-        l[i][j] = sum * reciprocal[j];
-      }
-    }
-#pragma unroll
-  for (int i = 0; i < kUnknowns; ++i) {
-    x[i] = i < n ? system.b[i] : 0.0;
-#pragma unroll
-    for (int k = 0; k < i; ++k) x[i] -= l[i][k] * x[k];
-    x[i] *= reciprocal[i];
-  }
-#pragma unroll
-  for (int i = kUnknowns - 1; i >= 0; --i) {
-#pragma unroll
-    for (int k = i + 1; k < kUnknowns; ++k) x[i] -= l[k][i] * x[k];
-    x[i] *= reciprocal[i];
-  }
-  return positive;
-}
 
 __device__ inline bool is_small(const AlignSettings& s, const double (&x)[kUnknowns], double factor) {
   const double v = sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]);
@@ -156,7 +73,7 @@ __device__ inline void finish_level(AlignState& s) {
 __device__ inline bool propose(AlignState& s, const AlignSettings& settings, bool photometric) {
   double x[kUnknowns];
   const int unknowns = photometric && s.current.grey_count > 50 ? 8 : 6;
-  if (s.current.matches < settings.min_matches || !solve(s.current, s.damping, unknowns, x)) return false;
+  if (s.current.matches < settings.min_matches || !solve(s.current.h, s.current.b, s.damping, 1e-12, unknowns, x)) return false;
   s.candidate = moved(s.pose, x);
   s.candidate_gain = s.gain + x[6], s.candidate_bias = s.bias + x[7];
   if (!is_small(settings, x, s.phase == kCoarsePhase ? 10 : 1)) return true;

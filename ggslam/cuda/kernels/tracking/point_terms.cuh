@@ -3,6 +3,7 @@
 // native/src/tracking/kernels/gicp.cpp, where the equations are stated.
 #pragma once
 #include "native/formulas/gicp_terms.hpp"
+#include "tracking/rigid_motion.cuh"
 #include "tracking/voxel_lookup.cuh"
 
 namespace ggslam::cuda {
@@ -21,16 +22,6 @@ enum ReportSum {
   kMoment0, kMoment1, kMoment2 = kMoment1 + 3,
   kReportSums
 };
-
-// A pose as the points are turned by it.
-struct FloatPose {
-  float rotation[9], translation[3];
-};
-
-__device__ inline void rotate(const float (&r)[9], const float* v, float (&out)[3]) {
-#pragma unroll
-  for (int i = 0; i < 3; ++i) out[i] = r[3 * i] * v[0] + r[3 * i + 1] * v[1] + r[3 * i + 2] * v[2];
-}
 
 // A point at a pose, and the voxel it is matched to.
 struct PlacedPoint {

@@ -43,6 +43,9 @@ static inline T margin_at(const SightMargin& m, T z, T noise_share) {
   return (of_distance > least ? of_distance : least) + static_cast<T>(m.sigmas) * noise_share * sigma_at(m, z);
 }
 
+// Refuses one that cannot be.
+void check_margin(const SightMargin& margin);
+
 // A row of an image as if it were mirrored at its borders, without repeating them.
 inline int mirrored(int i, int count) {
   if (count == 1) return 0;

@@ -10,6 +10,12 @@
 #include "sight/places.hpp"
 
 namespace ggslam {
+
+void check_margin(const SightMargin& margin) {
+  const double numbers[] = {margin.least, margin.share, margin.sigmas, margin.constant, margin.square};
+  for (const double number : numbers) check_range("margin", number, 0.0, 1e9);
+}
+
 namespace {
 
 constexpr std::size_t kRows = 4, kPoints = 4096;  // handed out at once
@@ -21,11 +27,6 @@ void check_view(const char* name, const PlacesView& view) {
   check_within(name, numbers, 4, 1e7);
   const void* const arrays[] = {view.depth, view.near, view.far, view.whole, view.smooth};
   for (const void* array : arrays) check_array(name, array, 1);
-}
-
-void check_margin(const SightMargin& margin) {
-  const double numbers[] = {margin.least, margin.share, margin.sigmas, margin.constant, margin.square};
-  for (const double number : numbers) check_range("margin", number, 0.0, 1e9);
 }
 
 // How far depth at a place of the other view, between its four pixels, is from that of the point there.
