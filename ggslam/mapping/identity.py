@@ -233,8 +233,12 @@ class IdentityLearner(ABC):
     def _shown_labels(self, gaussians: GaussianMap) -> torch.Tensor:
         """The map's labels by votes as of the newest keyframe, int32 [N]."""
         if self._shown is None or self._shown_order != gaussians.order or len(self._shown) != len(gaussians):
-            self._shown, self._shown_order = vote_labels(gaussians), gaussians.order
+            self._shown, self._shown_order = self._vote_labels(gaussians), gaussians.order
         return self._shown
+
+    def _vote_labels(self, gaussians: GaussianMap) -> torch.Tensor:
+        """As `vote_labels`; the next call may overwrite it."""
+        return vote_labels(gaussians)
 
     def _forget_shown(self) -> None:
         self._shown = None

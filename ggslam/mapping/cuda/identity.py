@@ -28,6 +28,7 @@ from ggslam.mapping.cuda.insertion import NewRows
 from ggslam.mapping.cuda.lessons import CudaLessons
 from ggslam.mapping.cuda.neighbours import cuda_neighbours
 from ggslam.mapping.cuda.pixel_pool import PixelDrawer
+from ggslam.mapping.cuda.vote_labels import CudaVoteLabels
 from ggslam.mapping.identity import IDS, IdentityLearner, IdentityTuning, MaskedKeyframe
 from ggslam.mapping.identity_settings import IdentitySettings
 from ggslam.mapping.pixel_pool import PixelPool
@@ -100,6 +101,7 @@ class CudaIdentityLearner(IdentityLearner):
         self._drawer = PixelDrawer(self.device, self.library, drawn_from)
         self._neighbours = neighbours or cuda_neighbours
         self._has_parts = False
+        self._votes = CudaVoteLabels(self.device, self.library)
         self.device_alias = torch.arange(IDS, dtype=torch.int32, device=self.device)
         self.device_whole_of = torch.zeros(IDS, dtype=torch.int32, device=self.device)
         self._last: tuple[torch.Tensor, torch.Tensor] | None = None  # losses of the last step's pixels, their number
@@ -120,6 +122,9 @@ class CudaIdentityLearner(IdentityLearner):
         self._has_parts = bool(self._whole_of.any())
         self.device_alias.copy_(upload(self._alias.astype(np.int32), self.device))
         self.device_whole_of.copy_(upload(self._whole_of.astype(np.int32), self.device))
+
+    def _vote_labels(self, gaussians: GaussianMap) -> torch.Tensor:
+        return self._votes.of(gaussians)
 
     def _merge_votes(self, gaussians: GaussianMap) -> None:
         merge_votes(gaussians, self.device_alias)
@@ -177,7 +182,8 @@ class CudaIdentityLearner(IdentityLearner):
         return torch.where((self.device_whole_of[shown.long()] == labels) & (shown > 0), shown, labels)
 
     def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
-        self._begin(gaussians, rows, BirthLabelJob(labels=labels.to(torch.int32).contiguous().data_ptr()))
+        labels = labels.to(torch.int32).contiguous()
+        self._begin(gaussians, rows, BirthLabelJob(labels=labels.data_ptr()))
 
     def begin_at(self, gaussians: GaussianMap, keyframe: CudaMaskedKeyframe, new: NewRows) -> None:
         """As `begin`, of Gaussians that a keyframe brought."""
