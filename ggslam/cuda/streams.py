@@ -12,20 +12,24 @@ import torch
 
 class SideStream(AbstractContextManager["SideStream"]):
     """Within, as often as it is entered, a thread starts its work on a stream of its own: beside what others start on
-    the one that was current when this was made, and before that where both wait for room on the device. The host waits
-    for its work at each end. Does nothing without a GPU.
+    the one that was current when this was made, and before that where both wait for room on the device. Does nothing
+    without a GPU.
 
     Memory goes with the stream that it was allocated on: what was made elsewhere must not be given back within; see
     `let_go`.
 
     Args:
         device: where. Of its work, what was started before this was made precedes what is started within.
+        host_waits: whether at each end the host waits for what was started within. Else the stream that is current
+            outside waits, with all that is started there from then on; of this, nothing may be used within.
     """
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, device: torch.device, host_waits: bool = True) -> None:
+        self._device, self._host_waits = device, host_waits
         self._stream: torch.cuda.Stream | None = None
+        self._end: torch.cuda.Event | None = None
         if device.type == "cuda":
-            self._stream = torch.cuda.Stream(device, priority=-1)
+            self._stream, self._end = torch.cuda.Stream(device, priority=-1), torch.cuda.Event()
             self._stream.wait_stream(torch.cuda.current_stream(device))
         self._within: AbstractContextManager[object] = nullcontext()
 
@@ -36,8 +40,13 @@ class SideStream(AbstractContextManager["SideStream"]):
 
     def __exit__(self, *error: Any) -> None:
         self._within.__exit__(*error)
-        if self._stream is not None:
+        if self._stream is None or self._end is None:
+            return
+        if self._host_waits:
             self._stream.synchronize()  # memory of this stream may be used on others from now on
+        else:
+            self._end.record(self._stream)
+            torch.cuda.current_stream(self._device).wait_event(self._end)
 
 
 def let_go(*tensors: torch.Tensor) -> None:

@@ -207,9 +207,14 @@ class Mapper(ABC):
         """Object with the most votes of each Gaussian, uint16 [N], 0 where there are none. Waits for the device."""
         return vote_labels(self.map).cpu().numpy().astype(np.uint16)
 
-    def beside_others(self) -> AbstractContextManager[object]:
-        """Context for a thread that works on the device while the mapper works in another one: its work goes first. May
-        be entered repeatedly. Do not use the mapper inside."""
+    def beside_others(self, host_waits: bool = True) -> AbstractContextManager[object]:
+        """Context for work on the device beside the mapper's, which goes first. May be entered repeatedly. Inside, use
+        of the mapper what is `in_turn` alone.
+
+        Args:
+            host_waits: whether the host waits for it at each end, as it has to if another thread uses the mapper
+                meanwhile. Else the mapper's work after it waits.
+        """
         return nullcontext()
 
     def in_turn(self) -> AbstractContextManager[object]:

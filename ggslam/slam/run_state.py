@@ -78,7 +78,9 @@ class RunState:
         """All of them, each once."""
         self.movers.detector.source = parts.evidence
         self.locator = self._make_locator(parts)
-        self.schedule: Schedule = BesideTraining() if parts.on_device else Schedule()
+        self.schedule = Schedule()
+        if parts.on_device:
+            self.schedule = BesideTraining(self.mapper.beside_others(host_waits=False))
         self.corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
         self.removal = MapRemoval(self.surface, self.mapper, self.pager, self.corrections.publishing)
         self.parts = MapParts(self.mapper, self.poses, self.corrections, self.loops)

@@ -73,7 +73,18 @@ class Schedule:
 
 class BesideTraining(Schedule):
     """The same on a GPU: the points of the last keyframe join the surface while the host hands the step's training to
-    the GPU."""
+    the GPU, and the next frames are located beside that training, before it where both wait for room on the GPU. Of the
+    map, frames see what they see on the CPU.
+
+    Args:
+        beside: context for work beside the mapper's.
+    """
+
+    def __init__(self, beside: AbstractContextManager[object]) -> None:
+        self._beside = beside
+
+    def beside_mapping(self) -> AbstractContextManager[object]:
+        return self._beside
 
     def map(self, slam: MapSteps, keyframes: Sequence[NewKeyframe], frames: int) -> None:
         before = len(slam.mapper.keyframes)

@@ -14,7 +14,7 @@ from cuda_emulation import EMULATION, FLAGS
 from ggslam.cuda.compiler import KERNELS
 
 SOURCE = """
-#include "common/platform.cuh"
+#include "common/recorded_work.cuh"
 using namespace ggslam::cuda;
 
 // Each value moves on by one thread, by way of shared memory.
@@ -51,13 +51,37 @@ extern "C" void run(int what, float* out, std::int64_t blocks) {
   launch(kernels[what], blocks, 64, cudaStream_t{}, out);
 }
 
-extern "C" void run_in_graph(int what, float* out) {
-  const CaptureRegion region;
-  launch(right, 1, 64, cudaStream_t{}, out);
+void start_in_graph(int what, float* out, cudaStream_t stream) {
+  launch(right, 1, 64, stream, out);
   void* memory = nullptr;
-  if (what == 1) cudaMemcpyAsync(out, out + 32, 4, cudaMemcpyDeviceToHost, cudaStream_t{});
+  if (what == 1) cudaMemcpyAsync(out, out + 32, 4, cudaMemcpyDeviceToHost, stream);
   if (what == 2) cudaEventSynchronize(cudaEvent_t{});
   if (what == 3) cudaHostAlloc(&memory, 4, cudaHostAllocDefault);
+  if (what == 4) launch(right, 1, 64, cudaStream_t{}, out);
+  if (what == 5) cudaStreamSynchronize(stream);
+}
+
+extern "C" void run_in_graph(int what, float* out) {
+  const CaptureRegion region;
+  start_in_graph(what, out, cudaStream_t{});
+}
+
+// What is recorded is executed when the graph is launched, with the arguments that it was recorded with.
+extern "C" void record(int what, float* out) {
+  cudaStream_t stream = nullptr;
+  cudaStreamCreateWithFlags(&stream, cudaStreamNonBlocking);
+  RecordedWork work;
+  work.record(stream, [&] {
+    start_in_graph(what, out, stream);
+    return 0;
+  });
+  if (out[0] != 0) emulation::fail("executed while it was recorded");
+  for (int i = 0; i < 2; ++i) {
+    work.launch(cudaStream_t{});
+    if (out[5] != 6) emulation::fail("not executed");
+    out[5] = 0;
+  }
+  cudaStreamDestroy(stream);
 }
 """
 NAMES = ("right", "misaligned", "beyond", "unwritten", "part_of_a_warp", "part_of_a_block", "last_block", "nothing")
@@ -74,7 +98,7 @@ print(*(ctypes.c_float * 64).from_address(aligned))
 RUN_IN_GRAPH = """
 import ctypes, sys
 library, out = ctypes.CDLL(sys.argv[1]), (ctypes.c_float * 64)()
-library.run_in_graph(int(sys.argv[2]), out)
+getattr(library, sys.argv[3])(int(sys.argv[2]), out)
 """
 
 
@@ -111,11 +135,24 @@ def test_faults_end_the_process(library: Path, kernel: str, message: str) -> Non
     assert done.returncode != 0 and any(part in done.stderr for part in message.split("|")), done.stderr
 
 
-@pytest.mark.parametrize(("what", "message"), [(0, ""), (1, "a copy to the host"), (2, "a wait"), (3, "an allocation")])
-def test_what_no_graph_holds_ends_the_process(library: Path, what: int, message: str) -> None:
-    words = [sys.executable, "-c", RUN_IN_GRAPH, str(library), str(what)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
+@pytest.mark.parametrize("how", ["run_in_graph", "record"])
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [(0, ""), (1, "a copy to the host"), (2, "a wait"), (3, "an allocation"), (5, "a wait")],
+)  # fmt: skip
+def test_what_no_graph_holds_ends_the_process(library: Path, how: str, what: int, message: str) -> None:
+    done = run_in_graph(library, how, what)
     assert (done.returncode == 0) == (what == 0) and message in done.stderr
+
+
+def test_work_beside_what_is_recorded_ends_the_process(library: Path) -> None:
+    done = run_in_graph(library, "record", 4)
+    assert done.returncode != 0 and "another stream than the one that records" in done.stderr
+
+
+def run_in_graph(library: Path, how: str, what: int) -> subprocess.CompletedProcess[str]:
+    words = [sys.executable, "-c", RUN_IN_GRAPH, str(library), str(what), how]
+    return subprocess.run(words, capture_output=True, text=True, check=False)
 
 
 def test_a_grid_that_is_too_large_is_refused(library: Path) -> None:

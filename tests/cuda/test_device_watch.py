@@ -10,8 +10,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 import torch
-from device_watch import DEVICE, DeviceMixing, DeviceTensor, DeviceWatch
+from device_watch import DEVICE, DeviceMixing, DeviceTensor, DeviceWatch, UnorderedWork
+from device_watch.order import WorkOrder
 
+from ggslam.cuda.streams import SideStream
 from ggslam.mapping.cuda.class_learning import ClassKernels
 from ggslam.mapping.cuda.class_table import CudaClassTable
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
@@ -20,6 +22,7 @@ from ggslam.mapping.losses import LossTarget
 from ggslam.mapping.settings import LossSettings
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.cuda import CudaRasterizer
+from ggslam.rendering.exposure import identity_exposure
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 
@@ -315,3 +318,101 @@ def test_images_of_the_host_are_refused_by_the_kernels(watch: DeviceWatch) -> No
     images = {"image": torch.empty(3, 24, 40)}  # nothing in Python checks what is given here
     with pytest.raises(DeviceMixing, match="image is no address of device memory"):
         rasterizer.render(make_map(), CAMERA, POSE, rasterizer.memory, images)
+
+
+# --- streams ----------------------------------------------------------------------------------------------------------
+
+
+def use_beside(stream: torch.cuda.Stream, x: torch.Tensor) -> None:
+    with torch.cuda.stream(stream):
+        x.add_(1.0)
+
+
+def test_two_streams_at_the_same_memory_are_found(watch: DeviceWatch) -> None:
+    x, stream = ramp(4), torch.cuda.Stream()
+    with pytest.raises(UnorderedWork, match=r"add_ .* on stream .* and .* on stream 0"):
+        use_beside(stream, x[1:])  # the same memory
+    stream.wait_stream(torch.cuda.current_stream())
+    use_beside(stream, x)
+    with pytest.raises(UnorderedWork, match="mul"):
+        x * 2.0
+
+
+@pytest.mark.parametrize("how", ["stream", "event", "host", "download", "query"])
+def test_who_waits_may_use_what_others_used(watch: DeviceWatch, how: str) -> None:
+    x, stream, event = ramp(4), torch.cuda.Stream(), torch.cuda.Event()
+    event.record()
+    if how == "stream":
+        stream.wait_stream(torch.cuda.current_stream())
+    elif how == "event":
+        stream.wait_event(event)
+    elif how == "host":
+        torch.cuda.current_stream().synchronize()
+    elif how == "download":
+        x.cpu()
+    else:
+        assert event.query()
+    use_beside(stream, x)
+    event.record(stream)
+    torch.cuda.current_stream().wait_event(event)
+    assert watch.read(x * 2.0).tolist() == [2, 4, 6, 8]
+
+
+def test_an_event_of_before_says_nothing_of_what_came_after(watch: DeviceWatch) -> None:
+    x, stream, event = ramp(4), torch.cuda.Stream(), torch.cuda.Event()
+    event.record()
+    x.add_(1.0)
+    stream.wait_event(event)
+    with pytest.raises(UnorderedWork):
+        use_beside(stream, x)
+
+
+def test_work_of_a_slow_device_is_done_when_the_host_waited() -> None:
+    with DeviceWatch(is_slow=True):
+        x, event, stream = ramp(4), torch.cuda.Event(), torch.cuda.Stream()
+        assert event.query()  # never recorded
+        event.record()
+        assert not event.query() and not torch.cuda.current_stream().query()
+        with pytest.raises(UnorderedWork):
+            use_beside(stream, x)
+        event.synchronize()
+        assert event.query()
+        use_beside(torch.cuda.Stream(), x)
+
+
+def test_streams_may_read_the_same_memory(watch: DeviceWatch) -> None:
+    x, stream = ramp(4), torch.cuda.Stream()
+    stream.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(stream):
+        y = x + 1.0
+    assert watch.read(x + 2.0).tolist() == [2, 3, 4, 5]
+    with pytest.raises(UnorderedWork):
+        y + 1.0
+
+
+def test_memory_that_was_given_back_is_new(watch: DeviceWatch) -> None:
+    order = WorkOrder()
+    order.start("a", set(), {1})
+    order.enter(7)
+    order.forget(1)
+    order.start("b", set(), {1})
+    order.leave()
+    with pytest.raises(UnorderedWork):
+        order.start("c", {1}, set())
+
+
+def test_calls_of_kernels_use_all_that_they_are_given(watch: DeviceWatch) -> None:
+    states, stream = KeyframeStates(DEVICE, watch.library), torch.cuda.Stream()
+    states.append(np.eye(4), identity_exposure())
+    with torch.cuda.stream(stream), pytest.raises(UnorderedWork, match="keyframe_write"):
+        states.write_pose(0, np.eye(4))
+
+
+def test_a_side_stream_is_before_what_follows(watch: DeviceWatch) -> None:
+    x, side = ramp(4), SideStream(DEVICE, host_waits=False)
+    y = ramp(4)
+    with side:
+        x.add_(1.0)
+    assert watch.read(x * 2.0).tolist() == [2, 4, 6, 8] and not watch.waits
+    with pytest.raises(UnorderedWork), side:
+        y.add_(1.0)

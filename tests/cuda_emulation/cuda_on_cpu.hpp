@@ -17,6 +17,7 @@
 #include <type_traits>
 
 #include "fibers.hpp"
+#include "graphs.hpp"
 
 #define __global__
 #define __device__
@@ -160,13 +161,20 @@ inline float __uint_as_float(std::uint32_t bits) {
 
 // --- runtime: everything is done when the call returns ------------------------------------------------------------------
 
-using cudaStream_t = struct EmulatedStream*;
+using cudaStream_t = EmulatedStream*;
 using cudaEvent_t = struct EmulatedEvent*;
-enum cudaError_t { cudaSuccess = 0 };
+using cudaGraph_t = EmulatedGraph*;
+using cudaGraphExec_t = EmulatedGraph*;
+enum cudaError_t { cudaSuccess = 0, cudaErrorStreamCaptureUnsupported = 900, cudaErrorGraphExecUpdateFailure = 910 };
 enum cudaMemcpyKind { cudaMemcpyDeviceToHost };
-constexpr unsigned cudaHostAllocDefault = 0, cudaEventDisableTiming = 0;
+enum cudaStreamCaptureMode { cudaStreamCaptureModeThreadLocal };
+struct cudaGraphExecUpdateResultInfo {};
+constexpr unsigned cudaHostAllocDefault = 0, cudaEventDisableTiming = 0, cudaStreamNonBlocking = 1;
+#define CUDART_VERSION 13000
 
-inline const char* cudaGetErrorString(cudaError_t) { return "no error"; }
+inline const char* cudaGetErrorString(cudaError_t error) {
+  return error == cudaSuccess ? "no error" : "a graph cannot be recorded or changed";
+}
 inline cudaError_t cudaGetLastError() { return cudaSuccess; }
 inline cudaError_t cudaGetDevice(int* device) {
   *device = emulation::current_device;
@@ -176,8 +184,9 @@ inline cudaError_t cudaSetDevice(int device) {
   emulation::current_device = device;
   return cudaSuccess;
 }
-inline cudaError_t cudaMemsetAsync(void* place, int value, std::size_t bytes, cudaStream_t) {
-  std::memset(place, value, bytes);
+inline cudaError_t cudaMemsetAsync(void* place, int value, std::size_t bytes, cudaStream_t stream) {
+  emulation::run_or_record(stream, reinterpret_cast<const void*>(&cudaMemsetAsync),
+                           [=] { std::memset(place, value, bytes); });
   return cudaSuccess;
 }
 inline cudaError_t cudaMemcpyAsync(void* to, const void* from, std::size_t bytes, cudaMemcpyKind, cudaStream_t) {
@@ -207,7 +216,63 @@ inline cudaError_t cudaEventSynchronize(cudaEvent_t) {
   return cudaSuccess;
 }
 inline cudaError_t cudaEventDestroy(cudaEvent_t) { return cudaSuccess; }
-inline cudaError_t cudaStreamSynchronize(cudaStream_t) { return cudaSuccess; }
+inline cudaError_t cudaStreamSynchronize(cudaStream_t) {
+  emulation::refuse_in_graph("a wait");
+  return cudaSuccess;
+}
+
+// --- graphs: what is recorded is executed when the graph is launched, with the arguments that it was recorded with ------
+
+inline cudaError_t cudaStreamCreateWithFlags(cudaStream_t* stream, unsigned) {
+  emulation::refuse_in_graph("a new stream");
+  *stream = new EmulatedStream;
+  return cudaSuccess;
+}
+inline cudaError_t cudaStreamDestroy(cudaStream_t stream) {
+  delete stream;
+  return cudaSuccess;
+}
+inline cudaError_t cudaStreamBeginCapture(cudaStream_t stream, cudaStreamCaptureMode) {
+  if (stream == nullptr) emulation::fail("the stream that torch uses cannot record");
+  if (emulation::refuses_graphs()) return cudaErrorStreamCaptureUnsupported;
+  emulation::begin_graph();
+  emulation::set_recording(true);
+  stream->recording = new EmulatedGraph;
+  return cudaSuccess;
+}
+inline cudaError_t cudaStreamEndCapture(cudaStream_t stream, cudaGraph_t* graph) {
+  *graph = stream->recording;
+  stream->recording = nullptr;
+  emulation::set_recording(false);
+  emulation::end_graph();
+  return cudaSuccess;
+}
+inline cudaError_t cudaGraphInstantiateWithFlags(cudaGraphExec_t* made, cudaGraph_t graph, unsigned long long) {
+  *made = new EmulatedGraph(*graph);
+  return cudaSuccess;
+}
+// Graphs of the same kernels in the same order can be changed to one another.
+inline cudaError_t cudaGraphExecUpdate(cudaGraphExec_t made, cudaGraph_t graph, cudaGraphExecUpdateResultInfo*) {
+  const auto same = [](const EmulatedNode& a, const EmulatedNode& b) { return a.what == b.what; };
+  if (!std::equal(made->nodes.begin(), made->nodes.end(), graph->nodes.begin(), graph->nodes.end(), same))
+    return cudaErrorGraphExecUpdateFailure;
+  *made = *graph;
+  return cudaSuccess;
+}
+inline cudaError_t cudaGraphLaunch(cudaGraphExec_t made, cudaStream_t stream) {
+  if (stream != nullptr) emulation::fail("a graph on a stream that only records");
+  emulation::refuse_in_graph("a graph");
+  for (const EmulatedNode& node : made->nodes) node.run();
+  return cudaSuccess;
+}
+inline cudaError_t cudaGraphDestroy(cudaGraph_t graph) {
+  delete graph;
+  return cudaSuccess;
+}
+inline cudaError_t cudaGraphExecDestroy(cudaGraphExec_t made) {
+  delete made;
+  return cudaSuccess;
+}
 
 namespace ggslam::cuda {
 
@@ -218,10 +283,13 @@ struct CaptureRegion {
 };
 
 template <class Kernel, class... Arguments>
-void launch(Kernel kernel, std::int64_t blocks, int threads, cudaStream_t, const Arguments&... arguments) {
-  const auto thread = [&] { kernel(arguments...); };
-  using Thread = decltype(thread);
-  emulation::run_grid(blocks, threads, [](const void* code) { (*static_cast<const Thread*>(code))(); }, &thread);
+void launch(Kernel kernel, std::int64_t blocks, int threads, cudaStream_t stream, const Arguments&... arguments) {
+  if (blocks <= 0) return;
+  emulation::run_or_record(stream, reinterpret_cast<const void*>(kernel), [=] {
+    const auto thread = [&] { kernel(arguments...); };
+    using Thread = decltype(thread);
+    emulation::run_grid(blocks, threads, [](const void* code) { (*static_cast<const Thread*>(code))(); }, &thread);
+  });
 }
 
 }  // namespace ggslam::cuda

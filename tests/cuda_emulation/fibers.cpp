@@ -198,13 +198,22 @@ void fail(const char* what) {
 
 namespace {
 std::atomic<std::thread::id> in_graph{};
-}
+std::atomic<bool> records{}, refuses{};
+}  // namespace
 
 void begin_graph() {
   if (in_graph.exchange(std::this_thread::get_id()) != std::thread::id()) fail("a graph within a graph");
 }
 
 void end_graph() { in_graph = std::thread::id(); }
+
+void set_recording(bool recording) { records = recording; }
+
+bool refuses_graphs() { return refuses.load(); }
+
+void refuse_graphs(bool refused) { refuses = refused; }
+
+bool is_recording() { return records.load() && in_graph.load() == std::this_thread::get_id(); }
 
 void refuse_in_graph(const char* what) {
   if (in_graph.load() == std::this_thread::get_id()) fail(what);
@@ -278,3 +287,6 @@ extern "C" void ggslam_emulation_order(int order) { emulation::order = order; }
 
 // The device that calls without a device mean; returns what it was.
 extern "C" int ggslam_emulation_device(int device) { return std::exchange(emulation::current_device, device); }
+
+// From now on no graph can be recorded.
+extern "C" void ggslam_emulation_refuse_graphs(int refused) { emulation::refuse_graphs(refused != 0); }

@@ -19,6 +19,13 @@ enum Operation { kShuffle, kShuffleXor, kBallot, kReduceAdd, kReduceMax, kSync }
 void begin_graph();
 void end_graph();
 
+// Whether what the calling thread starts in between is noted instead of run.
+void set_recording(bool recording);
+bool is_recording();
+
+// Whether the runtime refuses to record, as tests may ask for.
+bool refuses_graphs();
+
 // Fails if the calling thread is between them: a graph holds nothing of this kind.
 void refuse_in_graph(const char* what);
 

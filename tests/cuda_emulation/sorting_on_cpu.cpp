@@ -9,8 +9,10 @@ namespace ggslam::cuda {
 
 std::size_t sorting_bytes(std::int64_t) { return 1; }
 
-cudaError_t sort_pairs(void*, std::size_t, const std::uint32_t* keys, std::uint32_t* sorted_keys, const std::uint32_t* values,
-                       std::uint32_t* sorted_values, std::int64_t count, int bits, cudaStream_t) {
+namespace {
+
+void sort(const std::uint32_t* keys, std::uint32_t* sorted_keys, const std::uint32_t* values,
+          std::uint32_t* sorted_values, std::int64_t count, int bits) {
   const std::uint32_t mask = bits == 32 ? ~0u : (1u << bits) - 1;
   std::vector<std::int64_t> order(static_cast<std::size_t>(count));
   std::iota(order.begin(), order.end(), 0);
@@ -20,21 +22,34 @@ cudaError_t sort_pairs(void*, std::size_t, const std::uint32_t* keys, std::uint3
     sorted_keys[i] = keys[order[static_cast<std::size_t>(i)]];
     sorted_values[i] = values[order[static_cast<std::size_t>(i)]];
   }
+}
+
+template <class Number>
+cudaError_t sum(const Number* numbers, Number* sums, std::int64_t count, cudaStream_t stream) {
+  emulation::run_or_record(stream, reinterpret_cast<const void*>(&sum<Number>),
+                           [=] { std::partial_sum(numbers, numbers + count, sums); });
+  return cudaSuccess;
+}
+
+}  // namespace
+
+cudaError_t sort_pairs(void*, std::size_t, const std::uint32_t* keys, std::uint32_t* sorted_keys, const std::uint32_t* values,
+                       std::uint32_t* sorted_values, std::int64_t count, int bits, cudaStream_t stream) {
+  emulation::run_or_record(stream, reinterpret_cast<const void*>(&sort_pairs),
+                           [=] { sort(keys, sorted_keys, values, sorted_values, count, bits); });
   return cudaSuccess;
 }
 
 cudaError_t running_sum(void*, std::size_t, const std::uint32_t* numbers, std::uint32_t* sums, std::int64_t count,
-                        cudaStream_t) {
-  std::partial_sum(numbers, numbers + count, sums);
-  return cudaSuccess;
+                        cudaStream_t stream) {
+  return sum(numbers, sums, count, stream);
 }
 
 std::size_t long_sum_bytes(std::int64_t) { return 1; }
 
 cudaError_t long_running_sum(void*, std::size_t, const std::int64_t* numbers, std::int64_t* sums, std::int64_t count,
-                             cudaStream_t) {
-  std::partial_sum(numbers, numbers + count, sums);
-  return cudaSuccess;
+                             cudaStream_t stream) {
+  return sum(numbers, sums, count, stream);
 }
 
 }  // namespace ggslam::cuda

@@ -16,14 +16,16 @@ run on the CPU, and kernels in their emulation. What is recorded:
     calls      functions of the kernels' library
     kept       tensors whose memory is kept for work on a stream (record_stream)
 
-What raises: `DeviceMixing` as said; NotImplementedError for operations on uint16 that torch may not have on a device;
-whatever torch itself refuses for tensors there, such as `.numpy()`.
-Not modelled: the order of streams, CUDA graphs, memory that is used again too early, autograd, operations that torch
-has for one of both only. Threads are watched if they are started within.
+What raises: `DeviceMixing` as said; `UnorderedWork` where two streams use the same memory, one of them to write, and
+neither is sure to be first (calls of the kernels' library count as writing to all that they are given);
+NotImplementedError for operations on uint16 that torch may not have on a device; whatever torch itself refuses for
+tensors there, such as `.numpy()`.
+Not modelled: CUDA graphs (the emulation has them), memory that is used again too early, autograd, operations that
+torch has for one of both only. Threads are watched if they are started within.
 """
 
-from device_watch.records import DeviceMixing, Record
+from device_watch.records import DeviceMixing, Record, UnorderedWork
 from device_watch.tensors import DEVICE, DeviceTensor
 from device_watch.watch import DeviceWatch
 
-__all__ = ["DEVICE", "DeviceMixing", "DeviceTensor", "DeviceWatch", "Record"]
+__all__ = ["DEVICE", "DeviceMixing", "DeviceTensor", "DeviceWatch", "Record", "UnorderedWork"]

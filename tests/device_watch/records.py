@@ -19,6 +19,10 @@ class DeviceMixing(RuntimeError):
     """Host and device memory in one operation."""
 
 
+class UnorderedWork(RuntimeError):
+    """Two streams use the same memory, and nothing says which is first."""
+
+
 @dataclass(frozen=True)
 class Record:
     """Something that happened.
@@ -28,12 +32,14 @@ class Record:
         where: innermost line of ggslam, else of the test: "file:line function".
         bytes: of a copy.
         blocking: whether the host waits.
+        stream: that it was started on; 0: the one of all threads.
     """
 
     operation: str
     where: str
     bytes: int = 0
     blocking: bool = True
+    stream: int = 0
 
 
 def here() -> str:

@@ -34,6 +34,9 @@ OF_ALL_TYPES = {
 }
 """Operations, besides views, that torch surely has for `FEW_OPERATIONS` on CUDA devices."""
 
+NO_WORK = {"detach", "device", "empty", "empty_like", "empty_strided", "new_empty", "record_stream", "set_"}
+"""Operations, besides views, that look at no values."""
+
 INDEXING = {"index", "_unsafe_index", "index_put", "index_put_", "_index_put_impl_"}
 MASKS = (torch.bool, torch.uint8)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
@@ -64,10 +65,15 @@ def active_watch() -> DeviceWatch:
 
 
 class DeviceMemory:
-    """Where tensors of the device lie."""
+    """Where tensors of the device lie.
 
-    def __init__(self) -> None:
+    Args:
+        released: is told of memory that no tensor has any more, by its address.
+    """
+
+    def __init__(self, released: Callable[[int], None]) -> None:
         self._storages: dict[int, list[int]] = {}  # address: bytes, tensors alive
+        self._released = released
 
     def wrap(self, host: torch.Tensor) -> DeviceTensor:
         """The tensor as one of the device."""
@@ -83,7 +89,9 @@ class DeviceMemory:
         place[1] -= 1
         if place[1] == 0:
             del self._storages[address]
+            self._released(address)
 
-    def has(self, address: int) -> bool:
-        """Whether the address is in the memory of a tensor that is alive."""
-        return any(start <= address < start + size for start, (size, _) in list(self._storages.items()))
+    def place_of(self, address: int) -> int | None:
+        """Where the memory of a tensor that is alive begins that has this address; None: there is none."""
+        found = (start for start, (size, _) in list(self._storages.items()) if start <= address < start + size)
+        return next(found, None)

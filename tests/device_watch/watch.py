@@ -18,8 +18,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map_only, tree_unflatten
 
 from device_watch.guard import register_guard
+from device_watch.order import Clock, WorkOrder
 from device_watch.records import DeviceMixing, Record, here
-from device_watch.rules import check_mixing, check_type, host_indices, waits
+from device_watch.rules import NO_WORK, check_mixing, check_type, host_indices, waits
 from device_watch.stand_ins import DeviceGenerator, HostGenerator, replacements
 from device_watch.tensors import DEVICE, DeviceMemory, DeviceTensor, _watches
 from ggslam.cuda.library import CudaLibrary
@@ -42,13 +43,15 @@ class WatchedLibrary(CudaLibrary):
     def call(self, name: str, *arguments: object) -> None:
         watch = self._watch()
         assert watch is not None
-        watch.calls.append(Record(name, here()))
+        watch.calls.append(Record(name, here(), stream=watch.order.stream))
+        used: set[int] = set()
         for argument, following in zip(arguments, (*arguments[1:], None), strict=True):
             if isinstance(found := getattr(argument, "_obj", argument), ctypes.Structure):
-                watch.check_addresses(name, found)
+                used |= watch.check_addresses(name, found)
             if isinstance(argument, ctypes.Array) and isinstance(following, int):  # structures, and how many
                 for found in argument[:following]:
-                    watch.check_addresses(name, found)
+                    used |= watch.check_addresses(name, found)
+        watch.order.start(name, set(), used)  # what is only read is not known
         if name.startswith("wait") or name.endswith("_wait"):
             watch.record_wait(f"ggslam_cuda_{name}")
         super().call(name, *arguments)
@@ -80,13 +83,17 @@ class _Generators(TorchFunctionMode):
 class DeviceWatch:
     """See `device_watch`.
 
+    Args:
+        is_slow: whether work seems to be done only when the host waits for it, instead of at once.
+
     Attributes:
         waits, uploads, downloads, calls, kept: what happened so far.
         library: kernels for tensors of the pretended device.
         started: number of asynchronous downloads so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, is_slow: bool = False) -> None:
+        self.is_slow = is_slow
         self.waits: list[Record] = []
         self.uploads: list[Record] = []
         self.downloads: list[Record] = []
@@ -94,7 +101,8 @@ class DeviceWatch:
         self.kept: list[Record] = []
         self.started = 0
         self.library = WatchedLibrary(self)
-        self._memory = DeviceMemory()
+        self.order = WorkOrder()
+        self._memory = DeviceMemory(self.order.forget)
         self._page_locked: dict[int, torch.Tensor] = {}  # by address; kept, so that no other memory gets it
         self._under_way: list[tuple[int, torch.Tensor, torch.Tensor]] = []  # number, destination, values
         self._stack = ExitStack()
@@ -135,9 +143,11 @@ class DeviceWatch:
 
     # --- records -----------------------------------------------------------------------------------------------------
 
-    def record_wait(self, operation: str, before: int | None = None) -> None:
-        """The host waits, and with that the first `before` asynchronous downloads have arrived; None: all."""
+    def record_wait(self, operation: str, before: int | None = None, clock: Clock | None = None) -> None:
+        """The host waits, for all that is done by `clock`, None: for what the thread's stream was given; with that the
+        first `before` asynchronous downloads have arrived, None: all."""
         self.waits.append(Record(operation, here()))
+        self.order.host_waits(clock)
         self.finish(before)
 
     def note_kept(self) -> None:
@@ -153,17 +163,26 @@ class DeviceWatch:
             else:
                 self._under_way.append(entry)
 
-    def check_addresses(self, name: str, structure: ctypes.Structure) -> None:
-        """Raises DeviceMixing unless all addresses in a structure but "stream" lead into tensors that are alive."""
+    def check_addresses(self, name: str, structure: ctypes.Structure) -> set[int]:
+        """Where the tensors begin that the addresses in a structure lead into.
+
+        Raises:
+            DeviceMixing: an address but "stream" leads into no tensor that is alive.
+        """
+        found: set[int] = set()
         for field, kind, *_ in structure._fields_:  # type: ignore[misc]
             value = getattr(structure, field)
             if isinstance(value, ctypes.Structure):
-                self.check_addresses(f"{name}: {field}", value)
-            elif kind is ctypes.c_void_p and value and field != "stream" and not self._has(value):
-                raise DeviceMixing(f"{name}: {field} is no address of device memory")
+                found |= self.check_addresses(f"{name}: {field}", value)
+            elif kind is ctypes.c_void_p and value and field != "stream":
+                place = self._memory.place_of(value)
+                if place is None and not self._is_in_page_locked(value):
+                    raise DeviceMixing(f"{name}: {field} is no address of device memory")
+                found |= set() if place is None else {place}
+        return found
 
-    def _has(self, address: int) -> bool:
-        return self._memory.has(address) or any(
+    def _is_in_page_locked(self, address: int) -> bool:
+        return any(
             start <= address < start + tensor.untyped_storage().nbytes()
             for start, tensor in self._page_locked.items()
         )  # fmt: skip
@@ -182,9 +201,11 @@ class DeviceWatch:
         check_type(func, tensors, kwargs.get("device"), kwargs.get("dtype"))
         for index in host_indices(name, args):
             self._record_upload(name, index, False)
+        result = self._run(func, flat, spec, kwargs.get("device"))
+        self._note_order(func, args, kwargs, result)
         if waits(func, args):
             self.record_wait(name)
-        return self._run(func, flat, spec, kwargs.get("device"))
+        return result
 
     def _run(self, func: Any, flat: list[Any], spec: Any, device: torch.device | None) -> Any:
         if device is not None and device.type == "cuda" and device.index not in (None, 0):
@@ -202,6 +223,19 @@ class DeviceWatch:
             torch.Tensor, lambda host: wrappers[id(host)] if id(host) in wrappers else self._memory.wrap(host), result
         )
 
+    def _note_order(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any], result: Any) -> None:
+        """An operation on tensors of the device, unless it looks at none of their values."""
+        if func.is_view or func.overloadpacket.__name__ in NO_WORK:
+            return
+        reads, writes = set[int](), set[int]()
+        for number, argument in enumerate(func._schema.arguments):
+            value = args[number] if number < len(args) else kwargs.get(argument.name)
+            changed = argument.alias_info is not None and argument.alias_info.is_write
+            (writes if changed else reads).update(_places(value))
+        writes |= _places(result) - reads
+        if reads or writes:
+            self.order.start(func.overloadpacket.__name__, reads, writes)
+
     def _run_device(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         return DEVICE  # of a DeviceTensor: torch asks no other
 
@@ -216,6 +250,7 @@ class DeviceWatch:
     def _run__to_copy(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         source, device, asynchronous = args[0], kwargs.get("device"), kwargs.pop("non_blocking", False)
         device = source.device if device is None else device
+        self.order.start("to", _places(source), set())
         values = func(_of_host(source), **{**kwargs, "device": torch.device("cpu")})
         if device.type == "cuda":
             if not isinstance(source, DeviceTensor):
@@ -233,6 +268,7 @@ class DeviceWatch:
         target, source = args[:2]
         asynchronous = args[2] if len(args) > 2 else kwargs.get("non_blocking", False)
         to_device, from_device = isinstance(target, DeviceTensor), isinstance(source, DeviceTensor)
+        self.order.start("copy_", _places(source), _places(target))
         if to_device and not from_device:
             self._record_upload("copy_", source, asynchronous)
         if from_device and not to_device:
@@ -259,6 +295,12 @@ class DeviceWatch:
         self._under_way.append((self.started, target, values))
         self.started += 1
         target.fill_(torch.nan if target.is_floating_point() else 85)  # not there yet
+
+
+def _places(value: Any) -> set[int]:
+    """Addresses of the memory of tensors of the device."""
+    tensors = [part for part in tree_flatten(value)[0] if isinstance(part, DeviceTensor)]
+    return {tensor.host.untyped_storage().data_ptr() for tensor in tensors}
 
 
 def _of_host(value: Any) -> Any:

@@ -26,13 +26,17 @@ class SlowOutlet(KeptOutlet):
         super().__init__(**values)
         self.seconds, self.begun = seconds, 0
 
+    def wait(self) -> object:
+        """Until a message is sent."""
+        return time.sleep(self.seconds)
+
     def send(self, channel: Channel, content: Content, stamp: float) -> int:
         self.begun += 1
-        time.sleep(self.seconds)
+        self.wait()
         return super().send(channel, content, stamp)
 
 
-def until(happened: Callable[[], object], seconds: float = 10.0) -> None:
+def until(happened: Callable[[], object], seconds: float = 30.0) -> None:
     """Waits until something is so."""
     end = time.monotonic() + seconds
     while not happened():

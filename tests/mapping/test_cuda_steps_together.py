@@ -13,20 +13,14 @@ import numpy as np
 import pytest
 import torch
 from cuda_emulation import emulated_library
+from cuda_mappers import LEARNING, add_keyframe, assert_same, make_mapper
 from device_watch import DeviceTensor, DeviceWatch
 
-from ggslam.cuda.library import CudaLibrary
-from ggslam.mapping.cuda.identity import CudaIdentityLearner
 from ggslam.mapping.cuda.keyframe_states import KeyframeStateTuning
 from ggslam.mapping.cuda.mapper import CudaMapper
 from ggslam.mapping.cuda.training import CudaTraining
-from ggslam.mapping.identity_settings import IdentitySettings, NeighbourSettings
-from ggslam.mapping.labelling import KeyframeLabels
-from ggslam.mapping.settings import MapperSettings
 from ggslam.scene.frame import Frame
-from ggslam.scene.gaussian_map import GaussianMap
-from ggslam.scene.identity import IDENTITY_CHANNELS
-from ggslam.scene.poses import inverse, se3_exp
+from ggslam.scene.poses import inverse
 from ggslam.sequences import open_sequence
 from ggslam.system.tuning import overridden
 
@@ -36,41 +30,11 @@ def frames(room: Path) -> list[Frame]:
     return list(open_sequence(room, scale=0.22, stride=4).stream(masks=True))[:4]
 
 
-def make_mapper(library: CudaLibrary, identity: IdentitySettings | None = None) -> CudaMapper:
-    exposed, device = replace(MapperSettings().exposure, enabled=True), library.whole_device(None)
-    learner = None if identity is None else CudaIdentityLearner(identity, 1, device, library)
-    gaussians = GaussianMap(feature_channels=0 if identity is None else IDENTITY_CHANNELS, device=device)
-    mapper = CudaMapper(gaussians, replace(MapperSettings(), exposure=exposed), library, identity=learner)
-    mapper.pixel_m = 0.01
-    return mapper
-
-
-def add_keyframe(mapper: CudaMapper, frame: Frame, number: int = 0, **labels: Any) -> None:
-    """Where it is, but for a little that training takes back."""
-    assert frame.T_world_camera is not None
-    shaken = se3_exp(1e-3 * np.random.default_rng(number).normal(size=6))
-    found = KeyframeLabels(frame.mask, **labels)
-    mapper.add_keyframe(frame, frame.T_world_camera @ inverse(shaken), lambda keyframe, show: found)
-
-
 @contextmanager
 def one_by_one() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(CudaTraining, "is_ready", property(lambda self: False))
         yield
-
-
-def assert_same(found: CudaMapper, expected: CudaMapper) -> None:
-    ours, theirs = found.map.state(), expected.map.state()
-    assert ours["count"] == theirs["count"] > 500
-    for name, rows in theirs["rows"].items():
-        assert torch.equal(ours["rows"][name], rows), name
-    assert np.array_equal(found._states.read_poses(), expected._states.read_poses())
-    assert np.array_equal(found._states.read_exposures(), expected._states.read_exposures())
-    assert found._states.read_sums() == expected._states.read_sums()
-    assert torch.equal(found._rasterizer.overflows, expected._rasterizer.overflows)
-    assert [k.iterations for k in found.keyframes] == [k.iterations for k in expected.keyframes]
-    assert found.times.iterations == expected.times.iterations and found.times.steps == expected.times.steps
 
 
 def both_ways(work: Callable[[], CudaMapper]) -> tuple[CudaMapper, CudaMapper]:
@@ -149,9 +113,6 @@ def test_cameras_of_several_sizes(frames: list[Frame], room: Path) -> None:
 
     found, _ = both_ways(work)
     assert len({keyframe.camera for keyframe in found.keyframes}) == 2 and found._training.fillings > 5
-
-
-LEARNING = IdentitySettings(every=2, pixels=64, neighbours=NeighbourSettings(samples=20, every=2))
 
 
 @pytest.mark.parametrize("schedule", ["sampled", "votes"])

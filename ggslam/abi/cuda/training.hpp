@@ -39,16 +39,31 @@ struct TrainingStep {
   std::int32_t lesson;   // number of the step of identity learning on the same rendering; -1: there is none
 };
 
+// What became of pieces of steps: a step, or, with identity learning in its midst, what comes before and after that.
+struct GraphCounts {
+  std::int64_t started;  // as graphs
+  std::int64_t plain;    // kernel by kernel
+  std::int64_t made;     // graphs that were recorded and made
+  std::int64_t changed;  // graphs that became those of another job
+  std::int64_t refused;  // not recorded, because the CUDA runtime refused to; from then on nothing is
+};
+
 }  // namespace ggslam::cuda
+
+// Graphs of steps, for the jobs that were used last; and their end, which waits for nothing.
+GGSLAM_EXPORT int ggslam_cuda_graphs_create(int device, void** graphs);
+GGSLAM_EXPORT void ggslam_cuda_graphs_destroy(void* graphs);
+GGSLAM_EXPORT void ggslam_cuda_graph_counts(const void* graphs, ggslam::cuda::GraphCounts* counts);
 
 // Bytes of memory of a desk.
 GGSLAM_EXPORT std::int64_t ggslam_cuda_training_bytes();
 
 // Makes `count` steps one after the other: forward, loss, backward with the optimizer, the keyframe's step. A step whose
 // rendering finds no room changes nothing and is counted, see Rendering. identity, lessons: of those steps that have one
-// of identity learning, else null. counter: receives the largest number of pairs;
-// recent_pairs: on the host, receives what ggslam_cuda_recent_pairs says.
+// of identity learning, else null. graphs: null, or those by which what is used again is started as a whole; what is
+// computed is the same. counter: receives the largest number of pairs; recent_pairs: on the host, receives what
+// ggslam_cuda_recent_pairs says.
 GGSLAM_EXPORT int ggslam_cuda_train(const ggslam::cuda::TrainingJob* job, const ggslam::cuda::TrainingStep* steps,
                                     int count, const ggslam::cuda::IdentityJob* identity,
-                                    const ggslam::cuda::IdentityStep* lessons, void* counter,
+                                    const ggslam::cuda::IdentityStep* lessons, void* graphs, void* counter,
                                     std::int64_t* recent_pairs);

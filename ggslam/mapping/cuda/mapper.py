@@ -113,8 +113,8 @@ class CudaMapper(ComparingMapper):
         """Memory on the device that images of keyframes take at present; part of it for good, see `ImageStore`."""
         return self._images.nbytes
 
-    def beside_others(self) -> AbstractContextManager[object]:
-        return SideStream(self.device)
+    def beside_others(self, host_waits: bool = True) -> AbstractContextManager[object]:
+        return SideStream(self.device, host_waits)
 
     def in_turn(self) -> AbstractContextManager[object]:
         return self._states.in_turn()
@@ -219,9 +219,9 @@ class CudaMapper(ComparingMapper):
 
     def render_view(self, camera: Camera, T_camera_world: np.ndarray) -> RenderBuffers:
         self._rasterizer.low_pass, self._rasterizer.close_below = LOW_PASS, 0.0
-        with self._with_room():
+        with self.in_turn(), self._with_room():
             view = self._rasterizer.forward(self.map, camera, T_camera_world, features=False)
-        return RenderBuffers(*map(torch.from_numpy, download(view.image, view.depth, view.alpha)))
+            return RenderBuffers(*map(torch.from_numpy, download(view.image, view.depth, view.alpha)))
 
     def _render_all(self, keyframe: Keyframe, grid: PixelGrid = ALL_PIXELS) -> RenderBuffers:
         with self._with_room():

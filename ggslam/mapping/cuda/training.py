@@ -22,6 +22,7 @@ from ggslam.mapping.cuda.keyframe import CudaKeyframe, CudaKeyframeImages
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.lessons import CudaLessons
 from ggslam.mapping.cuda.losses import CudaImageLoss
+from ggslam.mapping.cuda.step_graphs import StepGraphs
 from ggslam.mapping.settings import LossSettings, MapperSettings
 from ggslam.rendering.adam import ADAM_GROUPS, AdamSettings
 from ggslam.rendering.arguments import image_gradients
@@ -82,6 +83,9 @@ class CudaTraining:
         rasterizer: to render with, one that does not wait.
         loss: evaluates the images.
         states: of the keyframes.
+
+    Attributes:
+        graphs: by which steps are started.
     """
 
     def __init__(self, rasterizer: CudaRasterizer, loss: CudaImageLoss, states: KeyframeStates) -> None:
@@ -107,6 +111,7 @@ class CudaTraining:
         self._twist = torch.zeros(6, dtype=torch.float64, device=self._device)
         self.fillings = 0
         """How often the job was filled."""
+        self.graphs = StepGraphs(self._library, self._device.index or 0)
 
     @property
     def is_ready(self) -> bool:
@@ -172,10 +177,10 @@ class CudaTraining:
         self._job.rendering.stream = self._states.begin_steps()
         self._rasterizer.forget()
         identity = ctypes.byref(self._identity) if self._identity is not None and self._lesson_count else None
-        counter, recent = self._rasterizer.counter.handle, ctypes.byref(self._recent)
+        ends = self.graphs.handle, self._rasterizer.counter.handle, ctypes.byref(self._recent)
         steps, lessons = self._steps, self._lessons
         self.count = self._lesson_count = 0
-        self._library.call("train", ctypes.byref(self._job), steps, count, identity, lessons, counter, recent)
+        self._library.call("train", ctypes.byref(self._job), steps, count, identity, lessons, *ends)
         self._images.clear()
 
     # --- the job -----------------------------------------------------------------------------------------------------

@@ -135,7 +135,6 @@ differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussia
                                                       !out_of_room(gaussians, pairs));
   WarpQueue<kFeatures>& queue = queues[warp];
   share_image_gradients(pixel, queue.pixel(lane));
-  QueuedSplat mine = {};
   int queued = 0;
 
   for (int end = (maximum_of_block(pixel.last) >> 1) + 1; end > 0; end -= kBatch) {
@@ -157,14 +156,14 @@ differentiate_kernel(GaussianArrays arrays, Grid grid, GaussianWorkspace gaussia
         const Contribution c = differentiate<kFeatures, kDetached>(splat, batch.features[k], first + k, pixel);
         queue.weights[queued * kQueueStride + lane] = c.weight;
         queue.log_alphas[queued * kQueueStride + lane] = c.log_alpha;
-        if (lane % kQueued == queued) mine = {splat.mean_x, splat.mean_y, splat.slope_x, batch.rows[k]};
+        if (lane == 0) queue.splats[queued] = {splat.mean_x, splat.mean_y, splat.slope_x, batch.rows[k]};
         if (++queued < kQueued) continue;
-        empty_queue(queue, mine, queued, pixel.x, pixel.y, group, out);
+        empty_queue(queue, queued, pixel.x, pixel.y, group, out);
         queued = 0;
       }
     }
   }
-  if (queued > 0) empty_queue(queue, mine, queued, pixel.x, pixel.y, group, out);
+  if (queued > 0) empty_queue(queue, queued, pixel.x, pixel.y, group, out);
 }
 
 }  // namespace ggslam::cuda

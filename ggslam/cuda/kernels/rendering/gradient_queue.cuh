@@ -24,6 +24,12 @@ struct GradientRows {
   std::uint8_t* touched;  // [N]
 };
 
+// A splat that is queued.
+struct __align__(16) QueuedSplat {
+  float mean_x, mean_y, slope_x;
+  std::uint32_t row;
+};
+
 // One warp's part of shared memory.
 template <int kFeatures>
 struct __align__(16) WarpQueue {
@@ -31,16 +37,11 @@ struct __align__(16) WarpQueue {
   static constexpr int kRowStride = kWarpWidth * kChannels + 4;  // rows of pixels start in different banks
   float image_gradients[kWarpHeight * kRowStride];  // [row][column][channel]
   float weights[kQueued * kQueueStride], log_alphas[kQueued * kQueueStride];  // [splat][pixel]
+  QueuedSplat splats[kQueued];  // not in registers: there are none left where there are 16 features
 
   __device__ float* pixel(int lane) {
     return image_gradients + lane / kWarpWidth * kRowStride + lane % kWarpWidth * kChannels;
   }
-};
-
-// What a lane knows of the queued splat that it will stand for, number lane % kQueued.
-struct QueuedSplat {
-  float mean_x, mean_y, slope_x;
-  std::uint32_t row;
 };
 
 // Eight numbers of the queue, of one splat and one row of pixels.
@@ -124,11 +125,12 @@ __device__ inline void join_rows(int lane, float (&values)[kValues]) {
 // Adds the gradients of the first `count` queued splats to their Gaussians' rows. x, y: the lane's pixel. All lanes of
 // the warp must call this.
 template <int kFeatures>
-__device__ inline void empty_queue(const WarpQueue<kFeatures>& queue, const QueuedSplat& mine, int count, float x,
-                                   float y, const FeatureGroup& group, const GradientRows& out) {
+__device__ inline void empty_queue(const WarpQueue<kFeatures>& queue, int count, float x, float y,
+                                   const FeatureGroup& group, const GradientRows& out) {
   const int lane = threadIdx.x % kWarp;
   float values[kBaseGradients + kFeatures];
   __syncwarp();  // the queue has been written
+  const QueuedSplat mine = queue.splats[lane % kQueued];  // that the lane stands for
   // The lane's own pixel lies in the row that it sums, as there are as many splats as pixels in a row.
   static_assert(kQueued == kWarpWidth, "a lane's row of pixels is the row that it sums");
   const float left = x - static_cast<float>(lane % kWarpWidth), dy = y - mine.mean_y;

@@ -6,6 +6,7 @@
 
 #include "common/host.cuh"
 #include "rendering/count_pairs.cuh"
+#include "training/step_graphs.cuh"
 
 namespace ggslam::cuda {
 namespace {
@@ -14,8 +15,8 @@ cudaStream_t stream_of(const TrainingJob& job) { return static_cast<cudaStream_t
 
 TrainingDesk* desk_of(const TrainingJob& job) { return static_cast<TrainingDesk*>(job.desk); }
 
-// The job with what each step finds on the desk.
-TrainingJob at_desk(const TrainingJob& given) {
+// The job with what each step finds on the desk, to be started on a stream.
+TrainingJob at_desk(const TrainingJob& given, cudaStream_t stream) {
   TrainingJob job = given;
   TrainingDesk* desk = desk_of(job);
   job.rendering.pose = desk->pose;
@@ -24,7 +25,7 @@ TrainingJob at_desk(const TrainingJob& given) {
   job.loss.target = &desk->step.images;
   if (job.loss.exposure != nullptr) job.loss.exposure = desk->exposure;
   job.keyframe.choice = &desk->step.keyframe;
-  job.loss.stream = job.keyframe.stream = job.rendering.stream;
+  job.rendering.stream = job.loss.stream = job.keyframe.stream = stream;
   job.loss.device = job.keyframe.device = job.rendering.device;
   return job;
 }
@@ -39,27 +40,66 @@ void bound_values(const TrainingJob& job) {
            job.adam.sh.parameters, colors, job.darkest, job.brightest);
 }
 
-// A step of identity learning on a training step's rendering.
-struct Lesson {
-  const IdentityJob* job;
-  const IdentityStep* step;
-};
-
-// The step that is next on the desk. All that is started is the same for every step, but for `bounded` and the lesson,
-// and nothing of it waits, allocates or copies to the host: it could be recorded as a graph.
-int make_step(const TrainingJob& job, bool bounded, const Lesson& lesson) {
-  const CaptureRegion region;
+// The step that is next on the desk, up to its loss. All that is started is the same for every step, and nothing of it
+// waits, allocates or copies to the host: it can be recorded as a graph.
+int start_forward(const TrainingJob& job) {
   launch(begin_step_kernel, 1, kWarp, stream_of(job), desk_of(job));
   int status = ggslam_cuda_project(&job.rendering, nullptr);
   if (status == 0) status = ggslam_cuda_composite(&job.rendering);
   if (status == 0) status = ggslam_cuda_image_loss(&job.loss);
-  if (status == 0 && lesson.step != nullptr) status = ggslam_cuda_learn(lesson.job, lesson.step, &job.rendering);
-  if (status == 0)
-    status = ggslam_cuda_backward(&job.rendering, &job.image_gradients, &job.gradients, &job.adam, job.row_memory);
+  return status;
+}
+
+// What follows from the loss, likewise.
+int start_backward(const TrainingJob& job, bool bounded) {
+  int status =
+      ggslam_cuda_backward(&job.rendering, &job.image_gradients, &job.gradients, &job.adam, job.row_memory);
   if (status == 0) status = ggslam_cuda_keyframe_step(&job.keyframe);
   if (status == 0 && bounded) bound_values(job);
   return status;
 }
+
+// Steps of a job, by graphs if there are any.
+class StepRun {
+ public:
+  StepRun(const TrainingJob& given, StepGraphs* graphs)
+      : given_(given), stream_(stream_of(given)), job_(at_desk(given, stream_)), graphs_(graphs) {
+    if (graphs_ != nullptr) graphs_->choose(given);
+  }
+
+  const TrainingJob& job() const { return job_; }
+
+  int make(bool bounded) const {
+    return run(bounded ? kWholeBoundedStep : kWholeStep, [bounded](const TrainingJob& job) {
+      const int status = start_forward(job);
+      return status != 0 ? status : start_backward(job, bounded);
+    });
+  }
+
+  // With a step of identity learning on the same rendering.
+  int make(bool bounded, const IdentityJob* identity, const IdentityStep* lesson) const {
+    int status = run(kBeforeLesson, start_forward);
+    if (status == 0) status = ggslam_cuda_learn(identity, lesson, &job_.rendering);
+    if (status != 0) return status;
+    return run(bounded ? kAfterLessonBounded : kAfterLesson,
+               [bounded](const TrainingJob& job) { return start_backward(job, bounded); });
+  }
+
+ private:
+  template <class Start>
+  int run(StepPiece piece, const Start& start) const {
+    if (graphs_ == nullptr) {
+      const CaptureRegion region;
+      return start(job_);
+    }
+    return graphs_->run(piece, stream_, [&](cudaStream_t stream) { return start(at_desk(given_, stream)); });
+  }
+
+  const TrainingJob& given_;
+  cudaStream_t stream_;
+  TrainingJob job_;
+  StepGraphs* graphs_;
+};
 
 void lay_down_steps(const TrainingJob& job, const TrainingStep* steps, int count, bool first) {
   StepBatch batch = {};
@@ -76,17 +116,36 @@ using namespace ggslam::cuda;
 
 GGSLAM_EXPORT std::int64_t ggslam_cuda_training_bytes() { return sizeof(TrainingDesk); }
 
+GGSLAM_EXPORT int ggslam_cuda_graphs_create(int device, void** graphs) {
+  auto* made = new StepGraphs(device);
+  *graphs = made;
+  return on_device(device, [&] { return made->begin(); });
+}
+
+GGSLAM_EXPORT void ggslam_cuda_graphs_destroy(void* graphs) {
+  auto* made = static_cast<StepGraphs*>(graphs);
+  on_device(made->device(), [&] {
+    delete made;
+    return cudaSuccess;
+  });
+}
+
+GGSLAM_EXPORT void ggslam_cuda_graph_counts(const void* graphs, GraphCounts* counts) {
+  *counts = static_cast<const StepGraphs*>(graphs)->counts();
+}
+
 GGSLAM_EXPORT int ggslam_cuda_train(const TrainingJob* given, const TrainingStep* steps, int count,
-                                    const IdentityJob* identity, const IdentityStep* lessons, void* counter,
-                                    std::int64_t* recent_pairs) {
-  const TrainingJob job = at_desk(*given);
-  return on_device(job.rendering.device, [&] {
+                                    const IdentityJob* identity, const IdentityStep* lessons, void* graphs,
+                                    void* counter, std::int64_t* recent_pairs) {
+  return on_device(given->rendering.device, [&] {
+    const StepRun run(*given, static_cast<StepGraphs*>(graphs));
+    const TrainingJob& job = run.job();
     int status = 0;
     for (int i = 0; i < count && status == 0; ++i) {
       if (i % kMostWaitingSteps == 0)
         lay_down_steps(job, steps + i, std::min(count - i, kMostWaitingSteps), i == 0);
-      const Lesson lesson{identity, steps[i].lesson >= 0 ? lessons + steps[i].lesson : nullptr};
-      status = make_step(job, steps[i].bounded != 0, lesson);
+      const bool bounded = steps[i].bounded != 0;
+      status = steps[i].lesson < 0 ? run.make(bounded) : run.make(bounded, identity, lessons + steps[i].lesson);
     }
     if (count > 0) count_pairs(counter, desk_of(job)->totals, stream_of(job));
     *recent_pairs = ggslam_cuda_recent_pairs(counter);
