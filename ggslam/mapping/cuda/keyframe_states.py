@@ -105,6 +105,7 @@ class KeyframeStates:
             self._use(table)
         self._write(self._count, T_camera_world, exposure)
         self._count += 1
+        self._changes += 1  # whoever read before that has a row too few
         return self._count - 1
 
     def pose(self, i: int) -> torch.Tensor:
@@ -156,12 +157,17 @@ class KeyframeStates:
             job.exposure_rate, job.exposure_regularization = exposure.rate, exposure.regularization
         job.stream = self.begin_steps()
         self.library.call("keyframe_step", ctypes.byref(job))
+        self.note_steps()
 
     def begin_steps(self) -> int | None:
-        """Others are about to make steps, with `address` and `totals`; returns the stream for them."""
+        """Others are about to start steps, with `address` and `totals`; returns the stream for them."""
+        return self._current_stream()
+
+    def note_steps(self) -> None:
+        """They have started them. What another thread reads meanwhile is of before, and not kept for what comes after.
+        """
         self._changes += 1
         self._read_sums = None
-        return self._current_stream()
 
     def write_pose(self, i: int, T_camera_world: np.ndarray) -> None:
         """Sets keyframe i's pose [4, 4]; the moments of its steps stay.

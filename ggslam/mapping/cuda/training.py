@@ -111,6 +111,7 @@ class CudaTraining:
         steps, lessons, graphs = self._steps, self._lessons, self.graphs.handle
         self.count = self._lesson_count = 0
         self._library.call("train", ctypes.byref(job), steps, count, identity, lessons, graphs, counter, recent)
+        self._states.note_steps()
         self._named.clear()
 
     def _job(self, gaussians: GaussianMap) -> Any:

@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // Graphs of the pieces of training steps, of the jobs that were used last.
 #pragma once
+#include <algorithm>
 #include <array>
 #include <cstring>
+#include <iterator>
 
 #include "abi/cuda/training.hpp"
 #include "common/recorded_work.cuh"
@@ -35,7 +37,8 @@ class StepGraphs {
   void choose(const TrainingJob& given) {
     Bytes bytes;
     TrainingJob job = given;
-    job.rendering.stream = nullptr;  // graphs can be started on any
+    job.rendering.stream = nullptr;  // graphs can be started on any, and rates are those of the steps
+    std::fill(std::begin(job.adam.rates), std::end(job.adam.rates), 0.0f);
     std::memcpy(bytes.data(), &job, sizeof(job));
     ++time_;
     Kept* oldest = &kept_[0];
