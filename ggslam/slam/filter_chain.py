@@ -35,9 +35,10 @@ def filter_classes() -> list[type[FrameFilter]]:
     return sorted(found, key=lambda kind: kind.order)
 
 
-@savable(not_saved="_cleaning _expecting _judging _watching", after="sort")
+@savable()
 class FilterChain(FrameFilter):
-    """Applies filters in a row. Each receives the frame as the previous one returned it.
+    """Applies filters in a row. Each receives the frame as the previous one returned it. Hooks that every frame goes
+    through are not called where they do nothing.
 
     Args:
         filters: in their order.
@@ -47,16 +48,6 @@ class FilterChain(FrameFilter):
 
     def __init__(self, filters: list[FrameFilter]) -> None:
         self.filters = filters
-        self.sort()
-
-    def sort(self) -> None:
-        """Finds the filters with a hook of their own, of those that every frame goes through."""
-
-        def with_own(hook: str) -> list[FrameFilter]:
-            return [one for one in self.filters if getattr(type(one), hook) is not getattr(FrameFilter, hook)]
-
-        self._cleaning, self._expecting = with_own("clean"), with_own("expect")
-        self._judging, self._watching = with_own("judge"), with_own("expects_motion")
 
     @classmethod
     def make_all(cls, made_of: FilterContext) -> FilterChain:
@@ -91,24 +82,28 @@ class FilterChain(FrameFilter):
             one.use_context(context)
 
     def clean(self, frame: Frame) -> Frame:
-        for one in self._cleaning:
-            frame = one.clean(frame)
+        for one in self.filters:
+            if type(one).clean is not FrameFilter.clean:
+                frame = one.clean(frame)
         return frame
 
     def expect(self, frame: Frame) -> Frame:
-        for one in self._expecting:
-            frame = one.expect(frame)
+        for one in self.filters:
+            if type(one).expect is not FrameFilter.expect:
+                frame = one.expect(frame)
         return frame
 
     def judge(
         self, frame: Frame, result: TrackingResult, noise: DepthNoise | None
     ) -> tuple[Frame, TrackingResult]:  # fmt: skip
-        for one in self._judging:
-            frame, result = one.judge(frame, result, noise)
+        for one in self.filters:
+            if type(one).judge is not FrameFilter.judge:
+                frame, result = one.judge(frame, result, noise)
         return frame, result
 
     def expects_motion(self) -> bool:
-        return any(one.expects_motion() for one in self._watching)
+        watching = [one for one in self.filters if type(one).expects_motion is not FrameFilter.expects_motion]
+        return any(one.expects_motion() for one in watching)
 
     def before_insertion(self, removal: MapRemoval, newest: Frame, tracking: TrackingResult) -> None:
         for one in self.filters:
