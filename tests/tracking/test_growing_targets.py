@@ -143,7 +143,8 @@ def test_a_copy_lacks_what_was_touched() -> None:
     assert not some.whole and 0 < some.fine.block_count < 0.05 * whole.fine.block_count
     assert 0 < some.coarse.block_count < 0.2 * whole.coarse.block_count
     assert some.fine.all_blocks >= whole.fine.all_blocks
-    for other in (TargetCopy(whole.target.number + 999, 1, 1), TargetCopy(whole.target.number, whole.target.version, 0)):
+    held = whole.target
+    for other in (TargetCopy(held.number + 999, held.version, 1), TargetCopy(held.number, held.version, 0)):
         assert lacking(nearer, other).whole
     assert lacking(target, some.target).whole  # the copy is of a later version
 

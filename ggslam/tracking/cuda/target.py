@@ -174,14 +174,14 @@ class CudaTarget:
         """Where the kernels find what was sent, from address `first` on, and where it belongs."""
         job.blocks, job.indices = first + changes.blocks_at, first + changes.indices_at
         job.block_count, job.voxel_count = changes.block_count, changes.voxel_count
-        job.voxels = self._kept(f"voxels {level}", Voxel, changes.places)
+        job.voxels = self._reserve(f"voxels {level}", Voxel, changes.places)
         job.moments = job.new_moments = job.new_voxels = None
         if settings is None:
             job.new_voxels = first + changes.values_at
         else:
-            job.moments = self._kept(f"moments {level}", VoxelMoments, changes.places)
+            job.moments = self._reserve(f"moments {level}", VoxelMoments, changes.places)
             job.new_moments, job.settings = first + changes.values_at, settings
 
-    def _kept(self, name: str, value: type[ctypes.Structure], count: int) -> int:
+    def _reserve(self, name: str, value: type[ctypes.Structure], count: int) -> int:
         """Address of memory for so many values that keeps what is there."""
         return self._memory.kept_block(name, sizeof(value) * max(1, count)).data_ptr()
