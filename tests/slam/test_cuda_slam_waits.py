@@ -20,7 +20,7 @@ SETTINGS = ["device=cuda", "mapping.iterations_per_frame=1", "mapping.first_fram
 
 @pytest.mark.long("the whole loop under emulation")
 @pytest.mark.parametrize(("setting", "scale"), [
-    ("identity.schedule=sampled", 0.42), ("identity.schedule=votes", 0.42), ("tracker=edges_planes", 0.75),
+    ("identity.schedule=sampled", 0.42), ("identity.schedule=votes", 0.42), ("tracker=edges_planes", 0.6),
 ])  # fmt: skip
 def test_the_host_waits_for_a_frame_once(
     room: Path, setting: str, scale: float, monkeypatch: pytest.MonkeyPatch

@@ -112,7 +112,7 @@ def test_planes_of_exact_depth_lie_on_the_walls(cuda_library: CudaLibrary) -> No
     assert np.median(off.min(1)) < 1e-6
 
 
-@pytest.mark.parametrize("angle", [0.0, 10.0], ids=["whole", "segments"])
+@pytest.mark.parametrize("angle", [10.0])  # segments, and all that follows
 def test_features_repeat_bit_for_bit_in_any_order_of_threads(angle: float, other_order: None) -> None:
     from cuda_emulation import emulated_library
 

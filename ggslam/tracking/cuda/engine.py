@@ -134,6 +134,10 @@ class CudaTrackingEngine:
         """Where depth images are on the device."""
         return self._depth.address
 
+    def note_depth_arrival(self) -> None:
+        """The host has waited for the stream that `send_depth` used."""
+        self._depth.note_arrival()
+
     def align(
         self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
         noise: DepthNoise, photometric: PhotometricSource | None = None,

@@ -52,7 +52,7 @@ class CudaFeatures:
     """
 
     def __init__(self, settings: FeatureTrackerSettings, tracking: CudaTrackingEngine) -> None:
-        self.tracking, self.library, self.device = tracking, tracking.library, tracking.device
+        self.gicp_engine, self.library, self.device = tracking, tracking.library, tracking.device
         self._settings = settings
         self._job = job = FeatureTrackJob()
         self._scans = FeatureScanJobs(tracking.camera, settings.extraction, self.library, self.device, job.scan)
@@ -94,7 +94,7 @@ class CudaFeatures:
         before = None if self._pending is None else self._pending()
         if before is not None:
             self._start(before)
-        self.tracking.send_depth(depth)
+        self.gicp_engine.send_depth(depth)
         self._scans.set_noise(noise)
         scan = CudaScan(self._scans.rooms, self._blocks.take(CudaScan.words_for(self._scans.rooms)), self._start)
         scan.depth = depth
@@ -145,9 +145,10 @@ class CudaFeatures:
             self._prepare(scan)
         align.stream = self.library.stream(self.device)
         self.library.call("feature_track_wait", self._reference)
+        self.gicp_engine.note_depth_arrival()
         scan.note_extracted()
         self._note_updated()
-        return self._taken(scan, self._found.copy())
+        return self._read_result(scan, self._found.copy())
 
     def flush(self) -> None:
         """Starts what the next alignment would do first: clearing the map, adding the last scan."""
@@ -165,12 +166,12 @@ class CudaFeatures:
 
     def depth_address(self, depth: np.ndarray) -> int | None:
         """Where a frame's depth is on the device, if this very array was sent last."""
-        return self.tracking.depth_address(depth)
+        return self.gicp_engine.depth_address(depth)
 
     def bring_evidence(self, wanted: bool) -> None:
         """See `CudaTrackingEngine.bring_evidence`."""
         if wanted:
-            self.evidence.depth, self.evidence.pose = self.tracking.depth_on_device, self._results.data_ptr()
+            self.evidence.depth, self.evidence.pose = self.gicp_engine.depth_on_device, self._results.data_ptr()
         self._job.makes_evidence = wanted
 
     # --- parts -------------------------------------------------------------------------------------------------------
@@ -178,9 +179,9 @@ class CudaFeatures:
     def _prepare(self, scan: CudaScan) -> None:
         """Sets what extracts a scan; its depth is on the device, or sent anew."""
         assert scan.depth is not None
-        if self.tracking.depth_address(scan.depth) is None:
-            self.tracking.send_depth(scan.depth)
-        self._job.scan.depth, self._job.scan.out = self.tracking.depth_on_device, scan.arrays()
+        if self.gicp_engine.depth_address(scan.depth) is None:
+            self.gicp_engine.send_depth(scan.depth)
+        self._job.scan.depth, self._job.scan.out = self.gicp_engine.depth_on_device, scan.arrays()
 
     def _start(self, scan: CudaScan) -> None:
         """Starts to extract features, if that was not done yet."""
@@ -200,7 +201,7 @@ class CudaFeatures:
             self._matches_room = room
             self._job.align.matches = self._memory.block("matches", 4 * room).data_ptr()
 
-    def _taken(self, scan: CudaScan, found: np.ndarray) -> FeatureAlignment:
+    def _read_result(self, scan: CudaScan, found: np.ndarray) -> FeatureAlignment:
         """An alignment from what the kernels say, float64 [FEATURE_RESULTS]."""
         value, place, s = found.tolist(), FeatureResult, self._settings.align
         scan.set_header(

@@ -33,7 +33,7 @@ class DeviceFeatures(FeatureEngine, Protocol):
     """The same on a device, which has frames' features to itself."""
 
     @property
-    def tracking(self) -> TrackingEngine:
+    def gicp_engine(self) -> TrackingEngine:
         """Extracts points and aligns them there."""
 
     def extract(self, depth: np.ndarray, noise: DepthNoise) -> Scan:

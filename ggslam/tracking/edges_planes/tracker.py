@@ -72,7 +72,7 @@ class FeatureTracker(Tracker):
         engine: DeviceFeatures | None = None,
     ) -> None:
         super().__init__(TrackerState.begin(camera, settings, context, T_world_camera))
-        self._gicp = GicpTracker.with_state(self.state, None if engine is None else engine.tracking)
+        self._gicp = GicpTracker.with_state(self.state, None if engine is None else engine.gicp_engine)
         self.features = features or FeatureTrackerSettings()
         self.local_map = LocalFeatureMap(self.features, engine)
         self.counts = FeatureCounts()
