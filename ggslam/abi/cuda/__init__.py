@@ -10,7 +10,7 @@ from ggslam.abi.core import DECLARED as CORE
 from ggslam.abi.headers import Declarations
 
 HEADERS = (
-    "common", "growth", "mapping", "rendering", "sampled_identity", "sight", "edges_planes", "tracking", "training",
+    "common", "growth", "mapping", "rendering", "sampled_identity", "sight", "tracked_features", "tracking", "training",
     "volumes",
 )  # fmt: skip
 DECLARED = Declarations(Path(__file__).parent, HEADERS, CORE.structures)

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "abi/cuda/common.hpp"
-#include "abi/cuda/edges_planes.hpp"
 #include "abi/cuda/growth.hpp"
 #include "abi/cuda/mapping.hpp"
 #include "abi/cuda/rendering.hpp"
 #include "abi/cuda/sampled_identity.hpp"
 #include "abi/cuda/sight.hpp"
+#include "abi/cuda/tracked_features.hpp"
 #include "abi/cuda/tracking.hpp"
 #include "abi/cuda/training.hpp"
 #include "abi/cuda/volumes.hpp"

@@ -2,7 +2,7 @@
 // The voxels of the local map and how they are found: the rules of FeatureMap in ggslam/tracking/edges_planes/voxels.py,
 // where they are explained.
 #pragma once
-#include "abi/cuda/edges_planes.hpp"
+#include "abi/cuda/tracked_features.hpp"
 #include "common/host.cuh"
 #include "tracking/rigid_motion.cuh"
 

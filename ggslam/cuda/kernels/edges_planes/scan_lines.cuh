@@ -3,7 +3,7 @@
 // plane: the rules of LineScanner in ggslam/tracking/edges_planes/extraction.py, where they are explained. What decides is
 // rounded step by step as there, however a compiler would join products and sums.
 #pragma once
-#include "abi/cuda/edges_planes.hpp"
+#include "abi/cuda/tracked_features.hpp"
 #include "common/host.cuh"
 
 namespace ggslam::cuda {
