@@ -15,6 +15,7 @@ from ggslam.system.tuning import Tuning
 from ggslam.tracking.edges_planes.extraction import LineScanner, ScanFeatures, ScanLines
 from ggslam.tracking.edges_planes.segments import RangeSegments
 from ggslam.tracking.edges_planes.settings import ExtractionSettings
+from ggslam.tracking.points import check_depth
 from ggslam.tracking.settings import DepthNoise
 
 
@@ -106,9 +107,7 @@ class DepthImageFeatures:
         Raises:
             ValueError: another size than the camera's.
         """
-        expected = (self.camera.height, self.camera.width)
-        if depth.shape != expected:
-            raise ValueError(f"depth is {depth.shape}, expected {expected} of the camera")
+        check_depth(depth, self.camera)
         if self._segments is not None:
             depth = self._segments.without_small(depth, noise)
         image = self._depth.copy_(torch.tensor(np.ascontiguousarray(depth, np.float32)))
