@@ -166,6 +166,7 @@ def test_what_did_not_arrive_is_sent_again(copy: Copy, views: list[tuple[FramePo
     copy.bring(two)
     copy.target.stage(three)
     copy.target.fill(three, copy.job)  # and then the call of the kernels fails
+    copy.target.stage(three)  # beside it, by a thread that does not know
     for target in (three, two, one):
         copy.bring(target)
         assert copy.was_sent_whole and is_like(copy, target)
