@@ -4,15 +4,18 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
+import torch
 from device_watch import DeviceTensor, DeviceWatch
 from torch.utils._pytree import tree_flatten
 
@@ -56,8 +59,65 @@ class CallCounter:
             threading.setprofile(None)  # type: ignore[arg-type]
 
 
-class TimedFunctions:
-    """The functions of a library of kernels; notes how often they are called and how long they take.
+class KernelThread:
+    """Makes the calls of a kernels' library in a thread of its own on the last processor, and copies that the caller
+    need not wait for beside it: what the host finds in its caches after a call is then what it left there, as with a
+    GPU, and not what seconds of emulated kernels left.
+
+    Args:
+        functions: as `CudaLibrary.functions`.
+    """
+
+    def __init__(self, functions: Any) -> None:
+        self._functions, self._main = functions, threading.get_ident()
+        self._thread = ThreadPoolExecutor(1, "kernels", self._to_last_processor)
+        self._copy = torch.Tensor.copy_
+        self.wall = self.cpu = 0.0
+        """Seconds within calls and such copies of the thread that made this: by the clock, and of its processor."""
+
+    @staticmethod
+    def _to_last_processor() -> None:
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._functions, name)
+
+        def called(*arguments: Any) -> Any:
+            return self._there(function, *arguments)
+
+        self.__dict__[name] = called
+        return called
+
+    def _there(self, function: Any, *arguments: Any) -> Any:
+        wall, cpu = time.perf_counter(), time.thread_time()
+        calling = self._thread.submit(function, *arguments)
+        while not calling.done():
+            time.sleep(0)  # a processor that rests loses its caches, too
+        if threading.get_ident() == self._main:
+            self.wall += time.perf_counter() - wall
+            self.cpu += time.thread_time() - cpu
+        return calling.result()
+
+    @contextmanager
+    def copying(self) -> Iterator[None]:
+        """Within, copies that need not be waited for are the device's."""
+        copy, there = self._copy, self._there
+
+        def copied(tensor: torch.Tensor, source: torch.Tensor, non_blocking: bool = False) -> torch.Tensor:
+            if non_blocking:
+                there(copy, tensor, source)
+                return tensor
+            return copy(tensor, source)
+
+        torch.Tensor.copy_ = copied  # type: ignore[method-assign, assignment]
+        try:
+            yield
+        finally:
+            torch.Tensor.copy_ = copy  # type: ignore[method-assign]
+
+
+class CountedFunctions:
+    """The functions of a library of kernels; notes how often they are called.
 
     Args:
         functions: as `CudaLibrary.functions`.
@@ -66,25 +126,18 @@ class TimedFunctions:
 
     def __init__(self, functions: Any, found: Counter[str]) -> None:
         self._functions, self._found = functions, found
-        self._main = threading.get_ident()
-        self.wall = self.cpu = 0.0
-        """Seconds within calls of the thread that made this: by the clock, and of its processor."""
 
     def __getattr__(self, name: str) -> Any:
         function = getattr(self._functions, name)
+        if name == "ggslam_cuda_error_text":
+            return function
 
-        def timed(*arguments: Any) -> Any:
-            wall, cpu = time.perf_counter(), time.thread_time()
-            result = function(*arguments)
-            if threading.get_ident() == self._main:
-                self.wall += time.perf_counter() - wall
-                self.cpu += time.thread_time() - cpu
+        def counted(*arguments: Any) -> Any:
             self._found["library calls"] += 1
-            return result
+            return function(*arguments)
 
-        if name != "ggslam_cuda_error_text":
-            self.__dict__[name] = timed
-        return timed
+        self.__dict__[name] = counted
+        return counted
 
 
 def count_operations(watch: DeviceWatch, found: Counter[str]) -> None:

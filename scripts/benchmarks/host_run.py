@@ -16,7 +16,7 @@ from typing import Any
 
 from cuda_emulation import emulated_library
 from device_watch import DeviceWatch
-from host_counts import CallCounter, TimedFunctions, count_operations, take_records
+from host_counts import CallCounter, CountedFunctions, KernelThread, count_operations, take_records
 
 from ggslam.cuda.library import CudaLibrary
 from ggslam.scene.frame import Frame
@@ -85,7 +85,7 @@ def counted_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
     """Under the watch."""
     looks, steps, found = Looks(), [], Counter[str]()
     with DeviceWatch() as watch:
-        watch.library.functions = TimedFunctions(watch.library.functions, found)
+        watch.library.functions = CountedFunctions(watch.library.functions, found)
         count_operations(watch, found)
         calls = CallCounter(found)
         config = load_config(None, settings(options, "device=cuda"))
@@ -104,19 +104,20 @@ def timed_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
     """Without the watch, tensors on the CPU."""
     looks, steps = Looks(), []
     library = CudaLibrary(Path(emulated_library().functions._name), device_type="cpu")
-    functions = TimedFunctions(library.functions, Counter())
-    library.functions = functions
+    kernels = KernelThread(library.functions)
+    library.functions = kernels
     config = load_config(None, settings(options))
-    slam = start(frames, config, library)
-    gc.collect()
-    gc.freeze()
-    for frame in frames:
-        functions.wall = functions.cpu = 0.0
-        wall, cpu = time.perf_counter(), time.thread_time()
-        report = slam.step(frame)
-        wall, cpu = time.perf_counter() - wall - functions.wall, time.thread_time() - cpu - functions.cpu
-        figures = {"host ms": 1e3 * wall, "host ms of its processor": 1e3 * cpu, "kernels ms": 1e3 * functions.wall}
-        steps.append(Step(looks.kind(report.is_keyframe), figures))
+    with kernels.copying():
+        slam = start(frames, config, library)
+        gc.collect()
+        gc.freeze()
+        for frame in frames:
+            kernels.wall = kernels.cpu = 0.0
+            wall, cpu = time.perf_counter(), time.thread_time()
+            report = slam.step(frame)
+            wall, cpu = time.perf_counter() - wall - kernels.wall, time.thread_time() - cpu - kernels.cpu
+            figures = {"host ms": 1e3 * wall, "host ms of its processor": 1e3 * cpu, "kernels ms": 1e3 * kernels.wall}
+            steps.append(Step(looks.kind(report.is_keyframe), figures))
     slam.close()
     return steps
 
