@@ -32,6 +32,11 @@ COUNTS = (
 )  # fmt: skip
 
 
+KINDS = ("ordinary", "residuals", "keyframe", "ordinary, no kernels", "residuals, no kernels")
+REPEATS = 80
+"""Frames with the kernels left out."""
+
+
 @dataclass
 class Step:
     """Figures of a frame of one kind."""
@@ -111,15 +116,32 @@ def timed_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
         slam = start(frames, config, library)
         gc.collect()
         gc.freeze()
-        for frame in frames:
-            kernels.wall = kernels.cpu = 0.0
-            wall, cpu = time.perf_counter(), time.thread_time()
-            report = slam.step(frame)
-            wall, cpu = time.perf_counter() - wall - kernels.wall, time.thread_time() - cpu - kernels.cpu
-            figures = {"host ms": 1e3 * wall, "host ms of its processor": 1e3 * cpu, "kernels ms": 1e3 * kernels.wall}
-            steps.append(Step(looks.kind(report.is_keyframe), figures))
+        steps += [timed_step(slam, frame, kernels, looks) for frame in frames]
+        if options.part == "time":
+            steps += steps_without_kernels(slam, frames[-2:], kernels, looks)
     slam.close()
     return steps
+
+
+def timed_step(slam: Slam, frame: Frame, kernels: KernelThread, looks: Looks) -> Step:
+    """A step with the kernels' time taken out."""
+    kernels.wall = kernels.cpu = 0.0
+    wall, cpu = time.perf_counter(), time.thread_time()
+    report = slam.step(frame)
+    wall, cpu = time.perf_counter() - wall - kernels.wall, time.thread_time() - cpu - kernels.cpu
+    figures = {"host ms": 1e3 * wall, "host ms of its processor": 1e3 * cpu, "kernels ms": 1e3 * kernels.wall}
+    return Step(looks.kind(report.is_keyframe), figures)
+
+
+def steps_without_kernels(slam: Slam, frames: list[Frame], kernels: KernelThread, looks: Looks) -> list[Step]:
+    """Steps of these frames again and again, none of them a keyframe, with the kernels left out: one after the other,
+    as a GPU lets them follow."""
+    slam.policy.decide = lambda *_: False  # type: ignore[method-assign]
+    kernels.leaves_out, steps = True, list[Step]()
+    for number in range(1, REPEATS + 1):
+        frame = replace(frames[number % len(frames)], index=frames[-1].index + number)
+        steps.append(timed_step(slam, frame, kernels, looks))
+    return [replace(step, kind=f"{step.kind}, no kernels") for step in steps[REPEATS // 4 :]]
 
 
 def medians(steps: list[Step]) -> dict[str, float]:
@@ -130,7 +152,7 @@ def medians(steps: list[Step]) -> dict[str, float]:
 
 def kinds_of(steps: list[Step]) -> dict[str, dict[str, float]]:
     """Medians by kind."""
-    kinds = {kind: [step for step in steps if step.kind == kind] for kind in ("ordinary", "residuals", "keyframe")}
+    kinds = {kind: [step for step in steps if step.kind == kind] for kind in KINDS}
     return {kind: medians(of_kind) for kind, of_kind in kinds.items() if of_kind}
 
 
