@@ -129,7 +129,7 @@ __global__ void __launch_bounds__(kPickThreads) pick_kernel(FeatureScanJob job, 
   if (lane == 0) work.counts[number] = good;
 }
 
-__device__ inline void write_feature(const FeatureScanJob& job, const PickGroup& group, int place, std::int64_t n) {
+__device__ inline void write_feature(const FeatureScanJob& job, const PickGroup& group, int place, int n) {
   const FeatureSettings& s = job.settings;
   const FeatureArrays& out = job.out;
   const PixelPlace at = pixel_on_line(s, group.line, place + kHalf);
@@ -159,13 +159,12 @@ __global__ void __launch_bounds__(kPickThreads) write_features_kernel(FeatureSca
   unsigned before = 0;
   for (int g = (group.planes ? 0 : planes) + lane; g < number; g += kWarp)
     before += static_cast<unsigned>(work.counts[g]);
-  const std::int64_t first = __reduce_add_sync(kAllLanes, before);
+  const auto first = static_cast<int>(__reduce_add_sync(kAllLanes, before));
   const std::int32_t* kept = work.kept + static_cast<std::int64_t>(number) * s.segment;
   const int count = work.counts[number];
+  if (lane == 0 && number == planes - 1) job.out.header->planes = first + count;
+  if (lane == 0 && number == all - 1) job.out.header->edges = first + count;
   for (int k = lane; k < count; k += kWarp) write_feature(job, group, kept[k], first + k);
-  if (lane != 0) return;
-  if (number == planes - 1) job.out.header->planes = static_cast<std::int32_t>(first) + count;
-  if (number == all - 1) job.out.header->edges = static_cast<std::int32_t>(first) + count;
 }
 
 // Number `i` of `used` ones that are evenly taken from `count`.

@@ -154,14 +154,14 @@ __device__ inline void build_filling(const InsertionJob& job, std::int64_t i, in
   const int stride = job.fill_stride;
   write_mean(job, i, position_at(job, x, y, z));
   const float sigma = 2.0f * job.scale_pixels * static_cast<float>(stride) * z * (2.0f / (job.fx + job.fy));
-  std::int64_t sums[3] = {0, 0, 0};
+  unsigned sums[3] = {0, 0, 0};
   for (int row = y - stride / 2; row < y - stride / 2 + stride; ++row)
     for (int column = x - stride / 2; column < x - stride / 2 + stride; ++column) {
       const std::int64_t pixel = static_cast<std::int64_t>(reflected(row, job.height)) * job.width;
       const std::uint8_t* color = job.color + 3 * (pixel + reflected(column, job.width));
       for (int k = 0; k < 3; ++k) sums[k] += color[k];
     }
-  const std::int64_t count = static_cast<std::int64_t>(stride) * stride;
+  const unsigned count = static_cast<unsigned>(stride) * static_cast<unsigned>(stride);
   for (int k = 0; k < 3; ++k) {
     job.log_scales[3 * i + k] = logf(sigma);
     write_color(job, i, k, static_cast<float>((2 * sums[k] + count) / (2 * count)));
@@ -174,14 +174,15 @@ __global__ void __launch_bounds__(kBuildThreads) build_kernel(InsertionJob job, 
   const std::int64_t i = static_cast<std::int64_t>(blockIdx.x) * kBuildThreads + threadIdx.x;
   if (i >= job.count) return;
   const bool coarse = (w.order[i] & kCoarse) != 0;
-  const std::int64_t number = w.order[i] & ~kCoarse, fill = number - candidates.pixels;
+  const auto number = static_cast<int>(w.order[i] & ~kCoarse), fill = number - static_cast<int>(candidates.pixels);
   int x, y;
   if (fill < 0) {
-    x = static_cast<int>(number % job.width), y = static_cast<int>(number / job.width);
+    x = number % job.width, y = number / job.width;
     build_disc(job, i, x, y, coarse ? 2.0f : 1.0f);
   } else {
-    x = static_cast<int>(fill % candidates.fill_wide) * job.fill_stride + job.fill_stride / 2;
-    y = static_cast<int>(fill / candidates.fill_wide) * job.fill_stride + job.fill_stride / 2;
+    const int wide = candidates.fill_wide;
+    x = fill % wide * job.fill_stride + job.fill_stride / 2;
+    y = fill / wide * job.fill_stride + job.fill_stride / 2;
     build_filling(job, i, x, y, w.fill_depth[fill]);
   }
   job.pixels[i] = y * job.width + x;
