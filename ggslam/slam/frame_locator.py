@@ -46,10 +46,6 @@ class Located:
         return self.joint.status is TrackingStatus.LOST
 
 
-def _nothing() -> None:
-    pass
-
-
 @savable(not_saved="before_search _config _surface _masks _tracker _loops _pager _policy _poses _filters")
 class FrameLocator:
     """Locates the frames of a camera.
@@ -70,7 +66,7 @@ class FrameLocator:
         self._policy, self._poses, self._filters = policy, poses, filters
         self.color_poses = ColorPoses(parts.mapper, poses, parts.tracker.state)
         self.part_start, self.left_parts = PartStart(), LeftParts()
-        self.before_search: Callable[[], None] = _nothing
+        self.before_search: Callable[[], None] = lambda: None
         """Is called before a lost camera is looked for: all keyframes have to be known then."""
 
     def target(self, published: GicpTarget | None) -> GicpTarget | None:
