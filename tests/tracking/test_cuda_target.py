@@ -180,19 +180,23 @@ def test_a_keyframe_goes_up_in_one_copy_from_memory_that_is_there(frames: list[F
         surface = MeasuredSurface(TrackerSettings().target, NativeContext(1))
         surface.finish, surface.prepare = False, engine.expect_target
         settings, noise, align = PointSettings(count=1200), DepthNoise(), AlignSettings(coarse_points=400)
-        sent = []
+        sent, blocks = [], set[int]()
         for turn in range(3):
             for frame in frames:
                 points, T = engine.points(frame.depth, settings, noise), frame.T_world_camera
                 assert T is not None
                 if surface.target is not None:
                     watch.forget()
+                    reserved = engine._target._memory._reserved
                     engine.align(points, surface.target, T, align, noise)
+                    assert engine._target._memory._block is reserved  # allocated when the keyframe came
+                    blocks.add(reserved.address)
                     assert len(watch.uploads) == 1 and not watch.uploads[0].blocking
                     sent.append(watch.uploads[0].bytes)
                 surface.add(points, T)
             if turn == 0:
                 room = engine._target._upload._buffer.data_ptr(), engine._target._memory.address
         assert room == (engine._target._upload._buffer.data_ptr(), engine._target._memory.address)
+        assert 1 < len(blocks) < len(frames)
         # The third time around nothing is new: what is sent goes with a keyframe.
         assert max(sent[-10:]) < 1.1 * max(sent[10:20])

@@ -64,7 +64,7 @@ class TargetMemory:
         self._stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
         self._block = self._reserved = _Block([0] * _PARTS, device)
         self._before: tuple[_Block, VoxelLevelJob, VoxelLevelJob] | None = None  # which they may be reading
-        self._values: tuple[list[torch.Tensor], list[torch.Tensor]] = [], []  # in use, and where they go when this grows
+        self._values: tuple[list[torch.Tensor], list[torch.Tensor]] = [], []  # in use, and where they go as this grows
 
     @property
     def address(self) -> int:
