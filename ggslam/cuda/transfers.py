@@ -62,7 +62,7 @@ class Upload:
             self._buffer = _allocate_page_locked(size + size // 4, self._device)
         return self._buffer.numpy()[:size]
 
-    def beginning(self, size: int) -> torch.Tensor:
+    def filled_part(self, size: int) -> torch.Tensor:
         """What was filled in, or its beginning, uint8 [size]; to be sent before the next `begin`."""
         return self._buffer[:size]
 
@@ -71,9 +71,9 @@ class Upload:
 
         Args:
             out: where to.
-            source: `beginning` of its size, if that was made before.
+            source: `filled_part` of its size, if that was made before.
         """
-        out.copy_(self.beginning(out.numel()) if source is None else source, non_blocking=True)
+        out.copy_(self.filled_part(out.numel()) if source is None else source, non_blocking=True)
         self._sent.set()
 
 

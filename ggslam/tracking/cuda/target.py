@@ -120,7 +120,7 @@ class CudaTarget:
             if size <= self._room:
                 break
             self._room = max(size, 2 * self._room)
-        out, source = self._memory.reserve(changes, size, settings is not None), self._upload.beginning(size)
+        out, source = self._memory.reserve(changes, size, settings is not None), self._upload.filled_part(size)
         self._staged = _Staged(weakref.ref(target), settings, before, changes, source, out)
         return self._staged
 
