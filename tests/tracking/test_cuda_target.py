@@ -15,6 +15,7 @@ from device_watch import DeviceWatch
 from ggslam.abi.core import Voxel, VoxelMoments
 from ggslam.abi.cuda import TrackJob, VoxelSlot
 from ggslam.cuda.library import CudaLibrary
+from ggslam.cuda.streams import SideStream
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -174,6 +175,31 @@ def test_what_did_not_arrive_is_sent_again(copy: Copy, views: list[tuple[FramePo
         assert copy.was_sent_whole and is_like(copy, target)
 
 
+def test_memory_comes_from_the_stream_that_uses_it(frames: list[Frame]) -> None:
+    """Work on another one may still use what was given back there: the first target waits for who aligns to it."""
+    with DeviceWatch() as watch:
+        engine = CudaTrackingEngine(frames[0].camera, library=watch.library)
+        surface = MeasuredSurface(TrackerSettings().target, NativeContext(1))
+        surface.finish, surface.prepare = False, engine.expect_target
+        beside, memory = SideStream(engine.device), engine._target._memory
+        used = set[int]()
+        for frame in frames[:4]:
+            T = frame.T_world_camera
+            assert T is not None
+            with beside:
+                here = torch.cuda.current_stream(engine.device).cuda_stream
+                points = engine.points(frame.depth, PointSettings(count=1200), DepthNoise())
+                if surface.target is None:
+                    assert not memory._reserved.memory.numel()
+                else:
+                    engine.align(points, surface.target, T, AlignSettings(coarse_points=400), DepthNoise())
+                    assert memory._stream is not None
+                    used |= {here, memory._stream.cuda_stream}
+                points.read()
+            surface.add(points, T)
+        assert used == {here} and here != torch.cuda.current_stream(engine.device).cuda_stream
+
+
 def test_a_keyframe_goes_up_in_one_copy_from_memory_that_is_there(frames: list[Frame]) -> None:
     with DeviceWatch() as watch:
         engine = CudaTrackingEngine(frames[0].camera, library=watch.library)
@@ -189,7 +215,9 @@ def test_a_keyframe_goes_up_in_one_copy_from_memory_that_is_there(frames: list[F
                     watch.forget()
                     reserved = engine._target._memory._reserved
                     engine.align(points, surface.target, T, align, noise)
-                    assert engine._target._memory._block is reserved  # allocated when the keyframe came
+                    if sent:  # the first time it is not known before on which stream the memory will be used
+                        assert engine._target._memory._block is reserved  # allocated when the keyframe came
+                    reserved = engine._target._memory._block
                     blocks.add(reserved.address)
                     assert len(watch.uploads) == 1 and not watch.uploads[0].blocking
                     sent.append(watch.uploads[0].bytes)

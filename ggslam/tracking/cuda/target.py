@@ -77,7 +77,8 @@ class CudaTarget:
     def stage(self, target: GicpTarget) -> None:
         """Copies what the device lacks of a target to page-locked memory; in any thread."""
         with self._staging:
-            self._stage(target)
+            if self._memory.has_stream:  # the first one is sent by who uses it
+                self._stage(target)
 
     def fill(self, target: GicpTarget, job: TrackJob) -> None:
         """Sets the levels of the job to those of the target, and whether they have to be made. `note_made` when that
@@ -88,6 +89,7 @@ class CudaTarget:
         with self._staging:
             if self._sent is not None:  # what became of that is not known
                 self._copy, self._sent = TargetCopy(), None
+            self._memory.note_stream()
             staged = self._stage(target)
             self._send(staged, target.voxel, job)
             self._target, self._staged = None, None

@@ -60,8 +60,9 @@ class TargetMemory:
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
-        # Memory that a stream's work may still be using must not come to another stream.
-        self._stream = torch.cuda.current_stream(device) if device.type == "cuda" else None
+        self._stream: torch.cuda.Stream | None = None
+        self.has_stream = False
+        """Whether it is known on which stream the memory is used; until then, none may be reserved."""
         self._block = self._reserved = _Block([0] * _PARTS, device)
         self._before: tuple[_Block, VoxelLevelJob, VoxelLevelJob] | None = None  # which they may be reading
         self._values: tuple[list[torch.Tensor], list[torch.Tensor]] = [], []  # in use, and where they go as this grows
@@ -70,6 +71,12 @@ class TargetMemory:
     def address(self) -> int:
         """Of what is in use; what is sent goes there."""
         return self._block.address
+
+    def note_stream(self) -> None:
+        """It is the current one of this thread. Memory is allocated on it: on another, work that was started there may
+        still be using what it has given back."""
+        self._stream = torch.cuda.current_stream(self._device) if self._device.type == "cuda" else None
+        self.has_stream = True
 
     def reserve(self, changes: TargetChanges, size: int, has_moments: bool) -> torch.Tensor:
         """Makes sure that there is memory for a target; returns where to send what the device lacks, uint8 [size].
