@@ -63,10 +63,11 @@ def check_frame(frame: Frame, camera: Camera) -> None:
             )
     if frame.camera is not camera and frame.camera != camera:
         raise SequenceError(f"frame {frame.source_index}: it is of {frame.camera}, expected {camera}")
-    if unit := wrong_unit(frame.depth):
-        raise SequenceError(f"frame {frame.source_index}: {unit}")
     # Of a NaN among them, the least and the greatest are NaN.
-    if not (np.minimum.reduce(frame.depth, axis=None) >= 0 and np.maximum.reduce(frame.depth, axis=None) < np.inf):
+    least, greatest = np.minimum.reduce(frame.depth, axis=None), np.maximum.reduce(frame.depth, axis=None)
+    if not greatest <= FrameCheckTuning.max_median_m and (unit := wrong_unit(frame.depth)):
+        raise SequenceError(f"frame {frame.source_index}: {unit}")
+    if not (least >= 0 and greatest < np.inf):
         raise SequenceError(f"frame {frame.source_index}: depth has negative, infinite or NaN values; 0 means none")
     if not math.isfinite(frame.timestamp):
         raise SequenceError(f"frame {frame.source_index}: its time is {frame.timestamp}, expected seconds")
