@@ -16,7 +16,6 @@ from ggslam.system.array_forms import Pose, check_indices
 from ggslam.system.savable import savable
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
-
 _NAMES = {status: status.value for status in TrackingStatus}  # asked for with every frame
 
 

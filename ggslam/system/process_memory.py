@@ -50,8 +50,8 @@ def peak_memory_mb() -> float:
 
 def resident_bytes() -> int:
     """Resident memory of this process now; where the system does not tell, the largest so far."""
-    # Every frame asks. These calls keep Python's lock: they take microseconds, and whoever lets go of the lock may wait a
-    # hundred times as long until another thread does.
+    # Every frame asks. These calls keep Python's lock: they take microseconds, and whoever lets go of it may wait a
+    # hundred times as long until another thread does the same.
     system, text = _system(), _Text()
     file = system.open(_OWN_MEMORY, os.O_RDONLY)
     if file >= 0:

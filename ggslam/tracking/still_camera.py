@@ -9,7 +9,6 @@ their number all over the image, and their depth.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -58,44 +57,49 @@ class StillTuning(Tuning):
     """Share of a run's frames from which the camera is reported as still."""
 
 
-@savable(not_saved="smooth gradients")
-@dataclass(frozen=True)
+@savable(not_saved="planes", after="prepare")
+@dataclass
 class SmallFrame:
-    """A frame at reduced size: grey values float32 [h, w] of 0 to 255, and depth float32 [h, w], metres, 0: unknown."""
+    """A frame at reduced size: grey values float32 [h, w] of 0 to 255, and depth float32 [h, w], metres, 0: unknown.
+
+    Attributes:
+        planes: float32 [5, h, w]: grey values, blurred; their gradients along rows and along columns, grey levels per
+            pixel; depth; grey values.
+    """
 
     grey: DepthImage
     depth: DepthImage
+    planes: np.ndarray | None = None
 
     @staticmethod
     def of(color: np.ndarray, depth: np.ndarray) -> SmallFrame:
         """Of colour uint8 [H, W, 3] and depth float32 [H, W]."""
-        size = (StillTuning.width, max(2, round(color.shape[0] * StillTuning.width / color.shape[1])))
-        return SmallFrame(_shrink_grey(color, size), cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST))
+        width, height = StillTuning.width, max(2, round(color.shape[0] * StillTuning.width / color.shape[1]))
+        planes = np.empty((5, height, width), np.float32)
+        grey, factor = planes[4], color.shape[1] // width
+        if 0 < factor <= 16 and color.shape == (factor * height, factor * width, 3) and color.flags.c_contiguous:
+            load_library().ggslam_shrink_grey(address(color), *color.shape[:2], factor, address(grey))
+        else:
+            small = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
+            grey[...] = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        cv2.resize(depth, (width, height), dst=planes[3], interpolation=cv2.INTER_NEAREST)
+        _fill_planes(planes)
+        return SmallFrame(grey, planes[3], planes)
 
-    @cached_property
-    def smooth(self) -> np.ndarray:
-        """The grey values, blurred."""
-        return cv2.GaussianBlur(self.grey, (3, 3), 0.7)
-
-    @cached_property
-    def gradients(self) -> tuple[np.ndarray, np.ndarray]:
-        """Along rows and along columns, float32 [h, w] each, grey levels per pixel."""
-        return (
-            cv2.Sobel(self.smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8),
-            cv2.Sobel(self.smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8),
-        )
+    def prepare(self) -> None:
+        """Makes `planes`, where grey values and depth were given."""
+        if self.planes is None:
+            self.planes = np.empty((5, *self.grey.shape), np.float32)
+            self.planes[3], self.planes[4] = self.depth, self.grey
+            _fill_planes(self.planes)
 
 
-def _shrink_grey(color: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Grey values float32 [h, w] of 0 to 255 of colour uint8 [H, W, 3], `size` (w, h) large: means over areas."""
-    height, width = color.shape[:2]
-    factor = width // size[0]
-    if 0 < factor <= 16 and (factor * size[0], factor * size[1]) == (width, height) and color.flags.c_contiguous:
-        grey = np.empty((size[1], size[0]), np.float32)
-        load_library().ggslam_shrink_grey(address(color), height, width, factor, address(grey))
-        return grey
-    small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
+def _fill_planes(planes: np.ndarray) -> None:
+    """Makes the first three of `SmallFrame.planes`."""
+    smooth, gx, gy, _, grey = planes
+    cv2.GaussianBlur(grey, (3, 3), 0.7, dst=smooth)
+    cv2.Sobel(smooth, cv2.CV_32F, 1, 0, dst=gx, ksize=3, scale=1 / 8)
+    cv2.Sobel(smooth, cv2.CV_32F, 0, 1, dst=gy, ksize=3, scale=1 / 8)
 
 
 @savable()
@@ -135,35 +139,36 @@ def is_still(anchor: SmallFrame, now: SmallFrame, noise: DepthNoise) -> bool:
     """Whether two frames of one size were taken from the same place, whatever moves before the camera."""
     if anchor.grey.shape != now.grey.shape:
         return False
-    pixels, stays = _pixels_that_stay(anchor, now)
+    assert anchor.planes is not None and now.planes is not None
+    pixels, stays = _pixels_that_stay(anchor.planes, now.planes)
     if not len(pixels):
         return False
     rows, columns = np.divmod(pixels, anchor.grey.shape[1])
-    gx, gy = (gradient.reshape(-1)[pixels] for gradient in anchor.gradients)
-    grey = anchor.smooth.reshape(-1)[pixels]
-    difference = now.smooth.reshape(-1)[pixels] - grey
-    shifts = _shifts(rows, columns, gx, gy, grey, difference, stays, anchor.grey.shape)
+    grey, gx, gy, before = anchor.planes.reshape(5, -1)[:4, pixels]
+    smooth, _, _, after = now.planes.reshape(5, -1)[:4, pixels]
+    shifts = _shifts(rows, columns, gx, gy, grey, smooth - grey, stays, anchor.grey.shape)
     if shifts is None or np.abs(shifts).max() > StillTuning.max_shift_pixels:
         return False
-    before, after = anchor.depth.reshape(-1)[pixels][stays], now.depth.reshape(-1)[pixels][stays]
+    before, after = before[stays], after[stays]
     same = np.abs(after - before) < StillTuning.depth_sigmas * (noise.constant + noise.square * before * before) + 1e-3
     return bool(same.mean() >= StillTuning.min_still_depth)
 
 
-def _pixels_that_stay(anchor: SmallFrame, now: SmallFrame) -> tuple[np.ndarray, np.ndarray]:
+def _pixels_that_stay(anchor: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Textured pixels, by their number in the image, int32 [n], and whether each stays, bool [n]. None of them if too
-    few stay, in too few parts of the image, or along one direction."""
-    gx, gy = anchor.gradients
-    room = 2 * StillTuning.max_pixels
-    pixels, stays = np.empty(room, np.int32), np.empty(room, bool)
+    few stay, in too few parts of the image, or along one direction.
+
+    Args:
+        anchor, now: `SmallFrame.planes`.
+    """
+    found = np.empty(2 * StillTuning.max_pixels, np.int32)
     count = load_library().ggslam_still_pixels(StillPixelsJob(
-        address(anchor.smooth), address(gx), address(gy), address(anchor.depth), address(now.smooth),
-        address(now.depth), *anchor.grey.shape, StillTuning.min_gradient**2, StillTuning.max_flow_pixels,
+        address(anchor), address(now), *anchor.shape[1:], StillTuning.min_gradient**2, StillTuning.max_flow_pixels,
         StillTuning.min_pixels, StillTuning.max_pixels, StillTuning.cells, StillTuning.min_cell_pixels,
         StillTuning.min_still_cells, StillTuning.min_still_share, StillTuning.across, StillTuning.min_across,
-        address(pixels), address(stays),
+        address(found),
     ))  # fmt: skip
-    return pixels[:count], stays[:count]
+    return found[:count] >> 1, (found[:count] & 1) > 0
 
 
 def _shifts(

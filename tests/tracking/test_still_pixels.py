@@ -24,19 +24,28 @@ def some_frame(seed: int, like: np.ndarray | None = None, noise: float = 0.0, of
     grey = np.roll(grey, off, 1) + rng.normal(0, noise, grey.shape).astype(np.float32) if noise else grey
     depth = rng.uniform(1, 3, (120, 160)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.1] = 0
-    return SmallFrame(np.ascontiguousarray(grey, np.float32), depth)
+    found = SmallFrame(np.ascontiguousarray(grey, np.float32), depth)
+    found.prepare()
+    return found
+
+
+def stay(anchor: SmallFrame, now: SmallFrame) -> tuple[np.ndarray, np.ndarray]:
+    """What the core says."""
+    assert anchor.planes is not None and now.planes is not None
+    return _pixels_that_stay(anchor.planes, now.planes)
 
 
 def pixels_that_stay(anchor: SmallFrame, now: SmallFrame) -> tuple[np.ndarray, np.ndarray, bool]:
     """The compared pixels, whether each stays, and whether most do, all over the image and each way."""
-    t, (gx, gy), shape = StillTuning, anchor.gradients, anchor.grey.shape
+    assert anchor.planes is not None and now.planes is not None
+    t, (smooth, gx, gy, *_), shape = StillTuning, anchor.planes, anchor.grey.shape
     textured = (gx * gx + gy * gy > t.min_gradient**2) & (anchor.depth > 0) & (now.depth > 0)
     pixels = np.flatnonzero(textured)
     if len(pixels) < t.min_pixels:
         return pixels[:0], np.zeros(0, bool), False
     pixels = pixels[:: max(1, len(pixels) // t.max_pixels)]
     gx, gy = gx.ravel()[pixels], gy.ravel()[pixels]
-    difference = now.smooth.ravel()[pixels] - anchor.smooth.ravel()[pixels]
+    difference = now.planes[0].ravel()[pixels] - smooth.ravel()[pixels]
     slope = np.hypot(gx, gy)
     stays = np.abs(difference - np.median(difference)) < t.max_flow_pixels * slope
     rows, columns = np.divmod(pixels, shape[1])
@@ -57,7 +66,7 @@ def test_pixels_are_those_of_numpy(most: int) -> None:
         for seed, (noise, off) in enumerate(((0.5, 0), (4.0, 0), (8.0, 0), (1.0, 1), (1.0, 8))):
             now = some_frame(seed + 1, anchor.grey, noise, off)
             pixels, stays, still = pixels_that_stay(anchor, now)
-            found = _pixels_that_stay(anchor, now)
+            found = stay(anchor, now)
             decided.add(still)
             assert len(found[0]) == (len(pixels) if still else 0)
             if still:
@@ -69,18 +78,18 @@ def test_pixels_are_those_of_numpy(most: int) -> None:
 
 def test_too_little_texture_says_nothing() -> None:
     anchor = some_frame(0)
-    assert len(_pixels_that_stay(anchor, some_frame(1, anchor.grey, 0.5))[0])
+    assert len(stay(anchor, some_frame(1, anchor.grey, 0.5))[0])
     with overridden(StillTuning, min_pixels=19201):
-        assert not len(_pixels_that_stay(anchor, some_frame(1, anchor.grey, 0.5))[0])
+        assert not len(stay(anchor, some_frame(1, anchor.grey, 0.5))[0])
     with overridden(StillTuning, min_across=19201):
-        assert not len(_pixels_that_stay(anchor, some_frame(1, anchor.grey, 0.5))[0])
+        assert not len(stay(anchor, some_frame(1, anchor.grey, 0.5))[0])
 
 
 def test_what_is_no_number_is_not_still() -> None:
     anchor = some_frame(0)
     grey = anchor.grey.copy()
     grey[60] = np.nan
-    assert not len(_pixels_that_stay(anchor, some_frame(1, grey))[0])
+    assert not len(stay(anchor, some_frame(1, grey))[0])
 
 
 @pytest.mark.parametrize("size", [(640, 480), (320, 240), (160, 120), (1280, 720), (800, 600), (480, 270), (330, 200)])

@@ -144,15 +144,12 @@ struct AlignResult {
   int32_t coarse_iterations, fine_iterations, matches, inliers, converged, usable;
 };
 
-// Where a camera may have stood still since an earlier frame, the anchor: the pixels that tell, and what they say. All
-// images are [height, width] and finite.
+// Where a camera may have stood still since an earlier frame, the anchor: the pixels that tell, and what they say.
 struct StillPixelsJob {
-  const float* smooth;      // the anchor's grey values, blurred
-  const float* gx;          // their gradient along rows...
-  const float* gy;          // ...and along columns, grey levels a pixel
-  const float* depth;       // metres, 0 where unknown
-  const float* smooth_now;  // the frame's grey values, blurred
-  const float* depth_now;
+  // Four images [height, width] each: grey values, blurred; their gradients along rows and along columns, grey levels a
+  // pixel; depth, metres, 0 where unknown.
+  const float* anchor;
+  const float* now;
   int32_t height, width;
   float least_squared_gradient;  // of a textured pixel, exclusive
   float largest_flow;            // pixels across its edge, of a pixel that stays
@@ -163,9 +160,8 @@ struct StillPixelsJob {
   double still_share;            // ...at least this share of the pixels stays; the same for each direction
   float across;                  // least component of a unit gradient along a direction that it tells about
   int32_t fewest_across;         // such pixels of each direction
-  // Results, room for 2 `most` each: the compared pixels, row * width + column, and whether each stays, 0 or 1.
-  int32_t* pixels;
-  uint8_t* stays;
+  // Results, room for 2 `most`: of each compared pixel 2 (row * width + column) and, if it stays, 1 more.
+  int32_t* found;
 };
 
 }  // namespace ggslam

@@ -71,7 +71,7 @@ class CudaTrackingEngine:
         self._ring = FetchRing(self.device)
         self._pending: weakref.ref[CudaPoints] | None = None
         self._grid = (-1, -1)  # that there is memory for
-        self._points_of: tuple[PointSettings, DepthNoise, int] | None = None  # and their stride: what the job is set for
+        self._points_of: tuple[PointSettings, DepthNoise, int] | None = None  # and stride, that the job is set for
         self._workspace = torch.zeros(0, dtype=torch.uint8, device=self.device)
         self._largest = (0, 0)  # room and textured points that the workspace is known to have room for
         self._settings_of: tuple[AlignSettings, DepthNoise, PhotometricSettings | None] | None = None
@@ -119,7 +119,8 @@ class CudaTrackingEngine:
         Raises:
             ValueError: `depth` has another shape than the camera.
         """
-        check_depth(depth, self.camera)
+        if depth.shape != self._depth.staged.shape:
+            check_depth(depth, self.camera)
         before = None if self._pending is None else self._pending()
         if before is not None:
             self._extract(before)
