@@ -71,6 +71,7 @@ class CudaTrackingEngine:
         self._ring = FetchRing(self.device)
         self._pending: weakref.ref[CudaPoints] | None = None
         self._grid = (-1, -1)  # that there is memory for
+        self._point_room = self._point_words = 0
         self._points_of: tuple[PointSettings, DepthNoise, int] | None = None  # and stride, that the job is set for
         self._workspace = torch.zeros(0, dtype=torch.uint8, device=self.device)
         self._largest = (0, 0)  # room and textured points that the workspace is known to have room for
@@ -104,8 +105,7 @@ class CudaTrackingEngine:
         if not (before is not None and usual and before[0] is settings and before[1] is noise and before[2] == stride):
             self._set_points(native_points_settings(self.camera, settings, noise, stride, depth))
             self._points_of = settings, noise, stride
-        room = job.columns * job.rows
-        found = CudaPoints(room, self._point_blocks.take(words_for(room)), self._extract, self._ring)
+        found = CudaPoints(self._point_room, self._point_blocks.take(self._point_words), self._extract, self._ring)
         job.out = found.arrays
         self._pending = weakref.ref(found)
         return found
@@ -197,6 +197,7 @@ class CudaTrackingEngine:
         columns = max(0, math.ceil((self.camera.width - first) / stride))
         rows = max(0, math.ceil((self.camera.height - first) / stride))
         job.settings, job.columns, job.rows = settings, columns, rows
+        self._point_room, self._point_words = columns * rows, words_for(columns * rows)
         if self._grid != (columns, rows):
             size = self.library.functions.ggslam_cuda_depth_points_bytes(ctypes.byref(job))
             job.workspace = self._memory.block("points", size).data_ptr()
