@@ -15,13 +15,13 @@ first frames (whether outlines of depth are sharp, 12 ms a frame) is decided bef
             page-locked allocations, calls of the kernels' library (each function of it, those that only ask for sizes
             included), waits, copies of torch and their bytes (not those within a call of the library, such as the
             tracker's result). The watch's own work is left out; a stand-in of torch.cuda counts as one call.
-    time    without the watch, tensors on the CPU, kernels and the copies that a GPU makes by itself on another processor:
+    time    without the watch, tensors on the CPU; kernels, and copies that a GPU makes by itself, on another processor:
             a step by the clock, and processor time of its thread, both less what these took. It has all of Python, the
             compiled core's work of this thread, OpenCV, waiting for threads, and torch's other operations. It lacks
             what only a GPU has: starting kernels and copies, events, page-locked memory, looking up streams. Emulated
-            kernels take seconds, after which much is not in the caches: so the last frames are stepped again and again
-            with the kernels left out ("no kernels"; results are then the last ones), as a GPU lets them follow. Ratios
-            of two checkouts by turns are what counts; nothing else should run.
+            kernels take seconds, after which much is not in the caches: so the frames are stepped once more, to and
+            fro, with the kernels left out and with the poses found before ("no kernels"), one after the other as a GPU
+            lets them follow. Ratios of two checkouts by turns are what counts; nothing else should run.
     growth  all frames are keyframes of --growth-size: counts and time of keyframe 20 and of the last.
 """
 

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 import threading
@@ -19,9 +20,13 @@ import torch
 from device_watch import DeviceTensor, DeviceWatch
 from torch.utils._pytree import tree_flatten
 
+from ggslam.abi.cuda import AlignResult, TrackJob
+
 TOOLS = ("/device_watch/", "/torch/utils/_python_dispatch.py", "/torch/overrides.py", "host_counts.py")
 """Code that only watches: neither it nor what it calls is counted, but for a call of what it stands in for."""
 STANDS_IN = ("stand_ins.py", "watch.py")
+ON_HOST = ("_bytes", "_room", "_pairs", "_plan", "_create", "_destroy", "_counts", "_error_text")
+"""How functions of the library end that start nothing."""
 NO_OPERATIONS = {"device", "is_pinned"}
 
 
@@ -75,7 +80,9 @@ class KernelThread:
         self.wall = self.cpu = 0.0
         """Seconds within calls and such copies of the thread that made this: by the clock, and of its processor."""
         self.leaves_out = False
-        """Calls that compute, and such copies, are not made: results are those of the calls before."""
+        """Calls that compute, and such copies, are not made: results are those of the calls before, but alignments'."""
+        self.alignment: ctypes.Array[ctypes.c_double] | None = None
+        """What the last alignment found, and what those find that are left out."""
 
     @staticmethod
     def _to_last_processor() -> None:
@@ -85,12 +92,22 @@ class KernelThread:
         function = getattr(self._functions, name)
 
         def called(*arguments: Any) -> Any:
-            if name.endswith("_bytes"):
+            if name.endswith(ON_HOST):
                 return function(*arguments)
-            return self._there(function, *arguments)
+            status = self._there(function, *arguments)
+            if name == "ggslam_cuda_track_wait":
+                self._align(arguments[0]._obj)
+            return status
 
         self.__dict__[name] = called
         return called
+
+    def _align(self, job: TrackJob) -> None:
+        results = (ctypes.c_double * AlignResult.ALIGN_RESULTS).from_address(job.results)
+        if not self.leaves_out:
+            self.alignment = type(results).from_buffer_copy(results)
+        elif self.alignment is not None:
+            results[:] = self.alignment[:]
 
     def _there(self, function: Any, *arguments: Any) -> Any:
         if self.leaves_out:

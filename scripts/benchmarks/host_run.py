@@ -19,6 +19,7 @@ from device_watch import DeviceWatch
 from host_counts import CallCounter, CountedFunctions, KernelThread, count_operations, take_records
 
 from ggslam.cuda.library import CudaLibrary
+from ggslam.mapping.cuda import mapper
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import Config, load_config
@@ -32,8 +33,8 @@ COUNTS = (
 )  # fmt: skip
 
 
-KINDS = ("ordinary", "residuals", "keyframe", "ordinary, no kernels", "residuals, no kernels")
-REPEATS = 80
+KINDS = ("ordinary", "residuals", "keyframe")
+REPEATS = 120
 """Frames with the kernels left out."""
 
 
@@ -116,9 +117,12 @@ def timed_run(frames: list[Frame], options: argparse.Namespace) -> list[Step]:
         slam = start(frames, config, library)
         gc.collect()
         gc.freeze()
-        steps += [timed_step(slam, frame, kernels, looks) for frame in frames]
+        alignments = []
+        for frame in frames:
+            steps.append(timed_step(slam, frame, kernels, looks))
+            alignments.append(kernels.alignment)
         if options.part == "time":
-            steps += steps_without_kernels(slam, frames[-2:], kernels, looks)
+            steps += steps_without_kernels(slam, frames[1:], alignments[1:], kernels, looks)
     slam.close()
     return steps
 
@@ -133,14 +137,17 @@ def timed_step(slam: Slam, frame: Frame, kernels: KernelThread, looks: Looks) ->
     return Step(looks.kind(report.is_keyframe), figures)
 
 
-def steps_without_kernels(slam: Slam, frames: list[Frame], kernels: KernelThread, looks: Looks) -> list[Step]:
-    """Steps of these frames again and again, none of them a keyframe, with the kernels left out: one after the other,
-    as a GPU lets them follow."""
-    slam.policy.decide = lambda *_: False  # type: ignore[method-assign]
-    kernels.leaves_out, steps = True, list[Step]()
+def steps_without_kernels(
+    slam: Slam, frames: list[Frame], alignments: list[Any], kernels: KernelThread, looks: Looks
+) -> list[Step]:
+    """Steps of these frames to and fro with the kernels left out, one after the other as a GPU lets them follow, and
+    aligned as before. What surfaces hide is not looked for: that works with what kernels write."""
+    mapper.mark_shown = lambda *_: None
+    kernels.leaves_out, steps, last = True, list[Step](), len(frames) - 1
     for number in range(1, REPEATS + 1):
-        frame = replace(frames[number % len(frames)], index=frames[-1].index + number)
-        steps.append(timed_step(slam, frame, kernels, looks))
+        place = abs(last - number % (2 * last))
+        kernels.alignment = alignments[place]
+        steps.append(timed_step(slam, replace(frames[place], index=frames[-1].index + number), kernels, looks))
     return [replace(step, kind=f"{step.kind}, no kernels") for step in steps[REPEATS // 4 :]]
 
 
@@ -152,8 +159,9 @@ def medians(steps: list[Step]) -> dict[str, float]:
 
 def kinds_of(steps: list[Step]) -> dict[str, dict[str, float]]:
     """Medians by kind."""
-    kinds = {kind: [step for step in steps if step.kind == kind] for kind in KINDS}
-    return {kind: medians(of_kind) for kind, of_kind in kinds.items() if of_kind}
+    kinds = [*KINDS, *(f"{kind}, no kernels" for kind in KINDS)]
+    by_kind = {kind: [step for step in steps if step.kind == kind] for kind in kinds}
+    return {kind: medians(of_kind) for kind, of_kind in by_kind.items() if of_kind}
 
 
 def growth_of(counts: list[Step], times: list[Step], window: int) -> dict[str, dict[str, float]]:
