@@ -32,9 +32,10 @@ class SideStream(AbstractContextManager["SideStream"]):
             self._stream, self._end = torch.cuda.Stream(device, priority=-1), torch.cuda.Event()
             self._stream.wait_stream(torch.cuda.current_stream(device))
         self._within: AbstractContextManager[object] = nullcontext()
+        if self._stream is not None:
+            self._within = torch.cuda.stream(self._stream)
 
     def __enter__(self) -> SideStream:
-        self._within = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
         self._within.__enter__()
         return self
 

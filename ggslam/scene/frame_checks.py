@@ -44,6 +44,14 @@ def _median_depth(depth: np.ndarray) -> float:
     return median(seen) if len(seen) else 0.0
 
 
+def _check_depth(frame: Frame) -> None:
+    if unit := wrong_unit(frame.depth):
+        raise SequenceError(f"frame {frame.source_index}: {unit}")
+    # Of a NaN among them, the least and the greatest are NaN.
+    if not (np.minimum.reduce(frame.depth, axis=None) >= 0 and np.maximum.reduce(frame.depth, axis=None) < np.inf):
+        raise SequenceError(f"frame {frame.source_index}: depth has negative, infinite or NaN values; 0 means none")
+
+
 def check_frame(frame: Frame, camera: Camera) -> None:
     """Raises SequenceError unless the frame is of the camera and what `Frame` promises: images of its size, of the
     right types and in metres; a finite time; and no pose or a finite one [4, 4]."""
@@ -63,11 +71,10 @@ def check_frame(frame: Frame, camera: Camera) -> None:
             )
     if frame.camera is not camera and frame.camera != camera:
         raise SequenceError(f"frame {frame.source_index}: it is of {frame.camera}, expected {camera}")
-    if unit := wrong_unit(frame.depth):
-        raise SequenceError(f"frame {frame.source_index}: {unit}")
-    # Of a NaN among them, the least and the greatest are NaN.
-    if not (np.minimum.reduce(frame.depth, axis=None) >= 0 and np.maximum.reduce(frame.depth, axis=None) < np.inf):
-        raise SequenceError(f"frame {frame.source_index}: depth has negative, infinite or NaN values; 0 means none")
+    # Numbers are in the order of their bits; those of what is negative, infinite or NaN are greater.
+    usual = np.float32(FrameCheckTuning.max_median_m).view(np.uint32)
+    if np.maximum.reduce(frame.depth.view(np.uint32), axis=None) > usual:
+        _check_depth(frame)
     if not math.isfinite(frame.timestamp):
         raise SequenceError(f"frame {frame.source_index}: its time is {frame.timestamp}, expected seconds")
     if frame.T_world_camera is None:

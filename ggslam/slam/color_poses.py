@@ -121,7 +121,7 @@ class ColorPoses:
             return
         self._take_coded()
         number, depth = len(self.poses.frames) - 1, found.median_depth_m
-        if not self._tells_more(depth) and number >= ColorPoseTuning.undecided_frames:
+        if number >= ColorPoseTuning.undecided_frames and not self._tells_more(depth):
             return
         if self.held_bytes >= (
             ColorPoseTuning.kept_bytes if self.mapper.residency is None else ColorPoseTuning.kept_bytes_paged

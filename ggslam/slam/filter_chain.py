@@ -102,8 +102,10 @@ class FilterChain(FrameFilter):
         return frame, result
 
     def expects_motion(self) -> bool:
-        watching = [one for one in self.filters if type(one).expects_motion is not FrameFilter.expects_motion]
-        return any(one.expects_motion() for one in watching)
+        for one in self.filters:
+            if type(one).expects_motion is not FrameFilter.expects_motion and one.expects_motion():
+                return True
+        return False
 
     def before_insertion(self, removal: MapRemoval, newest: Frame, tracking: TrackingResult) -> None:
         for one in self.filters:

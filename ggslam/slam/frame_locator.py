@@ -73,7 +73,7 @@ class FrameLocator:
         """What the next frames are aligned to: the surface as it was published last, or what a part has begun with
         until the surface has that."""
         start = self.part_start
-        if len(self._surface) > start.keyframe:
+        if start.target is not None and len(self._surface) > start.keyframe:
             start.target = None
         return published if start.target is None else start.target
 

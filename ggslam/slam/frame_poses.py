@@ -16,6 +16,8 @@ from ggslam.system.array_forms import Pose, check_indices
 from ggslam.system.savable import savable
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
+_NAMES = {status: status.value for status in TrackingStatus}  # asked for with every frame
+
 
 @savable(growing="frames", check="check")
 class FramePoses:
@@ -59,7 +61,7 @@ class FramePoses:
         self.frames.append(
             TrackedFrame(
                 frame.index, frame.source_index, frame.timestamp, max(0, self._anchor), T_keyframe_camera,
-                tracking.overlap, tracking.rmse_m, tracking.status.value, tracking.reason,
+                tracking.overlap, tracking.rmse_m, _NAMES[tracking.status], tracking.reason,
             )
         )  # fmt: skip
 

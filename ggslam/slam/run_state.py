@@ -153,7 +153,7 @@ class RunState:
     @property
     def gaussian_count(self) -> int:
         """Gaussians of the map, in memory and on disk."""
-        return self.map.count + (0 if self.pager is None else self.pager.on_disk)
+        return self.mapper.map.count + (0 if self.pager is None else self.pager.on_disk)
 
     def pose_of(self, frame: TrackedFrame) -> np.ndarray:
         """T_world_camera [4, 4] of a frame that was not lost, as far as is known by now."""

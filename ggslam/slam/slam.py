@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import cv2
 import numpy as np
 
 from ggslam.geometry.scene_size import scene_scale
@@ -90,8 +91,11 @@ class Slam(RunState):
         Returns:
             What the step did, for each frame; what it took besides its length is the first one's.
         """
-        with opencv_errors(f"frame {frames[0].index}"):
+        try:
             return self._step(frames)
+        except cv2.error:
+            with opencv_errors(f"frame {frames[0].index}"):
+                raise
 
     def _step(self, frames: Sequence[Frame]) -> list[StepReport]:
         start = time.perf_counter()
@@ -115,7 +119,9 @@ class Slam(RunState):
         self._note_poses(located, chosen)
 
         # 4. to 7. Map the keyframes and train: `map_keyframe` and `train`, at once or in another thread.
-        new = [*located.early, *[(located.frames[k], located.tracked[k]) for k in chosen]]
+        new = [*located.early]
+        if chosen:
+            new += [(located.frames[k], located.tracked[k]) for k in chosen]
         with part("mapping"):
             keyframes = [NewKeyframe(*one, self.moves_followed) for one in new] if new else []
             self.schedule.map(self, keyframes, len(frames))
@@ -263,7 +269,7 @@ class Slam(RunState):
             for holder in (self.tracker, self.locator, self.filters, self.policy, self.poses):
                 holder.move(T_new_old)
         target = self.locator.target(published)
-        if target is not None:
+        if target is not None and target is not self.tracker.state.target:
             self.tracker.set_target(target)
 
     def use_scale(self, scale: float) -> None:
@@ -300,7 +306,9 @@ class Slam(RunState):
         candidates = self.locator.keyframe_candidates(located)
         if not candidates:
             return []
-        joint, least = located.joint, min([located.tracked[k].overlap for k in candidates])
+        joint, least = located.joint, located.tracked[candidates[0]].overlap
+        for k in candidates[1:]:
+            least = min(least, located.tracked[k].overlap)
         if least != joint.overlap:
             joint = replace(joint, overlap=least)
         return candidates if self.policy.decide(number, joint) else []

@@ -8,6 +8,7 @@ import os
 import resource
 import sys
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -27,7 +28,8 @@ class MemoryTuning(Tuning):
 
 
 _CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
-_OWN_MEMORY = "/proc/self/statm"
+_OWN_MEMORY = b"/proc/self/statm"
+_Text = ctypes.c_char * 256
 
 
 def peak_memory_bytes() -> int:
@@ -48,13 +50,16 @@ def peak_memory_mb() -> float:
 
 def resident_bytes() -> int:
     """Resident memory of this process now; where the system does not tell, the largest so far."""
+    # Every frame asks. These calls keep Python's lock: they take microseconds, and whoever lets go of it may wait a
+    # hundred times as long until another thread does the same.
+    system, text = _system(), _Text()
+    file = system.open(_OWN_MEMORY, os.O_RDONLY)
+    if file >= 0:
+        system.read(file, text, len(text) - 1)
+        system.close(file)
     try:
-        file = os.open(_OWN_MEMORY, os.O_RDONLY)  # every frame asks: objects about a file take longer than the rest
-        try:
-            return int(os.read(file, 256).split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        finally:
-            os.close(file)
-    except (OSError, ValueError, IndexError):
+        return int(text.value.split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, IndexError):
         return peak_memory_bytes()
 
 
@@ -80,6 +85,12 @@ def release_early() -> None:
     if adjust is not None:
         adjust(_MMAP_THRESHOLD, MemoryTuning.large_bytes)
         adjust(_TRIM_THRESHOLD, MemoryTuning.large_bytes)
+
+
+@lru_cache(maxsize=1)
+def _system() -> ctypes.PyDLL:
+    """Functions of the C library, called without letting go of Python's lock."""
+    return ctypes.PyDLL(None)
 
 
 def _c_library() -> ctypes.CDLL | None:

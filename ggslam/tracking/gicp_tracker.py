@@ -21,7 +21,7 @@ from ggslam.tracking.gicp import AlignmentResult, AlignmentStatus, GicpTarget, P
 from ggslam.tracking.noise import estimate_noise
 from ggslam.tracking.photometric import GreyDepth, PhotometricReference, textured_points
 from ggslam.tracking.points import PointSource
-from ggslam.tracking.pose_judge import PoseJudge
+from ggslam.tracking.pose_judge import JudgeTuning, PoseJudge
 from ggslam.tracking.settings import DepthNoise, PhotometricMode, TrackerSettings
 from ggslam.tracking.still_camera import SmallFrame
 from ggslam.tracking.tracker import Tracker, TrackerState, TrackingResult, TrackingStatus
@@ -144,7 +144,7 @@ class GicpTracker(Tracker):
         if state.motion.wary:
             near = min(settings.near_weight, state.settings.recovery.near_weight)
             settings = dataclasses.replace(settings, near_weight=near)
-        points = self.engine.points(depth, settings, noise)
+        points = (self._given_engine or self.engine).points(depth, settings, noise)
         if state.settings.noise is None and state.residuals.will_be_due():
             points.expect_look()
         return points
@@ -163,7 +163,9 @@ class GicpTracker(Tracker):
         state, known = self.state, points.median_depth_if_known()
         expected = self._median_depth if known is None else known
         mode = self._mode(points.median_depth if expected is None else expected)
-        judge = PoseJudge(view, state.motion, state.camera, state.settings.recovery, expected)
+        near = JudgeTuning.near_m
+        depth_m = min(expected or near, near)
+        judge = PoseJudge(view, state.motion, state.camera, state.settings.recovery, depth_m)
         found = self._locate_by(mode, judge, points, target)
         self._median_depth = depth = points.median_depth
         if known is None:  # it is known now, and seldom so far from the frame's before that the mode is another one
@@ -224,7 +226,7 @@ class GicpTracker(Tracker):
         assert noise is not None
         if not coarse:
             settings = dataclasses.replace(settings, coarse_iterations=0)
-        return self.engine.align(points, target, guess, settings, noise, photometric)
+        return (self._given_engine or self.engine).align(points, target, guess, settings, noise, photometric)
 
     def _noise(self) -> DepthNoise:
         assert self.noise is not None
@@ -232,7 +234,7 @@ class GicpTracker(Tracker):
 
     def _photometric_part(self, view: FeatureView) -> PhotometricSource | None:
         """Textured points of the view and the reference; None without either, as far as is known."""
-        state, greys, least = self.state, self.engine.greys, GicpTrackerTuning.min_textured
+        state, greys, least = self.state, (self._given_engine or self.engine).greys, GicpTrackerTuning.min_textured
         settings, earlier = state.settings.photometric, state.motion.reference_view
         if greys is not None:
             return None if earlier is None else greys.part(view, earlier, settings, self._shrink_factor(), least)

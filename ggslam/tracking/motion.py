@@ -158,7 +158,8 @@ class CameraMotion:
     def remember(self, view: FeatureView, points: PointSource, settings: TrackerSettings) -> None:
         """Keeps the last located frames for feature matching, and a not too distant one for its grey values. A view
         without depth (of a camera that the others of its rig located) tells nothing of either."""
-        if not np.logical_or.reduce(view.depth, axis=None):
+        some = view.depth[::8, ::8]  # of most views these have depth
+        if not (np.logical_or.reduce(some, axis=None) or np.logical_or.reduce(view.depth, axis=None)):
             return
         self.views = [view, *self.views[: settings.recovery.views - 1]]
         if self.reference_view is None or self._is_far(self.reference_view, view, points, settings.photometric):

@@ -42,14 +42,15 @@ class PoseJudge:
         motion: of the camera before it.
         camera: of both.
         settings: see there.
-        depth_m: median depth of the frame before, metres; None: not known.
+        depth_m: at which image shifts are judged, metres: the frame's median depth, if that is less than
+            `JudgeTuning.near_m`.
     """
 
     view: FeatureView
     motion: CameraMotion
     camera: Camera
     settings: RecoverySettings
-    depth_m: float | None
+    depth_m: float
 
     @cached_property
     def features(self) -> SharedFeatures:
@@ -77,18 +78,15 @@ class PoseJudge:
         if self.is_wide(turned):
             starts.append(("shift of the image", turned, True))
         for name, pose, coarse in starts:
-            if not any(self._shift(pose, other) < JudgeTuning.alike_share for other in tried):
+            shifts = [shift_between(pose, other, self.camera, self.depth_m) for other in tried]
+            if not any(shift / self.camera.width < JudgeTuning.alike_share for shift in shifts):
                 tried.append(pose)
                 yield name, pose, coarse
 
     def is_wide(self, T_world_camera: np.ndarray) -> bool:
         """Whether the image shifts far from the last pose to this one [4, 4]."""
-        return self._shift(T_world_camera, self.motion.T_world_camera) > self.settings.wide_share
-
-    def _shift(self, T_one: np.ndarray, T_other: np.ndarray) -> float:
-        """By what share of its width the image shifts between two poses [4, 4]."""
-        depth_m = min(self.depth_m or JudgeTuning.near_m, JudgeTuning.near_m)
-        return shift_between(T_one, T_other, self.camera, depth_m) / self.camera.width
+        shift = shift_between(T_world_camera, self.motion.T_world_camera, self.camera, self.depth_m)
+        return shift / self.camera.width > self.settings.wide_share
 
     # --- witnesses ---------------------------------------------------------------------------------------------------
 

@@ -47,7 +47,7 @@ _MEDIAN_OF_NORMAL: Final = 0.6745
 """Median of the absolute value of a standard normal variable."""
 
 
-@savable()
+@savable(not_saved="_known")
 @dataclass
 class ResidualNoise:
     """Compares a noise model with the residuals of tracking, frame by frame.
@@ -62,25 +62,28 @@ class ResidualNoise:
     residuals: list[tuple[float, float]] = field(default_factory=list)
     frames: int = 0
     hidden: float = 1.0
+    _known: tuple[list[tuple[float, float]], float | None] | None = None
 
     @property
     def sigma(self) -> float | None:
         """Robust standard deviation in metres of the distances in the latest looks; None: too few so far."""
-        if len(self.residuals) < ResidualNoiseTuning.min_measurements:
-            return None
-        return median([sigma for _, sigma in self.residuals])
+        known = self._known
+        if known is not None and known[0] is self.residuals:  # each look makes a new list
+            return known[1]
+        enough = len(self.residuals) >= ResidualNoiseTuning.min_measurements
+        found = median([sigma for _, sigma in self.residuals]) if enough else None
+        self._known = self.residuals, found
+        return found
 
     def due(self) -> bool:
         """Whether the next frame is looked at; counts it."""
+        due = self.will_be_due()
         self.frames += 1
-        return self._looks_at(self.frames)
+        return due
 
     def will_be_due(self) -> bool:
         """Whether the next frame is looked at."""
-        return self._looks_at(self.frames + 1)
-
-    @staticmethod
-    def _looks_at(frame: int) -> bool:
+        frame = self.frames + 1
         early = frame <= ResidualNoiseTuning.early_frames
         return frame % (ResidualNoiseTuning.early_stride if early else ResidualNoiseTuning.late_stride) == 0
 

@@ -9,13 +9,14 @@ their number all over the image, and their depth.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import cv2
 import numpy as np
 
+from ggslam.abi.arrays import address
+from ggslam.abi.core import StillPixelsJob
+from ggslam.native.loader import load_library
 from ggslam.system.array_forms import DepthImage, Pose
-from ggslam.system.medians import median
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.settings import DepthNoise
@@ -56,24 +57,49 @@ class StillTuning(Tuning):
     """Share of a run's frames from which the camera is reported as still."""
 
 
-WAYS: Final = ((1.0, 0.0), (0.7071, 0.7071), (0.0, 1.0), (-0.7071, 0.7071))
-"""Unit vectors of the four directions in the image along which motion is tested."""
-
-
-@savable()
-@dataclass(frozen=True)
+@savable(not_saved="planes", after="prepare")
+@dataclass
 class SmallFrame:
-    """A frame at reduced size: grey values float32 [h, w] of 0 to 255, and depth float32 [h, w], metres, 0: unknown."""
+    """A frame at reduced size: grey values float32 [h, w] of 0 to 255, and depth float32 [h, w], metres, 0: unknown.
+
+    Attributes:
+        planes: float32 [5, h, w]: grey values, blurred; their gradients along rows and along columns, grey levels per
+            pixel; depth; grey values.
+    """
 
     grey: DepthImage
     depth: DepthImage
+    planes: np.ndarray | None = None
 
     @staticmethod
     def of(color: np.ndarray, depth: np.ndarray) -> SmallFrame:
         """Of colour uint8 [H, W, 3] and depth float32 [H, W]."""
-        size = (StillTuning.width, max(2, round(color.shape[0] * StillTuning.width / color.shape[1])))
-        grey = cv2.cvtColor(cv2.resize(color, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-        return SmallFrame(grey.astype(np.float32), cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST))
+        width, height = StillTuning.width, max(2, round(color.shape[0] * StillTuning.width / color.shape[1]))
+        planes = np.empty((5, height, width), np.float32)
+        grey, factor = planes[4], color.shape[1] // width
+        if 0 < factor <= 16 and color.shape == (factor * height, factor * width, 3) and color.flags.c_contiguous:
+            load_library().ggslam_shrink_grey(address(color), *color.shape[:2], factor, address(grey))
+        else:
+            small = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
+            grey[...] = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        cv2.resize(depth, (width, height), dst=planes[3], interpolation=cv2.INTER_NEAREST)
+        _fill_planes(planes)
+        return SmallFrame(grey, planes[3], planes)
+
+    def prepare(self) -> None:
+        """Makes `planes`, where grey values and depth were given."""
+        if self.planes is None:
+            self.planes = np.empty((5, *self.grey.shape), np.float32)
+            self.planes[3], self.planes[4] = self.depth, self.grey
+            _fill_planes(self.planes)
+
+
+def _fill_planes(planes: np.ndarray) -> None:
+    """Makes the first three of `SmallFrame.planes`."""
+    smooth, gx, gy, _, grey = planes
+    cv2.GaussianBlur(grey, (3, 3), 0.7, dst=smooth)
+    cv2.Sobel(smooth, cv2.CV_32F, 1, 0, dst=gx, ksize=3, scale=1 / 8)
+    cv2.Sobel(smooth, cv2.CV_32F, 0, 1, dst=gy, ksize=3, scale=1 / 8)
 
 
 @savable()
@@ -113,47 +139,36 @@ def is_still(anchor: SmallFrame, now: SmallFrame, noise: DepthNoise) -> bool:
     """Whether two frames of one size were taken from the same place, whatever moves before the camera."""
     if anchor.grey.shape != now.grey.shape:
         return False
-    smooth = cv2.GaussianBlur(anchor.grey, (3, 3), 0.7)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
-    textured = (gx * gx + gy * gy > StillTuning.min_gradient**2) & (anchor.depth > 0) & (now.depth > 0)
-    rows, columns = textured.nonzero()
-    if len(rows) < StillTuning.min_pixels:
+    assert anchor.planes is not None and now.planes is not None
+    pixels, stays = _pixels_that_stay(anchor.planes, now.planes)
+    if not len(pixels):
         return False
-    step = max(1, len(rows) // StillTuning.max_pixels)
-    rows, columns = rows[::step], columns[::step]
-    gx, gy = gx[rows, columns], gy[rows, columns]
-    difference = cv2.GaussianBlur(now.grey, (3, 3), 0.7)[rows, columns] - smooth[rows, columns]
-    slope = np.hypot(gx, gy)
-    stays = np.abs(difference - median(difference)) < StillTuning.max_flow_pixels * slope
-    if not (_is_all_over(rows, columns, stays, anchor.grey.shape) and _stays_each_way(gx / slope, gy / slope, stays)):
-        return False
-    shifts = _shifts(rows, columns, gx, gy, smooth[rows, columns], difference, stays, anchor.grey.shape)
+    rows, columns = np.divmod(pixels, anchor.grey.shape[1])
+    grey, gx, gy, before = anchor.planes.reshape(5, -1)[:4, pixels]
+    smooth, _, _, after = now.planes.reshape(5, -1)[:4, pixels]
+    shifts = _shifts(rows, columns, gx, gy, grey, smooth - grey, stays, anchor.grey.shape)
     if shifts is None or np.abs(shifts).max() > StillTuning.max_shift_pixels:
         return False
-    before, after = anchor.depth[rows, columns][stays], now.depth[rows, columns][stays]
+    before, after = before[stays], after[stays]
     same = np.abs(after - before) < StillTuning.depth_sigmas * (noise.constant + noise.square * before * before) + 1e-3
     return bool(same.mean() >= StillTuning.min_still_depth)
 
 
-def _is_all_over(rows: np.ndarray, columns: np.ndarray, stays: np.ndarray, shape: tuple[int, ...]) -> bool:
-    """Whether pixels that stay are most of the textured ones in most parts of the image."""
-    cells = rows * StillTuning.cells // shape[0] * StillTuning.cells + columns * StillTuning.cells // shape[1]
-    textured = np.bincount(cells, minlength=StillTuning.cells**2)
-    still = np.bincount(cells[stays], minlength=StillTuning.cells**2)
-    counted = textured >= StillTuning.min_cell_pixels
-    stay = counted & (still >= StillTuning.min_still_share * textured)
-    count = np.add.reduce(counted)
-    return bool(count >= StillTuning.cells and np.add.reduce(stay) >= StillTuning.min_still_cells * count)
+def _pixels_that_stay(anchor: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Textured pixels, by their number in the image, int32 [n], and whether each stays, bool [n]. None of them if too
+    few stay, in too few parts of the image, or along one direction.
 
-
-def _stays_each_way(x: np.ndarray, y: np.ndarray, stays: np.ndarray) -> bool:
-    """Whether, for each direction in the image, most of the pixels stay that would show a motion along it; `x`, `y`:
-    unit gradients."""
-    telling = [np.abs(x * way[0] + y * way[1]) >= StillTuning.across for way in WAYS]
-    return all(
-        one.sum() >= StillTuning.min_across and stays[one].mean() >= StillTuning.min_still_share for one in telling
-    )
+    Args:
+        anchor, now: `SmallFrame.planes`.
+    """
+    found = np.empty(2 * StillTuning.max_pixels, np.int32)
+    count = load_library().ggslam_still_pixels(StillPixelsJob(
+        address(anchor), address(now), *anchor.shape[1:], StillTuning.min_gradient**2, StillTuning.max_flow_pixels,
+        StillTuning.min_pixels, StillTuning.max_pixels, StillTuning.cells, StillTuning.min_cell_pixels,
+        StillTuning.min_still_cells, StillTuning.min_still_share, StillTuning.across, StillTuning.min_across,
+        address(found),
+    ))  # fmt: skip
+    return found[:count] >> 1, (found[:count] & 1) > 0
 
 
 def _shifts(

@@ -41,7 +41,6 @@ ALLOWED = {
     "ggslam.slam.color_poses:_decode": "JPEGs that this process made, in memory",
     "ggslam.mapping.between_frames:decode": "JPEGs that this process made, in memory",
     "ggslam.system.process_memory:peak_memory_bytes": "/proc",
-    "ggslam.system.process_memory:resident_bytes": "/proc",
     "ggslam.system.process_memory:most_memory_bytes": "/sys",
     "ggslam.jobs.doctor.checkup:_memory_gb": "/proc and /sys",
     "ggslam.runs.environment:processor": "/proc",

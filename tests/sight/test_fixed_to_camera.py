@@ -6,10 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ggslam.abi.arrays import address
 from ggslam.errors import CoreInputError
+from ggslam.native.loader import load_library
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import inverse, se3_exp, transform_points
-from ggslam.sight.fixed_to_camera import FixedTuning, count_comparisons
+from ggslam.sight.fixed_to_camera import FixedTuning, count_comparisons, shrink_depth
 from ggslam.sight.margin import Margin
 from ggslam.sight.view import Sight, View
 
@@ -67,3 +69,29 @@ def test_what_cannot_be_is_refused() -> None:
     with pytest.raises(CoreInputError, match="T_world_camera"):
         count_comparisons(depth, T, [(other, np.full((4, 4), np.nan))], CAMERA, counts)
     assert not counts.any()
+
+
+@pytest.mark.parametrize("factor", [1, 2, 4, 7, 30])
+def test_small_depth_is_the_nearest_known_of_each_cell(factor: int) -> None:
+    depth = np.random.default_rng(0).uniform(0.5, 3, (30, 40)).astype(np.float32)
+    depth[depth < 1] = 0
+    depth[:8, :8] = 0
+    depth[9, 9:12], depth[10, 11], depth[11, 12] = (np.nan, np.inf, 1), -1, np.inf
+    found, camera = shrink_depth(depth, CAMERA, factor)
+    for i, j in np.ndindex(30 // factor, 40 // factor):
+        cell = depth[i * factor : (i + 1) * factor, j * factor : (j + 1) * factor]
+        known = cell[(cell > 0) & np.isfinite(cell)]
+        assert found[i, j] == (known.min() if len(known) else 0)
+    assert found.shape == (camera.height, camera.width) == (30 // factor, 40 // factor)
+    assert found.dtype == np.float32
+
+
+def test_depth_that_cannot_be_made_smaller_is_refused() -> None:
+    depth = np.ones((30, 40), np.float32)
+    with pytest.raises(ValueError, match="expected depth"):
+        shrink_depth(depth[:-1], CAMERA, 2)
+    for factor in (0, 31):
+        with pytest.raises(CoreInputError, match="factor"):
+            load_library().ggslam_shrink_depth(address(depth), 30, 40, factor, address(depth))
+    with pytest.raises(CoreInputError, match="depth"):
+        load_library().ggslam_shrink_depth(None, 30, 40, 2, address(depth))

@@ -118,5 +118,9 @@ struct PlacesEvidenceJob {
 // Each returns 0. Images are not empty, and `factor` is at most their sides.
 GGSLAM_EXPORT int ggslam_sight(void* context, const ggslam::SightJob* job);
 GGSLAM_EXPORT int ggslam_fixed_to_camera(const ggslam::FixedToCameraJob* job);
+
+// Depth `factor` times smaller: of the pixels of each place, as of `DepthPlacesJob`, the nearest known depth, 0 if none
+// is; `smaller`: [h, w].
+GGSLAM_EXPORT int ggslam_shrink_depth(const float* depth, int32_t height, int32_t width, int32_t factor, float* smaller);
 GGSLAM_EXPORT int ggslam_depth_places(void* context, const ggslam::DepthPlacesJob* job);
 GGSLAM_EXPORT int ggslam_places_evidence(void* context, const ggslam::PlacesEvidenceJob* job);

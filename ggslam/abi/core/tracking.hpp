@@ -144,12 +144,43 @@ struct AlignResult {
   int32_t coarse_iterations, fine_iterations, matches, inliers, converged, usable;
 };
 
+// Where a camera may have stood still since an earlier frame, the anchor: the pixels that tell, and what they say.
+struct StillPixelsJob {
+  // Four images [height, width] each: grey values, blurred; their gradients along rows and along columns, grey levels a
+  // pixel; depth, metres, 0 where unknown.
+  const float* anchor;
+  const float* now;
+  int32_t height, width;
+  float least_squared_gradient;  // of a textured pixel, exclusive
+  float largest_flow;            // pixels across its edge, of a pixel that stays
+  int32_t fewest, most;          // textured pixels with depth in both images; of `most` and more some are compared
+  int32_t cells;                 // parts of the image along each axis
+  int32_t fewest_in_cell;        // compared pixels of a part that counts
+  double still_cells;            // smallest share of these parts in which...
+  double still_share;            // ...at least this share of the pixels stays; the same for each direction
+  float across;                  // least component of a unit gradient along a direction that it tells about
+  int32_t fewest_across;         // such pixels of each direction
+  // Results, room for 2 `most`: of each compared pixel 2 (row * width + column) and, if it stays, 1 more.
+  int32_t* found;
+};
+
 }  // namespace ggslam
 
 // Points on the grid of pixels `stride` apart, row by row; returns their number. The outputs have room for
 // ceil(width / stride) ceil(height / stride) points.
 GGSLAM_EXPORT int ggslam_depth_points(void* context, const float* depth, const ggslam::DepthPointsSettings* settings,
                                       const ggslam::DepthPointsOutput* out);
+
+// Copies a depth image of `count` pixels to `copy`; returns how many of them are known, that is greater than 0.
+GGSLAM_EXPORT int64_t ggslam_copy_depth(const float* depth, int64_t count, float* copy);
+
+// Grey values 0 to 255 of an image [height, width, 3], of which `factor`, 1 to 16, divides both sides, `factor` times
+// smaller: means of squares of pixels and then of channels (by their luminance), each rounded as OpenCV does, `grey` [h, w].
+GGSLAM_EXPORT int ggslam_shrink_grey(const uint8_t* color, int32_t height, int32_t width, int32_t factor, float* grey);
+
+// The number of compared pixels if most of them stay, all over the image and along each of four directions, else 0.
+GGSLAM_EXPORT int ggslam_still_pixels(const ggslam::StillPixelsJob* job);
+
 GGSLAM_EXPORT void* ggslam_gicp_target_create();
 GGSLAM_EXPORT int ggslam_gicp_target_destroy(void* target);
 GGSLAM_EXPORT int ggslam_gicp_target_build(void* context, void* target, const void* base,

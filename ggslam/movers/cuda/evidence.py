@@ -145,9 +145,9 @@ class CudaEvidence:
         return bool(np.maximum.reduce(np.abs(self._apart)) <= most)  # what is not a number is not
 
     def _fill(self, request: EvidenceRequest) -> None:
-        """Sets what is asked of the kernels but for depth and pose."""
+        """Sets what is asked of the kernels but for depth and pose. Earlier views, if any, are in the ring."""
         job = self._job
-        if self._ring is None or not self._has_room(request):
+        if self._ring is None or not (request.earlier or self._has_room(request)):
             self._make_room(request.camera, request.factor, request.ages[-1] + 2)
         assert self._ring is not None
         if self._margin is not request.margin and self._margin != request.margin:

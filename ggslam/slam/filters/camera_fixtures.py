@@ -158,10 +158,13 @@ class CameraFixtures(FrameFilter):
             still >= FixtureTuning.still_per_world * world
         )
         candidates &= depth < FixtureTuning.max_depth_m
+        fewest = FixtureTuning.min_image_share * candidates.size
+        if np.add.reduce(candidates, axis=None) < fewest:
+            return
         found = parts_with_seeds(
             candidates & (fixed >= FixtureTuning.seed_views), candidates, FixtureTuning.min_seed_share
         )
-        if np.count_nonzero(found) < FixtureTuning.min_image_share * found.size:
+        if np.add.reduce(found, axis=None) < fewest:
             return
         grown = cv2.dilate(found.astype(np.uint8), np.ones((3, 3), np.uint8))
         large = cv2.resize(grown, (grown.shape[1] * factor, grown.shape[0] * factor), interpolation=cv2.INTER_NEAREST)

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 import torch
 
+from ggslam.abi.core import DepthPointsSettings
 from ggslam.abi.cuda import AlignJob, AlignResult, MoverEvidenceJob, TrackJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
@@ -38,7 +39,7 @@ from ggslam.tracking.gicp import (
     native_align_settings,
 )
 from ggslam.tracking.points import PointSource, check_depth, grid_stride, native_points_settings
-from ggslam.tracking.settings import AlignSettings, DepthNoise, PhotometricSettings, PointSettings
+from ggslam.tracking.settings import UNBOUNDED, AlignSettings, DepthNoise, PhotometricSettings, PointSettings
 
 _GUESS: Final = TrackJob.align.offset + AlignJob.guess.offset
 
@@ -70,6 +71,8 @@ class CudaTrackingEngine:
         self._ring = FetchRing(self.device)
         self._pending: weakref.ref[CudaPoints] | None = None
         self._grid = (-1, -1)  # that there is memory for
+        self._point_room = self._point_words = 0
+        self._points_of: tuple[PointSettings, DepthNoise, int] | None = None  # and stride, that the job is set for
         self._workspace = torch.zeros(0, dtype=torch.uint8, device=self.device)
         self._largest = (0, 0)  # room and textured points that the workspace is known to have room for
         self._settings_of: tuple[AlignSettings, DepthNoise, PhotometricSettings | None] | None = None
@@ -97,20 +100,13 @@ class CudaTrackingEngine:
             ValueError: `depth` has another shape than the camera.
         """
         self.send_depth(depth)
-        stride = grid_stride(int(np.count_nonzero(self._depth.staged > 0)), settings.count)
-        arguments = native_points_settings(self.camera, settings, noise, stride, depth)
-        border = arguments.window * arguments.window_step
-        first = 2 * border + stride // 2
-        columns = max(0, math.ceil((self.camera.width - first) / stride))
-        rows = max(0, math.ceil((self.camera.height - first) / stride))
-        room = columns * rows
-        found = CudaPoints(room, self._point_blocks.take(words_for(room)), self._extract, self._ring)
-        job = self._job.points
-        job.settings, job.columns, job.rows, job.out = arguments, columns, rows, found.arrays
-        if self._grid != (columns, rows):
-            size = self.library.functions.ggslam_cuda_depth_points_bytes(ctypes.byref(job))
-            job.workspace = self._memory.block("points", size).data_ptr()
-            self._grid = columns, rows
+        stride, job = grid_stride(self._depth.known, settings.count), self._job.points
+        before, usual = self._points_of, settings.near_weight >= UNBOUNDED
+        if not (before is not None and usual and before[0] is settings and before[1] is noise and before[2] == stride):
+            self._set_points(native_points_settings(self.camera, settings, noise, stride, depth))
+            self._points_of = settings, noise, stride
+        found = CudaPoints(self._point_room, self._point_blocks.take(self._point_words), self._extract, self._ring)
+        job.out = found.arrays
         self._pending = weakref.ref(found)
         return found
 
@@ -123,7 +119,8 @@ class CudaTrackingEngine:
         Raises:
             ValueError: `depth` has another shape than the camera.
         """
-        check_depth(depth, self.camera)
+        if depth.shape != self._depth.staged.shape:
+            check_depth(depth, self.camera)
         before = None if self._pending is None else self._pending()
         if before is not None:
             self._extract(before)
@@ -155,19 +152,22 @@ class CudaTrackingEngine:
         align.match, align.squared_distance = matched.address, matched.address + 4 * max(1, room)
         self._guess_rotation[...] = T_world_camera_guess[:3, :3]
         self._guess_translation[...] = T_world_camera_guess[:3, 3]
-        self._set_settings(settings, noise, None if photometric is None else photometric.settings)
+        greys, before = None if photometric is None else photometric.settings, self._settings_of
+        if before is None or before[0] is not settings or before[1] is not noise or before[2] is not greys:
+            align.settings = native_align_settings(settings, noise, greys)
+            self._settings_of = settings, noise, greys
         self._target.fill(target, job)
         self._set_photometric(photometric)
-        self._make_room(align)
+        if room > self._largest[0] or align.photometric_points.count > self._largest[1]:
+            self._make_room(align)
         job.makes_points = not source.is_extracted
         job.looks = source.looks
         align.stream = self.library.stream(self.device)
         self.library.call("track_wait", self._reference)
         self._depth.note_arrival()
         self._target.note_made()
-        source.note_extracted()
         found = self._found.copy()
-        source.set_header(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
+        source.note_aligned(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
         if isinstance(photometric, CudaPhotometricPart):
             self.greys.color.note_arrival()
             photometric.textured = int(found[AlignResult.TEXTURED])
@@ -190,18 +190,25 @@ class CudaTrackingEngine:
 
     # --- parts -------------------------------------------------------------------------------------------------------
 
+    def _set_points(self, settings: DepthPointsSettings) -> None:
+        """Sets how points are extracted, and the grid of those that may be."""
+        job, stride = self._job.points, settings.stride
+        first = 2 * settings.window * settings.window_step + stride // 2
+        columns = max(0, math.ceil((self.camera.width - first) / stride))
+        rows = max(0, math.ceil((self.camera.height - first) / stride))
+        job.settings, job.columns, job.rows = settings, columns, rows
+        self._point_room, self._point_words = columns * rows, words_for(columns * rows)
+        if self._grid != (columns, rows):
+            size = self.library.functions.ggslam_cuda_depth_points_bytes(ctypes.byref(job))
+            job.workspace = self._memory.block("points", size).data_ptr()
+            self._grid = columns, rows
+
     def _extract(self, points: CudaPoints) -> None:
         """Starts to extract the points that `points` got ready last, if that was not done yet."""
         if not points.is_extracted:
             self._job.points.stream = self.library.stream(self.device)
             self.library.call("depth_points", ctypes.byref(self._job.points))
             points.note_extracted()
-
-    def _set_settings(self, settings: AlignSettings, noise: DepthNoise, greys: PhotometricSettings | None) -> None:
-        before = self._settings_of
-        if before is None or before[0] is not settings or before[1] is not noise or before[2] is not greys:
-            self._job.align.settings = native_align_settings(settings, noise, greys)
-            self._settings_of = settings, noise, greys
 
     def _set_photometric(self, part: PhotometricSource | None) -> None:
         """Sets what grey values contribute, and what has to be made for that.
@@ -224,8 +231,6 @@ class CudaTrackingEngine:
     def _make_room(self, align: AlignJob) -> None:
         """Memory that an alignment works in, all zero when new."""
         room, textured = align.room, align.photometric_points.count
-        if room <= self._largest[0] and textured <= self._largest[1]:
-            return
         self._largest = max(room, self._largest[0]), max(textured, self._largest[1])
         align.room, align.photometric_points.count = self._largest
         size = self.library.functions.ggslam_cuda_align_bytes(ctypes.byref(align))

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from ggslam.abi.arrays import address
 from ggslam.cuda.transfers import Marker
+from ggslam.native.loader import load_library
 
 _TYPES: dict[Any, torch.dtype] = {np.float32: torch.float32, np.uint8: torch.uint8}
 
@@ -18,7 +20,7 @@ class FrameUpload:
 
     Args:
         shape: of the images.
-        dtype: of their numbers, float32 or uint8.
+        dtype: of their numbers: float32, depth in metres, or uint8.
         device: where to.
     """
 
@@ -26,6 +28,9 @@ class FrameUpload:
         self._staged = torch.empty(shape, dtype=_TYPES[dtype], pin_memory=device.type == "cuda")
         self.staged = self._staged.numpy()
         """The image that was sent last, on the host."""
+        self.known = 0
+        """Pixels of it with depth."""
+        self._is_depth, self._staged_address = dtype is np.float32, self._staged.data_ptr()
         self._memory = torch.empty(shape, dtype=_TYPES[dtype], device=device)
         self.address = self._memory.data_ptr()
         """On the device."""
@@ -39,7 +44,11 @@ class FrameUpload:
         if self._under_way:
             self._sent.set()
             self._sent.wait_if_ahead()
-        self.staged[...] = image
+        if self._is_depth and image.dtype == np.float32 and image.flags.c_contiguous:
+            self.known = load_library().ggslam_copy_depth(address(image), image.size, self._staged_address)
+        else:
+            self.staged[...] = image
+            self.known = int(np.count_nonzero(self.staged > 0)) if self._is_depth else 0
         self._memory.copy_(self._staged, non_blocking=True)
         self._under_way, self.image = True, image
 

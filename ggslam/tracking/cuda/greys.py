@@ -100,15 +100,18 @@ class CudaGreys:
         self, view: FeatureView, reference: FeatureView, settings: PhotometricSettings, shrink: int, least: int
     ) -> CudaPhotometricPart | None:
         """The photometric part of a frame; None if an alignment has told that it has not enough texture."""
-        if self._part is not None and self._part.is_of(view, reference, settings, shrink):
-            return self._part if self._part.has_texture else None
+        part = self._part
+        if part is not None and part.view is view and part.is_of(view, reference, settings, shrink):
+            return part if part.has_texture else None
         self._part = CudaPhotometricPart(view, reference, settings, shrink, least)
         return self._part
 
     def prepare(self, part: CudaPhotometricPart, job: TrackJob) -> None:
         """Sets what an alignment compares, and what has to be made before of the reference and of the frame, unless it
         is there. Images that this takes are on their way to the device."""
-        self._fill(part.settings, part.shrink)
+        filled = self._filled_for
+        if filled is None or filled[0] is not part.settings or filled[1] != part.shrink:
+            self._fill(part.settings, part.shrink)
         reference = self._image_of(part.reference, part.shrink)
         if reference is None:
             reference = self._place_for(part.reference, part.shrink, part.view)
@@ -124,7 +127,9 @@ class CudaGreys:
             job.greys = self._job_for(part.view, image, self.color, self._depth, chooses=True)
             job.makes_greys = 1
             self._made = part
-        self._set_reference(reference, part.reference)
+        place = part.reference.T_world_camera, reference.memory.data_ptr()
+        if self._view_of is None or self._view_of[0] is not place[0] or self._view_of[1] != place[1]:
+            self._set_reference(*place)
         align = job.align
         align.photometric_points, align.textured = self.points, self._job.count
         align.reference, align.least_textured = self.reference, part.least
@@ -133,8 +138,6 @@ class CudaGreys:
 
     def _fill(self, settings: PhotometricSettings, shrink: int) -> None:
         """What is the same for all frames."""
-        if self._filled_for is not None and self._filled_for[0] is settings and self._filled_for[1] == shrink:
-            return
         camera, job = reduced_camera(self._camera, shrink), self._job
         weights = cv2.getGaussianKernel(3, 0.7, cv2.CV_32F)
         job.fx, job.fy, job.cx, job.cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -178,10 +181,8 @@ class CudaGreys:
             job.count = None
         return job
 
-    def _set_reference(self, image: _Image, view: FeatureView) -> None:
-        T, address = view.T_world_camera, image.memory.data_ptr()
-        if self._view_of is not None and self._view_of[0] is T and self._view_of[1] == address:
-            return
+    def _set_reference(self, T: np.ndarray, address: int) -> None:
+        """The reference is a view at a pose T_world_camera [4, 4] whose image is at an address."""
         T_reference_world, small, out = inverse(T), self._small, self.reference
         out.pixels, out.width, out.height = address, small.width, small.height
         out.fx, out.fy, out.cx, out.cy = small.fx, small.fy, small.cx, small.cy

@@ -76,6 +76,10 @@ class CudaPoints:
         """Takes what the device says of the points, once it is known."""
         self._header = count, median_depth
 
+    def note_aligned(self, count: int, median_depth: float) -> None:
+        """The device has extracted and aligned them, and said this of them."""
+        self._extract, self._header = None, (count, median_depth)
+
     def __len__(self) -> int:
         """Waits for the device if the points were not aligned yet."""
         return self._known_header()[0]

@@ -57,6 +57,8 @@ inline int mirrored(int i, int count) {
 
 // Places of row `row`; `columns`: scratch, `width` elements each.
 GGSLAM_DECLARE_KERNEL(void depth_places_row(const DepthPlacesJob& job, int row, const DepthColumns& columns))
+// A row of places `factor` times smaller, of `factor` rows of depth; `nearest`: scratch, `width` elements.
+GGSLAM_DECLARE_KERNEL(void shrink_depth_row(const float* depth, int width, int factor, float* nearest, float* smaller))
 GGSLAM_DECLARE_KERNEL(void project_places(const PlacesView& view, const OtherPlacesView& other,
                                           const ProjectedPlaces& places))
 // The results by one other view, [5, count]; `share`: of a pixel's noise, where both views are smooth.
