@@ -169,6 +169,13 @@ class IdentityLearner(ABC):
         self._iterations += 1
         return self._iterations % self.settings.every == 0 and keyframe.mask is not None and self.table.count > 0
 
+    def due_turns(self, iterations: int) -> range:
+        """As `due` of so many iterations to come: the numbers, from 0, of those that shall have an identity step if
+        their keyframes have masks."""
+        every, done = self.settings.every, self._iterations
+        self._iterations += iterations
+        return range(every - 1 - done % every, iterations, every) if self.table.count > 0 else range(0)
+
     # --- a map that is partly on disk ---------------------------------------------------------------------------------
 
     def catch_up(self, gaussians: GaussianMap) -> None:
