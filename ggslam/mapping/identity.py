@@ -112,7 +112,9 @@ class MaskOnGrid:
 
 def ids_of(mask: np.ndarray) -> np.ndarray:
     """Ids that are in a mask of uint16, each once, in order."""
-    return np.flatnonzero(np.bincount(mask.reshape(-1), minlength=1)).astype(np.uint16)
+    flat = mask.reshape(-1)
+    begun = flat[1:][flat[1:] != flat[:-1]]  # the first pixel of each run of one id, which are few
+    return np.flatnonzero(np.bincount(np.append(flat[:1], begun), minlength=1)).astype(np.uint16)
 
 
 @dataclass
