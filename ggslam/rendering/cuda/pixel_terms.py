@@ -196,12 +196,16 @@ class CudaPixelTerms:
 
     # --- the C interface ---------------------------------------------------------------------------------------------
 
-    def _call(self, name: str, *arguments: object) -> None:
-        """Calls ggslam_cuda_terms_<name> for these terms; structures are passed by their address."""
-        terms = PixelTerms(
+    def native(self) -> PixelTerms:
+        """As the library takes them, on torch's current stream."""
+        return PixelTerms(
             len(self), address(self.gaussians), address(self.weights), address(self.counts),
             self.library.stream(self.device), self.capacity, self.device.index or 0,
         )  # fmt: skip
+
+    def _call(self, name: str, *arguments: object) -> None:
+        """Calls ggslam_cuda_terms_<name> for these terms; structures are passed by their address."""
+        terms = self.native()
         given = [ctypes.byref(value) if isinstance(value, ctypes.Structure) else value for value in arguments]
         self.library.call(f"terms_{name}", ctypes.byref(terms), *given)
 
