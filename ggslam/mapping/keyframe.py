@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.array_archive import ArrayArchive
+from ggslam.rendering.exposure import identity_exposure
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
@@ -63,7 +64,7 @@ class Keyframe:
     depth: Annotated[np.ndarray, Form("u2", "h", "w")]
     T_camera_world: Pose
     mask: IdImage | None = field(default_factory=lambda: None)
-    exposure: Exposure = field(default_factory=lambda: np.tile([1.0, 0.0], (3, 1)))
+    exposure: Exposure = field(default_factory=identity_exposure)
     iterations: int = 0
     archive: ArrayArchive | None = None
     """Has the images once they were put away; they are read from there."""

@@ -67,7 +67,7 @@ class CudaKeyframeImages:
     @property
     def nbytes(self) -> int:
         """Memory that they take."""
-        return sum(image.nbytes for image in (self.color, self.depth, self.mask) if image is not None)
+        return self.color.nbytes + self.depth.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
 
 _TYPES: Final = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.uint16}

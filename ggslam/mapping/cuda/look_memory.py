@@ -156,7 +156,7 @@ class LookMemory:
 
     def exposure(self) -> np.ndarray | None:
         """Of the keyframe against the map, as `SeenAgain.measure`."""
-        if not all(is_enough(used, self._compared) for used in self._found.used):
+        if not is_enough(min(self._found.used), self._compared):
             return None
         return exposure_of(self._found.medians)
 

@@ -270,7 +270,7 @@ class TrainingMapper(ComparingMapper):
         kind = StepKind(camera, self.settings, self._loss_settings(keyframe), exposed, *filters)
         step = TrainingStep(lesson=-1, T_camera_keyframe=address(keyframe.T_camera_keyframe_on_device))
         step.images = TargetImages(
-            address(images.color), address(images.depth), address(shown), keyframe.depth_unit, False
+            images.color.data_ptr(), images.depth.data_ptr(), address(shown), keyframe.depth_unit, False
         )  # fmt: skip
         step.keyframe = KeyframeChoice(self._states.address(number), 0.0, exposed and number > 0)
         return StepRow(self._kinds.only(kind), step, images, shown, self.is_world(keyframe))

@@ -32,7 +32,7 @@ class CudaVoteLabels:
 
     def job(self, gaussians: GaussianMap) -> VoteLabelJob:
         """The same, for the library; its labels are valid until the next call."""
-        if len(self._labels) < len(gaussians):
+        if len(self._labels) < gaussians.count:
             self._labels = torch.empty(gaussians.capacity, dtype=torch.int32, device=self._device)
         storage = gaussians.storage
         return VoteLabelJob(

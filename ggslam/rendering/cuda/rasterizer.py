@@ -384,7 +384,7 @@ class CudaRasterizer:
 
     def _parameters(self, gaussians: Gaussians) -> GaussianTensors:
         if isinstance(gaussians, GaussianMap) and gaussians.device == self.device:  # shaped as it should by itself
-            return GaussianTensors(*(getattr(gaussians, name) for name in PARAMETERS))
+            return GaussianTensors(*[getattr(gaussians, name) for name in PARAMETERS])
         return checked_parameters(gaussians, self.device)
 
     @property
