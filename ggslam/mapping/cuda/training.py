@@ -104,7 +104,7 @@ class CudaTraining:
         self._named.append(mask)
         self._lesson_count += 1
 
-    def bound(self, number: int) -> None:
+    def clamp_after(self, number: int) -> None:
         """After a step that was gathered, sizes and, of degree 0, colours are brought within their bounds."""
         self._steps[number].bounded = 1
 

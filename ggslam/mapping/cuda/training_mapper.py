@@ -207,7 +207,7 @@ class TrainingMapper(ComparingMapper):
             self.times.steps += 1
             self.times.iterations += 1
             if self.times.iterations % MapperTuning.bound_every == 0:
-                self._training.bound(number)
+                self._training.clamp_after(number)
 
     def _step(
         self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
@@ -289,7 +289,7 @@ class TrainingMapper(ComparingMapper):
 
     def _bound_values(self) -> None:
         if self._training.count:
-            self._training.bound(self._training.count - 1)
+            self._training.clamp_after(self._training.count - 1)
         else:
             super()._bound_values()
 
