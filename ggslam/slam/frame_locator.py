@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +46,7 @@ class Located:
         return self.joint.status is TrackingStatus.LOST
 
 
-@savable(not_saved="_config _surface _masks _tracker _loops _pager _policy _poses _filters")
+@savable(not_saved="before_search _config _surface _masks _tracker _loops _pager _policy _poses _filters")
 class FrameLocator:
     """Locates the frames of a camera.
 
@@ -66,6 +66,8 @@ class FrameLocator:
         self._policy, self._poses, self._filters = policy, poses, filters
         self.color_poses = ColorPoses(parts.mapper, poses, parts.tracker.state)
         self.part_start, self.left_parts = PartStart(), LeftParts()
+        self.before_search: Callable[[], None] = lambda: None
+        """Is called before a lost camera is looked for: all keyframes have to be known then."""
 
     def target(self, published: GicpTarget | None) -> GicpTarget | None:
         """What the next frames are aligned to: the surface as it was published last, or what a part has begun with
@@ -90,6 +92,7 @@ class FrameLocator:
         expected = self._filters.expect(frame)
         result, early = self._tracker.track(expected), list[tuple[Frame, TrackingResult]]()
         if result.status is TrackingStatus.LOST and self._loops is not None and self._tracker.target is not None:
+            self.before_search()
             found = self._find_again(frame, expected, result, self._loops)
             if found is not None:
                 result = found

@@ -33,6 +33,7 @@ from ggslam.system.array_forms import Form, Pose, PoseForm, check_arrays, check_
 from ggslam.system.savable import savable
 from ggslam.tracking.gicp import AlignmentResult, GicpTarget
 from ggslam.tracking.points import PointSource
+from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult
 
@@ -175,14 +176,20 @@ class LoopCloser:
             return begun[1].result()
         return self.places.describe(FeatureView(frame.color, frame.depth, T_world_camera), frame.camera)
 
-    def add(self, frame: Frame, tracking: TrackingResult) -> Correction | None:
+    def add(self, frame: Frame, tracking: TrackingResult, noise: DepthNoise | None = None) -> Correction | None:
         """A keyframe was made of a frame, and its points are in the surface. Puts aside and takes back keyframes.
+
+        Args:
+            frame: that it was made of.
+            tracking: where it is.
+            noise: of the depth camera as it was known then, where the tracker learns more meanwhile.
 
         Returns:
             The correction if this closes a loop. `apply` it.
         """
         start = time.perf_counter()
         with self._lock:
+            self.comparison.noise_then = noise
             T = tracking.T_world_camera
             place = self._describe(frame, T)
             # In real time, keyframes from before the camera was lost may still come after it was found.
@@ -200,6 +207,7 @@ class LoopCloser:
             correction = None if belated else self._look_back(frame, place, tracking)
             if correction is None and (self.activity.update() or belated or begins):
                 self._surface.arrange(self.activity.active)
+            self.comparison.noise_then = None
         self.seconds += time.perf_counter() - start
         return correction
 

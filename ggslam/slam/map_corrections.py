@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +20,7 @@ from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import TrackingResult
 
 
-@savable(not_saved="_surface _mapper _pager _masks _beside publishing")
+@savable(not_saved="_surface _mapper _pager _masks _held publishing")
 class MapCorrections:
     """Keeps the surface, which the tracker's thread reads, in step with the corrections that the mapper's makes.
 
@@ -40,7 +38,7 @@ class MapCorrections:
     ) -> None:
         self._surface, self._mapper, self._pager, self._masks = surface, mapper, pager, masks
         self.moves = []
-        self._beside: ThreadPoolExecutor | None = None
+        self._held: tuple[GicpTarget | None] | None = None
         self.publishing = threading.Lock()
         """Is held while the surface changes, or what the tracker reads beside it."""
 
@@ -51,8 +49,18 @@ class MapCorrections:
     def pending_moves(self, known: int) -> tuple[GicpTarget | None, list[np.ndarray]]:
         """What the tracker aligns to now, and what moved the world about the camera, [4, 4] each, since so many
         corrections."""
+        if self._held is not None:
+            return self._held[0], self.moves[known:]
         with self.publishing:
             return self._surface.target, self.moves[known:]
+
+    def hold_target(self) -> None:
+        """Until `show_target` the tracker aligns to what there is now, whatever another thread does to the surface."""
+        self._held = (self._surface.target,)
+
+    def show_target(self) -> None:
+        """The tracker sees again what the surface is."""
+        self._held = None
 
     def follow(self, tracking: TrackingResult, known: int) -> TrackingResult:
         """A tracked frame moved along with the corrections after the first `known` ones."""
@@ -64,20 +72,10 @@ class MapCorrections:
         """Starts in another thread what `add_points` will have to do."""
         self._surface.begin(tracking.points, tracking.T_world_camera)
 
-    def add_points(self, tracking: TrackingResult, meanwhile: Callable[[], None] | None = None) -> None:
-        """The points of a new keyframe join the surface; in another thread, if there is something to do meanwhile."""
-        if meanwhile is None:
-            with self.publishing:
-                self._surface.add(tracking.points, tracking.T_world_camera)
-            return
-        tracking.points.read()  # what waits for the GPU is done in this thread
-        if self._beside is None:
-            self._beside = ThreadPoolExecutor(1, thread_name_prefix="surface")
-        added = self._beside.submit(self.add_points, tracking)
-        try:
-            meanwhile()
-        finally:
-            added.result()
+    def add_points(self, tracking: TrackingResult) -> None:
+        """The points of a new keyframe join the surface."""
+        with self.publishing:
+            self._surface.add(tracking.points, tracking.T_world_camera)
 
     def apply(self, correction: Correction, loops: LoopCloser) -> None:
         """Moves the map after its keyframes, unites objects that both ends have mapped, takes out what is double now,

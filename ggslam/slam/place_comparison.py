@@ -41,6 +41,8 @@ class PlaceComparison:
         self.settings = settings
         self._neighbourhood, self._surface = neighbourhood, surface
         self._tracker, self._context = tracker, context
+        self.noise_then: DepthNoise | None = None
+        """Noise of the depth camera while what is compared was located; None: as the tracker knows it."""
 
     def find(
         self, source: PointSource, place: Place, places: PlaceIndex, poses: Sequence[np.ndarray], old: int,
@@ -84,8 +86,8 @@ class PlaceComparison:
 
     @property
     def noise(self) -> DepthNoise:
-        """Of the depth camera, as the tracker knows it."""
-        return self._tracker.noise or DepthNoise()
+        """Of the depth camera."""
+        return self.noise_then or self._tracker.noise or DepthNoise()
 
     def around(self, number: int, count: int) -> list[int]:
         """The keyframes of `count` whose points make the surface at one of them."""

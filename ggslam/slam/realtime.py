@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 
-from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.slam.frame_clock import FrameClock
 from ggslam.slam.result import StepReport
@@ -77,10 +76,8 @@ class RealtimeSlam:
         self._jobs: queue.Queue[NewKeyframe | None] = queue.Queue()
         self._mapper_error: BaseException | None = None
         slam.schedule = _InAnotherThread(self._jobs, slam.mapper.beside_others())
-        # The kernels of one context take turns; the tracker must not wait for the mapper's.
         slam.mapper.is_live = slam.color_poses.live = True  # the map changes meanwhile
-        slam.tracker.context = NativeContext(slam.context.threads, slam.context.instruction_set)
-        slam.filters.use_context(slam.tracker.context)
+        slam.use_context_beside_mapping()
 
     def run(self, frames: Iterable[Frame], report: Callable[[Frame, StepReport], None]) -> None:
         """Processes all frames; `report` is called for each. Errors of either thread are raised here."""

@@ -12,6 +12,7 @@ from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import ConfigError
 from ggslam.mapping.extra_loss import ExtraLoss
 from ggslam.mapping.keyframe import Keyframe
+from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IDENTITY_CHANNELS
@@ -22,6 +23,8 @@ from ggslam.slam.filters.frame_filter import FilterContext
 from ggslam.slam.filters.movers import MoverFilter
 from ggslam.slam.frame_locator import FrameLocator
 from ggslam.slam.frame_poses import FramePoses
+from ggslam.slam.joining import Joining
+from ggslam.slam.loop_closing import Correction
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
 from ggslam.slam.map_removal import MapRemoval
@@ -79,8 +82,12 @@ class RunState:
         self.movers.detector.source = parts.evidence
         self.locator = self._make_locator(parts)
         self.schedule = Schedule()
+        self.joining = Joining[Correction | None]()
+        """Of the newest keyframe, where the next frames do not wait for it."""
         if parts.on_device:
             self.schedule = BesideTraining(self.mapper.beside_others(host_waits=False))
+            self.use_context_beside_mapping()
+        self.locator.before_search = self.end_joining
         self.corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
         self.removal = MapRemoval(self.surface, self.mapper, self.pager, self.corrections.publishing)
         self.parts = MapParts(self.mapper, self.poses, self.corrections, self.loops)
@@ -160,11 +167,22 @@ class RunState:
         asked, before = self.config.refine_iterations, self.mapper.times.iterations - self.refine_iterations
         return asked if asked >= 0 else self.mapper.last_iterations(before)
 
+    def use_context_beside_mapping(self) -> None:
+        """The kernels of one context take turns: frames are located with one of their own, beside what the map's does.
+        """
+        self.tracker.context = NativeContext(self.context.threads, self.context.instruction_set)
+        self.filters.use_context(self.tracker.context)
+
+    def end_joining(self) -> None:
+        """Waits for the newest keyframe, if it still joins what frames are aligned to."""
+        self.joining.end()
+
     def join_parts(self) -> None:
         """Makes one part of those that the recording fell into, see `MapParts`; when there are no more frames."""
         self.parts.join_parts()
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""
+        self.end_joining()
         if self.pager is not None:
             self.pager.close()

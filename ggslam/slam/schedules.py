@@ -35,7 +35,10 @@ class MapSteps(Protocol):
     tracker: Tracker
 
     def map_keyframe(self, new: NewKeyframe, train: Callable[[], None] | None = None) -> None:
-        """Steps 4 to 6."""
+        """Steps 4 to 6; with `train`, 5 and 6 beside the next frames."""
+
+    def end_joining(self) -> None:
+        """A keyframe that joins beside the next frames has joined."""
 
     def train(self, frames: int, keyframes_before: int) -> None:
         """Step 7."""
@@ -72,9 +75,9 @@ class Schedule:
 
 
 class BesideTraining(Schedule):
-    """The same on a GPU: the points of the last keyframe join the surface while the host hands the step's training to
-    the GPU, and the next frames are located beside that training, before it where both wait for room on the GPU. Of the
-    map, frames see what they see on the CPU.
+    """The same on a GPU: the points of a step's last keyframe join the surface, and loops are looked for, beside the
+    next frame, which is aligned to the surface without them. Frames are located beside the training, before it where
+    both wait for room on the GPU. Of the map, frames see what they see on the CPU.
 
     Args:
         beside: context for work beside the mapper's.
@@ -91,7 +94,7 @@ class BesideTraining(Schedule):
         if not keyframes:
             slam.train(frames, before)
             return
-        slam.tracker.target = None
+        slam.end_joining()
         for keyframe in keyframes[:-1]:
             slam.map_keyframe(keyframe)
         slam.map_keyframe(keyframes[-1], train=lambda: slam.train(frames, before))

@@ -26,6 +26,8 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.frame_checks import check_frame
 from ggslam.slam.filters.depth_edges import DepthEdges
 from ggslam.slam.frame_locator import Located
+from ggslam.slam.joining import JoiningTuning
+from ggslam.slam.loop_closing import Correction
 from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.run_end import refine, result_of
 from ggslam.slam.run_state import RunState
@@ -36,6 +38,7 @@ from ggslam.system.savable import savable
 from ggslam.system.spent import part
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.scale import scale_settings
+from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
 LOST = TrackingStatus.LOST.value
@@ -48,7 +51,7 @@ class TrimTuning(Tuning):
     """Keyframes between two calls that return freed memory. A call takes milliseconds."""
 
 
-@savable(not_saved="camera config context pager start_notes schedule", after="use_scale_again")
+@savable(not_saved="camera config context pager start_notes schedule joining", after="use_scale_again")
 class Slam(RunState):
     """Synchronous SLAM: each step tracks one frame, maybe makes a keyframe of it, and trains the map a fixed number
     of iterations. Deterministic for a given configuration and machine.
@@ -94,6 +97,7 @@ class Slam(RunState):
         start = time.perf_counter()
         self.times.start()
         self.schedule.begin_step()
+        self.joining.begin_step()
 
         # 1. Clean the frames: no depth that hangs between two surfaces, was taken at another time than the colour, or
         #    shows what is fixed to the camera.
@@ -125,7 +129,8 @@ class Slam(RunState):
 
         Args:
             new: the keyframe.
-            train: the step's training, if that goes on while the points join the surface.
+            train: the step's training, if the next frames do not wait for the keyframe to join what they are aligned
+                to; else that is the caller's.
         """
         frame, tracking = new.frame, self.corrections.follow(new.tracking, new.moves_followed)
         chain = self.chains[frame.camera_number]
@@ -148,20 +153,58 @@ class Slam(RunState):
         keyframe = self.mapper.add_keyframe(frame, tracking.T_world_camera, labeller, begin_others)
         added = self.map.count - before
 
+        # 5. and 6. The same beside the next frames.
+        if train is not None:
+            self._join_beside(frame, tracking, train)
+            return
+
         # 5. Add its points to the measured surface that the next frames are aligned to.
-        self.corrections.add_points(tracking, train)
+        self.corrections.add_points(tracking)
 
         # 6. Remove what is fixed to the camera or has moved since; then close a loop, if the keyframe shows a known
         #    place: the graph of keyframe poses is optimised, and the map moves with its keyframes.
         chain.after_insertion(self.removal, frame)
-        if self.loops is not None:
-            with part("loops"):
-                correction = self.loops.add(frame, tracking)
-            if correction is not None:
-                self.corrections.apply(correction, self.loops)
-                self.filters.loop_closed()
+        self._close_loop(self._look_for_loop(frame, tracking))
         if self.pager is not None:
             self.pager.finish_insertion(keyframe, added, 0 if self.loops is None else self.loops.places.held_bytes)
+
+    def _look_for_loop(
+        self, frame: Frame, tracking: TrackingResult, noise: DepthNoise | None = None
+    ) -> Correction | None:
+        """What has to move if the newest keyframe shows a known place; `noise` as of `LoopCloser.add`."""
+        if self.loops is None:
+            return None
+        with part("loops"):
+            return self.loops.add(frame, tracking, noise)
+
+    def _close_loop(self, correction: Correction | None) -> None:
+        if correction is not None and self.loops is not None:
+            self.corrections.apply(correction, self.loops)
+            self.filters.loop_closed()
+
+    def _join_beside(self, frame: Frame, tracking: TrackingResult, train: Callable[[], None]) -> None:
+        """Steps 5 and 6 beside the training and the next frame, which is aligned to what there was before. Where that
+        shows too little, or a part of the map begins, they are waited for."""
+        tracking.points.read()  # what waits for the GPU is done in this thread
+        noise = self.tracker.noise  # frames change it
+
+        def join() -> Correction | None:
+            self.corrections.add_points(tracking)
+            return self._look_for_loop(frame, tracking, noise)
+
+        def finish(correction: Correction | None) -> None:
+            self.corrections.show_target()
+            with self.mapper.in_turn():  # a lost frame may ask for it, beside the mapper's work
+                self.chains[frame.camera_number].after_insertion(self.removal, frame)
+                self._close_loop(correction)
+
+        shown = 0.0 if self.tracker.target is None else tracking.overlap
+        waits = shown < JoiningTuning.min_overlap or self.locator.part_start.target is not None
+        self.corrections.hold_target()
+        self.joining.start(join, finish)
+        train()
+        if waits:
+            self.end_joining()
 
     def train(self, frames: int, keyframes_before: int) -> None:
         """The training of a step.
@@ -295,9 +338,11 @@ class Slam(RunState):
     @opencv_errors("after the last frame")
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refinement_steps`), then the result. `progress(done, total)` is called now and then."""
+        self.end_joining()
         refine(self, progress)
         return self.result()
 
     def result(self) -> SlamResult:
         """What there is so far. The first call settles the objects: it is for the end."""
+        self.end_joining()
         return result_of(self)

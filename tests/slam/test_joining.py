@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where frames do not wait for a keyframe, it joins what they are aligned to beside the next one; when they see it is
+decided by their number. The schedule of a GPU, with the map on the CPU."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ggslam.loops.activity import ActivitySettings
+from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse, se3_exp
+from ggslam.sequences import open_sequence
+from ggslam.slam.config import load_config
+from ggslam.slam.joining import Joining
+from ggslam.slam.loop_closing import LoopCloser
+from ggslam.slam.loop_settings import LoopSettings
+from ggslam.slam.map_corrections import MapCorrections
+from ggslam.slam.schedules import BesideTraining
+from ggslam.slam.slam import Slam
+from ggslam.tracking.gicp import GicpTarget
+from ggslam.tracking.points import extract_points
+from ggslam.tracking.settings import DepthNoise
+from ggslam.tracking.tracker import TrackingResult, TrackingStatus
+
+CHEAP = ["mapping.iterations_per_frame=1", "mapping.first_frame_iterations=4", "identity.enabled=false",
+         "evaluation.held_out_every=0", "refine_iterations=2"]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def frames(room: Path) -> list[Frame]:
+    return list(open_sequence(room, scale=0.5).stream())
+
+
+def start(frames: list[Frame], *settings: str, loops: LoopSettings | None = None) -> Slam:
+    config = load_config(None, [*CHEAP, *settings])
+    if loops is not None:
+        config = dataclasses.replace(config, loops=loops)
+    slam = Slam(frames[0].camera, config, has_masks=False)
+    slam.schedule = BesideTraining(nullcontext())
+    return slam
+
+
+class TestJoining:
+    def test_the_number_of_steps_decides(self) -> None:
+        joining, done, may_end = Joining[str](), list[str](), threading.Event()
+
+        def work() -> str:
+            may_end.wait()
+            return "found"
+
+        joining.begin_step()
+        joining.start(work, done.append)
+        joining.begin_step()
+        assert joining.is_under_way and not done
+        threading.Timer(0.05, may_end.set).start()
+        joining.begin_step()
+        assert done == ["found"] and not joining.is_under_way
+        joining.start(lambda: "at once", done.append)
+        time.sleep(0.05)
+        joining.begin_step()
+        assert done == ["found"]
+        joining.end()
+        joining.end()
+        joining.begin_step()
+        assert done == ["found", "at once"]
+
+    def test_errors_are_raised_where_it_is_taken_over(self) -> None:
+        joining, done = Joining[float](), list[float]()
+        joining.start(lambda: 1 / 0, done.append)
+        joining.begin_step()
+        with pytest.raises(ZeroDivisionError):
+            joining.begin_step()
+        assert not joining.is_under_way and not done
+
+
+def test_the_next_frame_is_aligned_to_what_there_was_before(frames: list[Frame]) -> None:
+    slam = start(frames, "keyframes.max_gap=3", "keyframes.min_overlap=0.01")
+    seen, keyframes, track = list[GicpTarget | None](), list[bool](), slam.tracker.track
+
+    def noted(frame: Frame) -> TrackingResult:
+        seen.append(slam.tracker.target)
+        return dataclasses.replace(track(frame), overlap=0.9)
+
+    slam.tracker.track = noted  # type: ignore[method-assign]
+    for frame in frames[:8]:
+        keyframes.append(slam.step(frame).is_keyframe)
+    assert keyframes == [True, False, False] * 2 + [True, False]
+    assert seen[0] is None and seen[1] is not None  # nothing was there before the first
+    assert seen[1] is seen[2] is seen[3] is seen[4]
+    assert seen[5] is not seen[4] and seen[5] is seen[6] is seen[7]
+    slam.step(frames[8])
+    assert seen[8] is not seen[7] and seen[8] is slam.surface.target
+
+
+@pytest.mark.parametrize("gap", [1, 2])
+def test_runs_repeat_bit_for_bit_however_long_it_takes(
+    frames: list[Frame], gap: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the map shows every keyframe, the last one, too."""
+    found = []
+    for pause in (0.0, 0.15):
+        add, add_points = LoopCloser.add, MapCorrections.add_points
+
+        def slow(*arguments: object, pause: float = pause, add: object = add) -> object:
+            time.sleep(pause)
+            return add(*arguments)  # type: ignore[operator]
+
+        def slow_points(*arguments: object, pause: float = pause, add: object = add_points) -> None:
+            time.sleep(pause)
+            add(*arguments)  # type: ignore[operator]
+
+        with monkeypatch.context() as patch:
+            patch.setattr(LoopCloser, "add", slow)
+            patch.setattr(MapCorrections, "add_points", slow_points)
+            slam = start(frames, f"keyframes.max_gap={gap}")
+            for frame in frames[:7]:
+                slam.step(frame)
+            result = slam.finish()
+        assert slam.loops is not None
+        assert len(slam.surface) == len(slam.loops) == len(result.keyframes) >= 7 // gap
+        found.append((result.trajectory(), result.gaussians.means.numpy().tobytes()))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert found[0][1] == found[1][1]
+
+
+def test_where_the_target_shows_little_the_next_frame_waits(frames: list[Frame]) -> None:
+    slam = start(frames, "keyframes.max_gap=1")
+    track, overlap = slam.tracker.track, 0.74
+    slam.tracker.track = lambda frame: dataclasses.replace(track(frame), overlap=overlap)  # type: ignore[method-assign]
+    for frame in frames[:3]:
+        slam.step(frame)
+        assert not slam.joining.is_under_way and len(slam.surface) == len(slam.mapper.keyframes)
+    overlap = 0.76
+    slam.step(frames[3])
+    assert slam.joining.is_under_way
+
+
+def test_a_lost_camera_is_looked_for_at_all_keyframes(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+    slam = start(frames, "keyframes.max_gap=1", "keyframes.min_overlap=0.01")
+    known, track, status = list[int](), slam.tracker.track, TrackingStatus.OK
+
+    def find(loops: LoopCloser, *_: object) -> None:
+        known.append(len(loops))
+
+    monkeypatch.setattr(LoopCloser, "find", find)
+    slam.tracker.track = lambda frame: dataclasses.replace(  # type: ignore[method-assign]
+        track(frame), overlap=0.9, status=status
+    )
+    for frame in frames[:3]:
+        slam.step(frame)
+    assert slam.joining.is_under_way and not known
+    status = TrackingStatus.LOST
+    slam.step(frames[3])
+    assert known == [3] and not slam.joining.is_under_way
+
+
+class Drifting:
+    """Gives a run's tracker the true motion with drift."""
+
+    def __init__(self, slam: Slam, frames: list[Frame], drift: np.ndarray) -> None:
+        self.slam, self.step, self.T = slam, se3_exp(drift / len(frames)), np.eye(4)
+        self.before: Frame | None = None
+        slam.tracker.track = self.track  # type: ignore[method-assign]
+        slam.tracker.move = self.move  # type: ignore[method-assign]
+
+    def track(self, frame: Frame) -> TrackingResult:
+        if self.before is not None:
+            assert self.before.T_world_camera is not None
+            self.T = self.T @ inverse(self.before.T_world_camera) @ frame.T_world_camera @ self.step
+        self.before, slam = frame, self.slam
+        slam.tracker.noise = DepthNoise()
+        points = extract_points(frame.depth, slam.camera, slam.config.tracking.points, DepthNoise(), slam.context)
+        return TrackingResult(self.T.copy(), TrackingStatus.OK, 1.0, 0.0, "", points)
+
+    def move(self, T_new_old: np.ndarray) -> None:
+        self.T = T_new_old @ self.T
+
+
+@pytest.mark.parametrize("gap", [1, 2])
+def test_a_loop_that_is_found_beside_frames_moves_them_all(room: Path, gap: int) -> None:
+    frames = list(open_sequence(room).stream())
+    stride = 2 // gap
+    order = [*range(0, 24, stride), *range(22, -1, -stride)]
+    forgetful = LoopSettings(activity=ActivitySettings(forget_after=0.05, near=0.15, batch=1, spread=0))
+    walk = [dataclasses.replace(frames[i], index=k) for k, i in enumerate(order)]
+    slam = start(walk, f"keyframes.max_gap={gap}", "movers.enabled=false", loops=forgetful)
+    camera = Drifting(slam, walk, np.array([0.15, 0.06, -0.09, 0.0, np.radians(4), 0.0]))
+    for frame in walk:
+        slam.step(frame)
+    slam.end_joining()
+    slam.follow_corrections()
+    assert len(slam.corrections) and "closed" in {event.kind for event in slam.parts.events()}
+    assert slam.moves_followed == len(slam.corrections)
+    error = np.linalg.norm(camera.T[:3, 3])  # the walk ends where it began
+    assert error < 0.06, error
+    pose = slam.pose_of(slam.frames[-1])
+    np.testing.assert_allclose(pose[:3, 3], camera.T[:3, 3], atol=0.01)
