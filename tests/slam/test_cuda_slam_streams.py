@@ -46,7 +46,7 @@ def test_tracking_does_not_wait_for_training(frames: list[Frame], monkeypatch: p
         for frame in frames:
             slam.step(frame)
         calls = calls_by_stream(watch)
-        assert "train" in calls[0] and "render" in calls[0] and len(calls) == 2
+        assert "train" in calls[0] and "project" in calls[0] and len(calls) == 2
         assert "track_wait" not in calls.pop(0) and "track_wait" in calls.popitem()[1]
         slam.finish()
 
