@@ -50,17 +50,6 @@ class GrowingMemory:
             block = self._blocks[name] = torch.empty(size + size // 4, dtype=torch.uint8, device=self._device)
         return block
 
-    def kept_block(self, name: str, size: int) -> torch.Tensor:
-        """As `block`, but its content stays: where it has to grow, it doubles and is copied."""
-        block = self._blocks.get(name)
-        if block is None or block.numel() < size:
-            self.allocations += 1
-            held = 0 if block is None else block.numel()
-            larger = torch.empty(max(size, 2 * held), dtype=torch.uint8, device=self._device)
-            if block is not None:
-                larger[:held].copy_(block)
-            block = self._blocks[name] = larger
-        return block
 
 class ByKind(Generic[_Kind, _Made]):
     """What is made once for images of a size, or for another kind of work, kept for the kinds that were asked for last.

@@ -62,9 +62,18 @@ class Upload:
             self._buffer = _allocate_page_locked(size + size // 4, self._device)
         return self._buffer.numpy()[:size]
 
-    def send(self, out: torch.Tensor) -> None:
-        """Starts the copy of what was filled in to the beginning of it, as long as `out`, uint8 [n]."""
-        out.copy_(self._buffer[: out.numel()], non_blocking=True)
+    def filled_part(self, size: int) -> torch.Tensor:
+        """What was filled in, or its beginning, uint8 [size]; to be sent before the next `begin`."""
+        return self._buffer[:size]
+
+    def send(self, out: torch.Tensor, source: torch.Tensor | None = None) -> None:
+        """Starts the copy of what was filled in to the beginning of it, as long as `out`, uint8 [n].
+
+        Args:
+            out: where to.
+            source: `filled_part` of its size, if that was made before.
+        """
+        out.copy_(self.filled_part(out.numel()) if source is None else source, non_blocking=True)
         self._sent.set()
 
 

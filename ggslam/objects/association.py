@@ -16,9 +16,9 @@ import numpy as np
 
 from ggslam.objects.bounding_planes import BoundingPlane, BoundingPlanes
 from ggslam.objects.consistency import ConsistencyJudge
-from ggslam.objects.evidence import PairEvidence, find_touching_pairs
+from ggslam.objects.evidence import PairEvidence
 from ggslam.objects.fragments import Fragment, FragmentMemory
-from ggslam.objects.overlap import MapView, SegmentOverlap, number_ids, overlap_of
+from ggslam.objects.overlap import MapView, SegmentOverlap, distinct_ids, overlap_of
 from ggslam.objects.settings import IDS, AssociationSettings
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, ObjectId
@@ -127,8 +127,7 @@ class Associator:
             raise ValueError(f"segments, depth and view must have one size, found {sorted(sizes)}")
         if view is None:
             view = MapView(np.zeros_like(segments), np.zeros_like(depth), np.zeros_like(depth))
-        view = MapView(self._current[view.ids], view.confidence, view.depth)
-        overlap = overlap_of(segments, view, depth, self._settings)
+        overlap = overlap_of(segments, view, depth, self._settings, self._current)
         if self._settings.mode == "auto" and len(overlap.objects):
             before = self._judge.consistent
             if self._judge.observe(segments, overlap) != before:
@@ -136,8 +135,8 @@ class Associator:
         if self.uses_own_ids:
             result = self._own_ids(segments, overlap)
         else:
-            result = self._match(view, overlap, *self._choose(overlap, depth, camera, T_world_camera))
-        for i in number_ids(result.ids)[0].tolist():
+            result = self._match(overlap, *self._choose(overlap, depth, camera, T_world_camera))
+        for i in distinct_ids(result.ids).tolist():
             self.sightings[i] = self.sightings.get(i, 0) + 1
         for kept, dropped in result.merges:
             self._join_sightings(kept, dropped)
@@ -195,7 +194,7 @@ class Associator:
         return Association(segments.copy(), [], new)
 
     def _match(
-        self, view: MapView, overlap: SegmentOverlap, best: np.ndarray, parts: dict[int, Fragment],
+        self, overlap: SegmentOverlap, best: np.ndarray, parts: dict[int, Fragment],
         planes: dict[int, BoundingPlane],
     ) -> Association:  # fmt: skip
         covered = self._find_covered(overlap)
@@ -220,8 +219,7 @@ class Associator:
                 covered[k] = False
         image = ids[overlap.row]
         self._keep_known(image, overlap, covered, best, parts, planes)
-        shown = np.where(overlap.column >= 0, view.ids, np.uint16(0))
-        self._evidence.observe(overlap, find_touching_pairs(shown))
+        self._evidence.observe(overlap, overlap.touching)
         merges = self._evidence.merges()
         for kept, dropped in merges:
             self._rename(kept, dropped)

@@ -57,7 +57,7 @@ class PairEvidence:
         self._largest = {}
         self._keyframe = 0
 
-    def observe(self, overlap: SegmentOverlap, neighbours: set[tuple[int, int]]) -> None:
+    def observe(self, overlap: SegmentOverlap, neighbours: Collection[tuple[int, int]]) -> None:
         """Takes a keyframe into account.
 
         Args:
@@ -135,13 +135,3 @@ class PairEvidence:
             into.together += pair.together
             into.apart += pair.apart
             into.keyframes |= pair.keyframes
-
-
-def find_touching_pairs(ids: np.ndarray) -> set[tuple[int, int]]:
-    """Pairs of different ids (smaller first, 0 left out) on neighbouring pixels of a uint16 image."""
-    pairs = []
-    for a, b in ((ids[:, :-1], ids[:, 1:]), (ids[:-1], ids[1:])):
-        edge = (a != b) & (a > 0) & (b > 0)
-        low, high = np.minimum(a[edge], b[edge]).astype(np.int64), np.maximum(a[edge], b[edge])
-        pairs.append(low << 16 | high)
-    return {(int(code >> 16), int(code & 0xFFFF)) for code in np.unique(np.concatenate(pairs))}

@@ -3,11 +3,24 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.objects.settings import AssociationSettings
+from ggslam.abi import core
+from ggslam.abi.arrays import address
+from ggslam.native.loader import load_library
+from ggslam.objects.settings import IDS, AssociationSettings
+from ggslam.system.tuning import Tuning
+
+
+class OverlapTuning(Tuning):
+    """How overlaps are counted."""
+
+    room = 1 << 14
+    """Pairs of segments and objects, and of objects that touch, that there is room for at first."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +49,7 @@ class SegmentOverlap:
         area: int64 [S], all pixels of each segment.
         row, column: int32 [H, W], number of the pixel's segment and of the object that the map shows there with the
             same surface; -1 = none.
+        touching: pairs of ids (smaller first) of objects that the map shows beside each other there.
     """
 
     segments: np.ndarray
@@ -44,6 +58,7 @@ class SegmentOverlap:
     area: np.ndarray
     row: np.ndarray
     column: np.ndarray
+    touching: Collection[tuple[int, int]] = ()
 
     @property
     def within(self) -> np.ndarray:
@@ -56,30 +71,57 @@ class SegmentOverlap:
         return self.shared / np.maximum(self.shared.sum(0), 1)
 
 
-def number_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct ids of a uint16 image but 0, ascending, and the number of each pixel's among them (-1 for 0)."""
-    present = np.bincount(ids.ravel(), minlength=1) > 0
-    present[0] = False
-    found = np.flatnonzero(present)
-    table = np.full(len(present), -1, np.int32)
-    table[found] = np.arange(len(found))
-    return found.astype(np.uint16), table[ids]
+def distinct_ids(ids: np.ndarray) -> np.ndarray:
+    """The distinct ids of a uint16 image but 0, ascending."""
+    ids, there = np.ascontiguousarray(ids, np.uint16), np.empty(IDS, bool)
+    load_library().ggslam_mark_ids(address(ids), ids.size, address(there))
+    there[0] = False
+    return np.flatnonzero(there).astype(np.uint16)
 
 
-def same_surface(view: MapView, depth: np.ndarray, settings: AssociationSettings) -> np.ndarray:
-    """bool [H, W]: where the map shows the measured surface; where nothing was measured, the map is believed."""
-    tolerance = np.maximum(settings.depth_tolerance_m, settings.depth_tolerance_relative * depth)
-    return (view.depth > 0) & ((depth <= 0) | (np.abs(view.depth - depth) < tolerance))
+def overlap_of(
+    segments: np.ndarray, view: MapView, depth: np.ndarray, settings: AssociationSettings, renamed: np.ndarray
+) -> SegmentOverlap:
+    """Counts the pixels that segments and the objects of a view share. Where nothing was measured, the map is believed.
+
+    Args:
+        segments: uint16 [H, W].
+        view: what the map shows.
+        depth: float32 [H, W], metres, 0 = unknown.
+        settings: when map and measurement agree.
+        renamed: uint16 [65536], what the objects of the view are called.
+    """
+    images = [
+        np.ascontiguousarray(image, kind)
+        for image, kind in (
+            (segments, np.uint16), (view.ids, np.uint16), (renamed, np.uint16), (view.confidence, np.float32),
+            (view.depth, np.float32), (depth, np.float32),
+        )
+    ]  # fmt: skip
+    row, column = np.empty(segments.shape, np.int32), np.empty(segments.shape, np.int32)
+    segment_ids, object_ids, areas = np.empty(IDS, np.uint16), np.empty(IDS, np.uint16), np.empty(IDS, np.int64)
+    job = core.OverlapJob(
+        *map(address, images), *segments.shape, settings.depth_tolerance_m, settings.depth_tolerance_relative,
+        settings.min_confidence, row=address(row), column=address(column), segment_ids=address(segment_ids),
+        object_ids=address(object_ids), areas=address(areas),
+    )  # fmt: skip
+    shared, touching = _count(job)
+    found, known = job.segment_count, job.object_count
+    pairs = [(low, high) for low, high in touching.tolist()]
+    return SegmentOverlap(
+        segment_ids[:found].copy(), object_ids[:known].copy(), shared, areas[:found].copy(), row, column, pairs
+    )
 
 
-def overlap_of(segments: np.ndarray, view: MapView, depth: np.ndarray, settings: AssociationSettings) -> SegmentOverlap:
-    """Counts the pixels that `segments` (uint16 [H, W]) and the objects of `view` share."""
-    known = same_surface(view, depth, settings) & (view.confidence >= settings.min_confidence)
-    segment_ids, row = number_ids(segments)
-    object_ids, column = number_ids(np.where(known, view.ids, np.uint16(0)))
-    both = (row >= 0) & (column >= 0)
-    shape = len(segment_ids), len(object_ids)
-    pairs = row[both].astype(np.int64) * shape[1] + column[both]
-    shared = np.bincount(pairs, minlength=shape[0] * shape[1]).reshape(shape)
-    area = np.bincount(row[row >= 0], minlength=shape[0])
-    return SegmentOverlap(segment_ids, object_ids, shared, area, row, column)
+def _count(job: core.OverlapJob) -> tuple[np.ndarray, np.ndarray]:
+    """Does the job: shared pixels int64 [S, O], and pairs of touching objects int [n, 2]."""
+    job.shared_room = job.touching_room = OverlapTuning.room
+    while True:
+        shared, touching = np.empty(job.shared_room, np.int64), np.empty((job.touching_room, 2), np.uint16)
+        job.shared, job.touching = address(shared), address(touching)
+        load_library().ggslam_segment_overlap(ctypes.byref(job))
+        size = job.segment_count * job.object_count
+        if size <= job.shared_room and job.touching_count <= job.touching_room:
+            pixels = shared[:size].reshape(job.segment_count, job.object_count)
+            return pixels, touching[: job.touching_count]
+        job.shared_room, job.touching_room = max(size, job.shared_room), max(job.touching_count, job.touching_room)

@@ -13,7 +13,7 @@ import torch
 from device_watch import DeviceWatch
 
 from ggslam.abi.core import Voxel, VoxelMoments
-from ggslam.abi.cuda import TrackJob
+from ggslam.abi.cuda import TrackJob, VoxelSlot
 from ggslam.cuda.library import CudaLibrary
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
@@ -58,9 +58,11 @@ class Copy:
 
     def contents(self, level: int) -> Contents:
         """By key: which voxels a block has, and these, and their moments if it is made of those."""
-        slots = self.rows(self.target._tables[level]._slots, 32).view(np.uint64)
-        voxels = self.rows(self.target._memory.block(f"voxels {level}", 0), sizeof(Voxel))
-        moments = self.rows(self.target._memory.block(f"moments {level}", 0), sizeof(VoxelMoments))
+        block = self.target._memory._block
+        of_level = block.pieces(block.sizes)[1 + level :: 2]
+        widths = sizeof(VoxelSlot), sizeof(Voxel), sizeof(VoxelMoments)
+        slots, voxels, moments = (self.rows(*part) for part in zip(of_level, widths, strict=True))
+        slots = slots.view(np.uint64)
         found: Contents = {}
         for key, occupied, first, _ in slots[slots[:, 0] != FREE].tolist():
             assert key not in found
@@ -178,19 +180,23 @@ def test_a_keyframe_goes_up_in_one_copy_from_memory_that_is_there(frames: list[F
         surface = MeasuredSurface(TrackerSettings().target, NativeContext(1))
         surface.finish, surface.prepare = False, engine.expect_target
         settings, noise, align = PointSettings(count=1200), DepthNoise(), AlignSettings(coarse_points=400)
-        sent = []
+        sent, blocks = [], set[int]()
         for turn in range(3):
             for frame in frames:
                 points, T = engine.points(frame.depth, settings, noise), frame.T_world_camera
                 assert T is not None
                 if surface.target is not None:
                     watch.forget()
+                    reserved = engine._target._memory._reserved
                     engine.align(points, surface.target, T, align, noise)
+                    assert engine._target._memory._block is reserved  # allocated when the keyframe came
+                    blocks.add(reserved.address)
                     assert len(watch.uploads) == 1 and not watch.uploads[0].blocking
                     sent.append(watch.uploads[0].bytes)
                 surface.add(points, T)
             if turn == 0:
-                room = engine._target._upload._buffer.data_ptr(), engine._target._tables[0].count
-        assert room == (engine._target._upload._buffer.data_ptr(), engine._target._tables[0].count)
+                room = engine._target._upload._buffer.data_ptr(), engine._target._memory.address
+        assert room == (engine._target._upload._buffer.data_ptr(), engine._target._memory.address)
+        assert 1 < len(blocks) < len(frames)
         # The third time around nothing is new: what is sent goes with a keyframe.
         assert max(sent[-10:]) < 1.1 * max(sent[10:20])

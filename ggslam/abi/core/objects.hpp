@@ -173,6 +173,52 @@ struct ContactsJob {
   int64_t* counts;
 };
 
+// A mask [H, W] without its dots and slivers: pieces of equal id that are small or nowhere three pixels wide, 0 an id like
+// others, are filled with the nearest id, first the small ones.
+struct CleaningJob {
+  const uint16_t* segments;
+  int32_t height, width;
+  double smallest;    // pixels of a piece that is not small
+  uint16_t* cleaned;  // [H, W], result
+};
+
+// Where a mask [H, W] has bled over a jump of depth: near its segment's border a pixel is not trusted that continues the
+// inside of another segment, and not that of its own.
+struct TrustJob {
+  const uint16_t* segments;  // 0 = unlabelled
+  const float* depth;        // metres, 0 = unknown
+  int32_t height, width;
+  int32_t reach;               // pixels from a border that are judged
+  float jump_m, jump_relative;  // depths differ from jump_m or jump_relative * depth on, whichever is larger
+  uint8_t* trusted;            // [H, W], result: 0 or 1
+};
+
+// What the segments of a keyframe share with the objects that a map shows there. They are numbered in the order of their
+// ids, without 0.
+struct OverlapJob {
+  const uint16_t* segments;  // [H, W]
+  const uint16_t* ids;       // [H, W], objects that the map shows, 0 = none
+  const uint16_t* renamed;   // [65536], what each is called
+  const float* confidence;   // [H, W], of that
+  const float* shown_depth;  // [H, W], of the map, metres, 0 = nothing
+  const float* depth;        // [H, W], measured, 0 = unknown: there the map is believed
+  int32_t height, width;
+  float tolerance_m, tolerance_relative;  // between both depths, the larger counts
+  float min_confidence;
+  int64_t shared_room, touching_room;  // elements of `shared` and rows of `touching` that there is room for
+  // Results: number of each pixel's segment, and of the object with the same surface, [H, W], -1 = none; the ids
+  // [65536], and how many there are; pixels of each segment [65536] and of each pair [segment_count, object_count].
+  int32_t* row;
+  int32_t* column;
+  uint16_t* segment_ids;
+  uint16_t* object_ids;
+  int32_t segment_count, object_count;
+  int64_t* areas;
+  int64_t* shared;
+  uint16_t* touching;  // [touching_count, 2], ids of objects beside each other, smaller first, pairs ascending
+  int64_t touching_count;
+};
+
 }  // namespace ggslam
 
 // Each works in the calling thread.
@@ -188,3 +234,7 @@ GGSLAM_EXPORT int ggslam_region_bodies(const ggslam::BodiesJob* job);
 GGSLAM_EXPORT int ggslam_surface_normals(const ggslam::NormalsJob* job);
 GGSLAM_EXPORT int ggslam_alike_colors(const ggslam::AlikeColorsJob* job);
 GGSLAM_EXPORT int ggslam_outlier_colors(const ggslam::OutlierColorsJob* job);
+GGSLAM_EXPORT int ggslam_clean_segments(const ggslam::CleaningJob* job);
+GGSLAM_EXPORT int ggslam_trust_borders(const ggslam::TrustJob* job);
+GGSLAM_EXPORT int ggslam_segment_overlap(ggslam::OverlapJob* job);  // what there is no room for is counted, not written
+GGSLAM_EXPORT int ggslam_mark_ids(const uint16_t* ids, int64_t count, uint8_t* there);  // there [65536]: 1 of each id

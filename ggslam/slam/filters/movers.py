@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.geometry.moved_depth import shift_between
-from ggslam.mapping.keyframe import FROM_EARLIER_RUN
+from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor, grow
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
@@ -19,7 +19,7 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sight.margin import Margin
-from ggslam.sight.places import CoarseView
+from ggslam.sight.places import CoarseView, DepthPlaces
 from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
@@ -46,7 +46,7 @@ DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
 
 
-@savable(not_saved="_reads_masks _noise _margin context")
+@savable(not_saved="_reads_masks _noise _margin _places context")
 class MoverFilter(FrameFilter):
     """Detects movers in each located frame, if the settings ask for it.
 
@@ -69,6 +69,7 @@ class MoverFilter(FrameFilter):
         """The movers one by one."""
         self._noise: DepthNoise | None = None
         self._margin = _margin(settings, DepthNoise())
+        self._places: dict[int, tuple[np.ndarray, DepthPlaces]] = {}  # of keyframes, and of which depth image
         self._before = None
         """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
 
@@ -150,8 +151,7 @@ class MoverFilter(FrameFilter):
             keyframes[-1],
             [k for k in keyframes[-1 - MoverFilterTuning.max_keyframes : -1] if k.frame_index != FROM_EARLIER_RUN],
         )
-        views = [(k.depth_m(), k.T_world_camera, k.mask) for k in earlier]
-        gone = self.gone_since(views, newest, latest.T_world_camera)
+        gone = self.gone_since(earlier, newest, latest.T_world_camera)
         parts = [(k, part) for k, part in zip(earlier, gone, strict=True) if part is not None]
         if parts:
             removal.drop_moved(parts)
@@ -162,13 +162,12 @@ class MoverFilter(FrameFilter):
         return self.active and len(self.detector.trail.keys) > 0
 
     def gone_since(
-        self, earlier: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray | None]], newest: Frame,
-        T_world_newest: np.ndarray,
-    ) -> list[np.ndarray | None]:  # fmt: skip
+        self, earlier: Sequence[Keyframe], newest: Frame, T_world_newest: np.ndarray
+    ) -> list[np.ndarray | None]:
         """What earlier views show where something has moved since, and the newest frame looks through.
 
         Args:
-            earlier: depth float32 [H, W], metres, T_world_camera [4, 4] and segments uint16 [H, W] of each.
+            earlier: keyframes.
             newest: without what moves in it.
             T_world_newest: [4, 4].
 
@@ -179,13 +178,20 @@ class MoverFilter(FrameFilter):
         factor = coarse_factor(camera, settings)
         view = CoarseView.of(newest.depth, camera, factor, T_world_newest, self._margin, self.context)
         found: list[np.ndarray | None] = []
-        for depth, T_world_camera, segments in earlier:
-            if depth.shape != newest.depth.shape:
+        places: dict[int, tuple[np.ndarray, DepthPlaces]] = {}
+        for k in earlier:
+            shape = k.depth.shape
+            if shape != newest.depth.shape:
                 found.append(None)
                 continue
-            old = CoarseView.of(depth, camera, factor, T_world_camera, self._margin, self.context)
-            part = gone_since(old, view, trail, segments, depth.shape, factor, self._margin, settings, self.context)
+            of, known = self._places.get(k.index, (None, None))
+            if of is not k.depth or known is None or known.camera != view.camera:
+                known = DepthPlaces.of(k.depth_m(), camera, factor, self.context)
+            places[k.index] = k.depth, known
+            old = known.view(k.T_world_camera, self._margin)
+            part = gone_since(old, view, trail, k.mask, shape, factor, self._margin, settings, self.context)
             found.append(None if part is None else grow(part, DetectorTuning.mask_margin))
+        self._places = places
         return found
 
     def notes(self, frames: int) -> list[str]:

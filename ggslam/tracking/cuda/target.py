@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 import threading
 import weakref
-from ctypes import sizeof
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,20 +17,18 @@ import numpy as np
 import torch
 
 from ggslam.abi.arrays import address
-from ggslam.abi.core import LevelChanges, TargetChanges, TargetCopy, Voxel, VoxelMoments
-from ggslam.abi.cuda import TrackJob, VoxelLevel, VoxelLevelJob, VoxelSlot
-from ggslam.cuda.memory import GrowingMemory
+from ggslam.abi.core import LevelChanges, TargetChanges, TargetCopy
+from ggslam.abi.cuda import TrackJob, VoxelLevelJob
 from ggslam.cuda.transfers import Upload
 from ggslam.native.loader import load_library
 from ggslam.system.tuning import Tuning
+from ggslam.tracking.cuda.target_memory import TargetMemory
 from ggslam.tracking.gicp import GicpTarget
 
 
 class CudaTargetTuning(Tuning):
     """Targets on the device."""
 
-    min_slots_per_block = 4
-    """Fewest slots of the hash table per block, so that most look-ups end at the first slot."""
     staging_bytes = 1 << 20
     """Page-locked memory that blocks are sent from, until more are sent at once. A keyframe of 640x480 changes 0.3 to
     0.9 MB."""
@@ -46,45 +43,16 @@ class _Staged:
         settings: what its voxels' shapes are to be made with; None: they are there.
         before: the copy on the device that this is added to.
         changes: what there is, and where.
-        size: bytes of it.
+        source: that, page-locked uint8 [n].
+        out: where it goes, uint8 [n].
     """
 
     target: weakref.ref[GicpTarget]
     settings: Any
     before: tuple[int, int, int]
     changes: TargetChanges
-    size: int
-
-
-class _Table:
-    """The hash table of a level on the device, with a power of two for the number of its slots.
-
-    Args:
-        device: where.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._slots = self._before = torch.empty(0, dtype=torch.uint8, device=device)
-
-    @property
-    def count(self) -> int:
-        """Number of slots."""
-        return self._slots.numel() // sizeof(VoxelSlot)
-
-    def make_room(self, blocks: int, job: VoxelLevelJob) -> None:
-        """Has the job use this table, with room for so many blocks. A larger one takes over those of the one before,
-        unless the job empties it."""
-        count = old = self.count
-        while count < max(64, CudaTargetTuning.min_slots_per_block * blocks):
-            count = max(64, 2 * count)
-        job.old_slots = None
-        if count > old:
-            self._before = self._slots  # stays until the kernels that read it have been started
-            self._slots = torch.empty(sizeof(VoxelSlot) * count, dtype=torch.uint8, device=self._device)
-            if old and not job.empties:
-                job.old_slots, job.old_mask = self._before.data_ptr(), old - 1
-        job.level.slots, job.level.slot_mask = self._slots.data_ptr(), count - 1
+    source: torch.Tensor
+    out: torch.Tensor
 
 
 class CudaTarget:
@@ -98,8 +66,7 @@ class CudaTarget:
     def __init__(self, device: torch.device) -> None:
         self._device = device
         self._core = load_library()
-        self._memory = GrowingMemory(device)
-        self._tables = _Table(device), _Table(device)
+        self._memory = TargetMemory(device)
         self._upload, self._room = Upload(device), 0
         self._target: weakref.ref[GicpTarget] | None = None
         self._copy = TargetCopy()  # what is on the device
@@ -133,6 +100,7 @@ class CudaTarget:
         if self._sent is not None:
             self._target, self._copy = self._sent
             self._sent = None
+            self._memory.note_used()
 
     def _stage(self, target: GicpTarget) -> _Staged:
         """Blocks that changed and their voxels on the host; of voxels without shapes the moments, for the device to
@@ -152,36 +120,28 @@ class CudaTarget:
             if size <= self._room:
                 break
             self._room = max(size, 2 * self._room)
-        self._staged = _Staged(weakref.ref(target), settings, before, changes, size)
+        out, source = self._memory.reserve(changes, size, settings is not None), self._upload.filled_part(size)
+        self._staged = _Staged(weakref.ref(target), settings, before, changes, source, out)
         return self._staged
 
     def _send(self, staged: _Staged, voxel: float, job: TrackJob) -> None:
         """Starts to send what was staged, and sets the jobs that make the levels of it."""
-        sent = self._memory.block("target", staged.size)
-        self._upload.send(sent[: staged.size])
-        for level, (changes, made) in enumerate(
-            ((staged.changes.fine, job.fine), (staged.changes.coarse, job.coarse))
+        self._memory.use(not staged.changes.whole, job.fine, job.coarse)
+        self._upload.send(staged.out, staged.source)
+        for changes, made, size in (
+            (staged.changes.fine, job.fine, np.float32(voxel)),
+            (staged.changes.coarse, job.coarse, np.float32(4) * np.float32(voxel)),
         ):
             made.empties, made.device = staged.changes.whole, self._device.index or 0
-            self._set_values(level, made, changes, sent.data_ptr(), staged.settings)
-            self._tables[level].make_room(changes.all_blocks, made)
-            size = np.float32(voxel) * np.float32(4 if level else 1)
-            made.level = VoxelLevel(
-                made.voxels, made.level.slots, made.level.slot_mask, size, np.float32(1) / size
-            )  # fmt: skip
+            _set_values(made, changes, self._memory.address, staged.settings)
+            made.level.voxels, made.level.size, made.level.inverse_size = made.voxels, size, np.float32(1) / size
 
-    def _set_values(self, level: int, job: VoxelLevelJob, changes: LevelChanges, first: int, settings: Any) -> None:
-        """Where the kernels find what was sent, from address `first` on, and where it belongs."""
-        job.blocks, job.indices = first + changes.blocks_at, first + changes.indices_at
-        job.block_count, job.voxel_count = changes.block_count, changes.voxel_count
-        job.voxels = self._reserve(f"voxels {level}", Voxel, changes.places)
-        job.moments = job.new_moments = job.new_voxels = None
-        if settings is None:
-            job.new_voxels = first + changes.values_at
-        else:
-            job.moments = self._reserve(f"moments {level}", VoxelMoments, changes.places)
-            job.new_moments, job.settings = first + changes.values_at, settings
 
-    def _reserve(self, name: str, value: type[ctypes.Structure], count: int) -> int:
-        """Address of memory for so many values that keeps what is there."""
-        return self._memory.kept_block(name, sizeof(value) * max(1, count)).data_ptr()
+def _set_values(job: VoxelLevelJob, changes: LevelChanges, first: int, settings: Any) -> None:
+    """Where the kernels find what was sent, from address `first` on."""
+    job.blocks, job.indices = first + changes.blocks_at, first + changes.indices_at
+    job.block_count, job.voxel_count = changes.block_count, changes.voxel_count
+    values = first + changes.values_at
+    job.new_voxels, job.new_moments = (values, None) if settings is None else (None, values)
+    if settings is not None:
+        job.settings = settings
