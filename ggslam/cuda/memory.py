@@ -94,7 +94,8 @@ class Slots:
 
     def take(self) -> torch.Tensor:
         """One of them; its content is undefined."""
-        self.make_room()
+        if not self._spare:
+            self.make_room()
         return self._spare.pop()
 
     def give_back(self, slot: torch.Tensor) -> None:

@@ -112,7 +112,9 @@ class MaskOnGrid:
 
 def ids_of(mask: np.ndarray) -> np.ndarray:
     """Ids that are in a mask of uint16, each once, in order."""
-    return np.flatnonzero(np.bincount(mask.reshape(-1), minlength=1)).astype(np.uint16)
+    flat = mask.reshape(-1)
+    begun = flat[1:][flat[1:] != flat[:-1]]  # the first pixel of each run of one id, which are few
+    return np.flatnonzero(np.bincount(np.append(flat[:1], begun), minlength=1)).astype(np.uint16)
 
 
 @dataclass
@@ -168,6 +170,13 @@ class IdentityLearner(ABC):
         """Whether this mapping iteration shall have an identity step. To be asked once an iteration."""
         self._iterations += 1
         return self._iterations % self.settings.every == 0 and keyframe.mask is not None and self.table.count > 0
+
+    def due_turns(self, iterations: int) -> range:
+        """As `due` of so many iterations to come: the numbers, from 0, of those that shall have an identity step if
+        their keyframes have masks."""
+        every, done = self.settings.every, self._iterations
+        self._iterations += iterations
+        return range(every - 1 - done % every, iterations, every) if self.table.count > 0 else range(0)
 
     # --- a map that is partly on disk ---------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ggslam.errors import FormatError
 from ggslam.formats.array_archive import ArrayArchive
+from ggslam.rendering.exposure import identity_exposure
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
@@ -63,7 +64,7 @@ class Keyframe:
     depth: Annotated[np.ndarray, Form("u2", "h", "w")]
     T_camera_world: Pose
     mask: IdImage | None = field(default_factory=lambda: None)
-    exposure: Exposure = field(default_factory=lambda: np.tile([1.0, 0.0], (3, 1)))
+    exposure: Exposure = field(default_factory=identity_exposure)
     iterations: int = 0
     archive: ArrayArchive | None = None
     """Has the images once they were put away; they are read from there."""
@@ -125,6 +126,9 @@ def make_keyframe(index: int, frame: Frame, T_world_camera: np.ndarray) -> Keyfr
 def _units_of(depth: np.ndarray, unit: float) -> np.ndarray:
     """Depth, float [H, W] in metres, rounded to units of so many metres, uint16; 0 where it is beyond their range."""
     scaled = depth * np.float32(1 / unit)
+    if _is_within(scaled, _MOST_UNITS) and scaled.min(initial=0) >= 0:
+        scaled += 0.5
+        return scaled.astype(np.uint16)
     beyond = scaled > _MOST_UNITS
     scaled += 0.5
     units = np.clip(scaled, 0, _MOST_UNITS, out=scaled).astype(np.uint16)
@@ -132,10 +136,18 @@ def _units_of(depth: np.ndarray, unit: float) -> np.ndarray:
     return units
 
 
+def _is_within(depth: np.ndarray, limit: float) -> bool:
+    """Whether no depth is known to be beyond a limit: one pass, for nearly all images."""
+    return bool(depth.max(initial=0) <= limit)
+
+
 def depth_unit_for(depth: np.ndarray) -> float:
     """Unit for depth, float [H, W], in metres: `DEPTH_UNIT`, doubled until at most `DepthRangeTuning.far_share` of the
     pixels with depth are beyond its range."""
-    known, unit = np.count_nonzero(depth > 0), DEPTH_UNIT
+    unit = DEPTH_UNIT
+    if _is_within(depth, _MOST_UNITS * unit):
+        return unit
+    known = np.count_nonzero(depth > 0)
     while known and np.count_nonzero(depth > _MOST_UNITS * unit) / known > DepthRangeTuning.far_share:
         unit *= 2
     return unit

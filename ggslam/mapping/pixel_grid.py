@@ -10,6 +10,7 @@ teach more in the same time; see `MapperSettings.sparse_noise`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -42,7 +43,7 @@ class PixelGrid:
     row: int = 0
     column: int = 0
 
-    @property
+    @cached_property
     def is_whole(self) -> bool:
         """Whether it has all pixels."""
         return self.stride == 1

@@ -65,7 +65,10 @@ class KeyframeSampler:
 
     def choose_many(self, numbers: Sequence[int], times: int) -> list[int]:
         """As `choose`, so many times."""
-        return [self.choose(numbers) for _ in range(times)]
+        first, count, offset = self._draws + 1, len(numbers), self._offset
+        self._draws += times
+        draws = range(first, first + times)
+        return [numbers[int((offset + draw * GOLDEN_RATIO) % 1.0 * count)] for draw in draws]
 
     def arrive(self, keyframes: Sequence[Keyframe]) -> None:
         """The last of the keyframes is new."""
@@ -74,8 +77,15 @@ class KeyframeSampler:
         """No more will arrive."""
 
 
+class _OneByOne(KeyframeSampler):
+    """Draws each keyframe by a rule of its own."""
+
+    def choose_many(self, numbers: Sequence[int], times: int) -> list[int]:
+        return [self.choose(numbers) for _ in range(times)]
+
+
 @savable()
-class RandomSampler(KeyframeSampler):
+class RandomSampler(_OneByOne):
     """Independent uniform draws.
 
     Args:
@@ -91,7 +101,7 @@ class RandomSampler(KeyframeSampler):
 
 
 @savable()
-class NewestSampler(KeyframeSampler):
+class NewestSampler(_OneByOne):
     """From the newest keyframe back to the first, again and again; when one arrives, from that one on. Between two
     arrivals as many of the newest are trained as there are steps: a window that slides along the recording."""
 

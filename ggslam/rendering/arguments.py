@@ -7,7 +7,6 @@ import numpy as np
 import torch
 
 from ggslam.abi import core as structures
-from ggslam.abi.arrays import address
 from ggslam.errors import RenderError
 from ggslam.rendering.types import (
     PARAMETERS,
@@ -70,14 +69,16 @@ def gaussian_arrays(
     parameters: GaussianTensors, features: bool, active_sh_degree: int | None
 ) -> structures.GaussianArrays:
     """Where the parameters lie and what of them is rendered; the tensors must stay alive."""
+    p = parameters
     return structures.GaussianArrays(
-        count=parameters.means.shape[0],
-        **{name: address(getattr(parameters, name)) for name in PARAMETERS},
+        count=p.means.shape[0], means=p.means.data_ptr(), quaternions=p.quaternions.data_ptr(),
+        log_scales=p.log_scales.data_ptr(), opacity_logits=p.opacity_logits.data_ptr(), sh=p.sh.data_ptr(),
+        features=p.features.data_ptr(),
         sh_coefficients=parameters.sh.shape[1],
         active_sh_coefficients=active_coefficients(parameters, active_sh_degree),
         feature_channels=parameters.features.shape[1],
         render_features=int(features and parameters.features.shape[1] > 0),
-    )
+    )  # fmt: skip
 
 
 def posed_view(
@@ -127,5 +128,5 @@ def image_gradients(
     for name, gradient in given.items():
         if gradient is not None:
             check_tensor(f"grad_{name}", gradient, device, getattr(buffers, name).shape)
-    addresses = {name: address(gradient) for name, gradient in given.items()}
+    addresses = {name: None if gradient is None else gradient.data_ptr() for name, gradient in given.items()}
     return structures.ImageGradients(**addresses, detach_features=int(detach_features))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -139,13 +140,21 @@ def exposure_of(gains: Sequence[float]) -> np.ndarray | None:
 
 def is_lit(color: np.ndarray) -> bool:
     """Whether an image uint8 [H, W, 3] shows colours: it is neither nearly black nor saturated nearly everywhere."""
-    red, green, blue = (color[_SOME][..., k] for k in range(3))
-    sums = red.astype(np.uint16)
-    sums += green
-    sums += blue
-    grey = np.arange(3 * 255 + 1, dtype=np.float32) / np.float32(3) / 255  # of each sum: quicker than of each pixel
-    lit = (grey > ExposureTuning.dark) & (grey < ExposureTuning.bright)
-    return bool(lit[sums].mean() >= ExposureTuning.min_lit_share)
+    some = color[_SOME]
+    sums = some[..., 0].astype(np.uint16)
+    sums += some[..., 1]
+    sums += some[..., 2]
+    first, last = _lit_sums(ExposureTuning.dark, ExposureTuning.bright)
+    lit = np.count_nonzero((sums >= first) & (sums <= last))
+    return bool(lit / sums.size >= ExposureTuning.min_lit_share)
+
+
+@lru_cache(maxsize=4)
+def _lit_sums(dark: float, bright: float) -> tuple[np.uint16, np.uint16]:
+    """Least and largest sum of a pixel's three channels whose mean, in [0, 1], lies between these two."""
+    grey = np.arange(3 * 255 + 1, dtype=np.float32) / np.float32(3) / 255
+    lit = np.flatnonzero((grey > dark) & (grey < bright)).astype(np.uint16)
+    return lit[0], lit[-1]
 
 
 def shows_otherwise(color: np.ndarray, seen: SeenAgain) -> bool:

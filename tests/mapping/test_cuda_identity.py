@@ -4,6 +4,7 @@ not what was rendered."""
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 from dataclasses import dataclass, field
 
@@ -247,7 +248,7 @@ def test_new_gaussians_have_the_objects_of_their_pixels(cuda_library: CudaLibrar
     pixels = torch.tensor(where, dtype=torch.int32, device=both.device)
     new, gaussians = NewRows(slice(2, 6), pixels.data_ptr()), both.device_map
     for keyframe, ids in ((both.keyframe, [2, 2, 1, 0]), (MaskedKeyframe(1, None, both.device), [0] * 4)):
-        both.cuda.begin_at(gaussians, keyframe, new)
+        cuda_library.call("birth_labels", ctypes.byref(both.cuda.births(gaussians, keyframe, new)))
         assert gaussians.vote_ids[2:6, 0].tolist() == ids
         assert gaussians.vote_weights[2:6, 0].tolist() == [np.float32(IdentityTuning.birth_vote) * (k > 0) for k in ids]
         codes = both.cuda.table.codes(torch.tensor(ids, device=both.device))

@@ -144,6 +144,20 @@ def test_unlabelled_pixels_teach_nothing() -> None:
 # --- merging, splitting, taking back ----------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("every", [1, 3, 7])
+def test_turns_that_are_due_are_those_asked_for_one_by_one(every: int) -> None:
+    mapper, single = make_mapper(every=every), make_mapper(every=every)
+    for one in (mapper, single):
+        one.add_keyframe(wall(), np.eye(4), lambda keyframe, show: KeyframeLabels(pictures()))
+    assert mapper.identity is not None and single.identity is not None
+    for iterations in (4, 1, 0, 9):
+        due = [turn for turn in range(iterations) if single.identity.due(single.keyframes[0])]
+        assert list(mapper.identity.due_turns(iterations)) == due
+    assert not mapper.identity.due_turns(0)
+    without = CpuIdentityLearner(IdentitySettings(every=1))
+    assert not without.due_turns(5)
+
+
 def test_merged_objects_are_one_everywhere() -> None:
     mapper = trained(pictures())
     identity = mapper.identity

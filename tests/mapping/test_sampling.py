@@ -44,6 +44,15 @@ def test_no_keyframe(order: SamplingOrder) -> None:
         make_sampler(order, 0).draw(0)
 
 
+@pytest.mark.parametrize("order", ["spread", "random", "newest", "covisible"])
+def test_draws_at_once_are_those_one_after_the_other(order: SamplingOrder) -> None:
+    together, single = make_sampler(order, 3), make_sampler(order, 3)
+    for count, times in ((1, 2), (7, 4), (40, 5), (40, 0), (41, 9)):
+        numbers = range(2, 2 + 3 * count, 3)
+        assert together.choose_many(numbers, times) == [single.choose(numbers) for _ in range(times)]
+    assert together.choose(range(9)) == single.choose(range(9))
+
+
 def test_the_default_order_is_that_of_its_formula() -> None:
     sampler, offset = make_sampler("spread", 5), np.random.default_rng(5).random()
     expected = [3 + 2 * int((offset + t * 0.6180339887498949) % 1 * 9) for t in range(1, 50)]

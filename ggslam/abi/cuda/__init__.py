@@ -10,8 +10,8 @@ from ggslam.abi.core import DECLARED as CORE
 from ggslam.abi.headers import Declarations
 
 HEADERS = (
-    "common", "growth", "mapping", "rendering", "sampled_identity", "sight", "tracked_features", "tracking", "training",
-    "volumes",
+    "common", "growth", "mapping", "rendering", "sampled_identity", "seen_map", "sight", "tracked_features", "tracking",
+    "training", "volumes",
 )  # fmt: skip
 DECLARED = Declarations(Path(__file__).parent, HEADERS, CORE.structures)
 globals().update(DECLARED.names)

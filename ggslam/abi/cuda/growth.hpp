@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The CUDA kernels of what happens to the map at keyframes besides insertion: what a keyframe sees of it, first values of
-// new rows, first labels, new classes, rows that go. Pointers lead to device memory. Calls only start work on the caller's
+// The CUDA kernels of what happens to the map at keyframes besides insertion: first values of new rows, first labels, new
+// classes, rows that go. Pointers lead to device memory. Calls only start work on the caller's
 // stream; those with a status return 0 or a cudaError_t.
 #pragma once
 #include <cstddef>
@@ -34,30 +34,6 @@ struct VoteLabelJob {
   void* stream;
   std::int64_t count;
   std::int32_t device, slots;
-};
-
-// How bright a keyframe is against the map, by the median of what pixels tell; of each channel R, G, B.
-struct BrightnessRatios {
-  std::int32_t used[3];  // pixels
-  float medians[3];      // keyframe / map; 0 without any
-};
-
-// What a new keyframe sees of the map.
-struct KeyframeLookJob {
-  const float *image, *depth, *alpha;  // rendered: [3, H, W], accumulated [H, W] in metres, [H, W]
-  const std::uint8_t* valid;           // [H, W], 0 where the keyframe shows nothing: nothing is missing there; may be null
-  const std::int32_t* overflowed;      // [1], of the rendering
-  const std::uint8_t* measured_color;  // the keyframe's, [H, W, 3]
-  const std::uint16_t* measured_depth;  // likewise, [H, W], 0 = none
-  float *explained_alpha, *explained_depth;  // [H, W]; depth in metres, 0 where nothing is shown
-  float* pixel_ratios;                 // [3, h, w], of pixels at every ratio_stride-th row and column, to work in
-  BrightnessRatios* ratios;            // [1]; may be null
-  float* shares;                       // at every label_stride-th row and column, become 0 where alpha is low; may be null
-  std::int32_t* was_short;             // [1], becomes what `overflowed` is
-  void* stream;
-  std::int32_t device, height, width, ratio_stride, label_stride;
-  float units_per_metre;               // of measured_depth
-  float least_alpha, largest_depth_error, dark, bright;  // of pixels that tell of brightness, see ExposureTuning
 };
 
 // First votes and identity vectors of new Gaussians.
@@ -124,9 +100,6 @@ GGSLAM_EXPORT int ggslam_cuda_fill_words(const ggslam::cuda::FillJob* job);
 
 // Fills `labels`.
 GGSLAM_EXPORT int ggslam_cuda_vote_labels(const ggslam::cuda::VoteLabelJob* job);
-
-// Fills what a keyframe sees.
-GGSLAM_EXPORT int ggslam_cuda_keyframe_look(const ggslam::cuda::KeyframeLookJob* job);
 
 // Fills votes and vectors.
 GGSLAM_EXPORT int ggslam_cuda_birth_labels(const ggslam::cuda::BirthLabelJob* job);

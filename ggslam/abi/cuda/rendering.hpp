@@ -90,6 +90,9 @@ GGSLAM_EXPORT std::int64_t ggslam_cuda_recent_pairs(const void* counter);
 // Lists pairs by tile and composites. May be called again for the same projection, with more room for pairs.
 GGSLAM_EXPORT int ggslam_cuda_composite(const ggslam::cuda::Rendering* r);
 
+// Both, for which the host need not know the number of pairs between them.
+GGSLAM_EXPORT int ggslam_cuda_render(const ggslam::cuda::Rendering* r, void* counter);
+
 // Differentiates a rendering, whose arrays and memory must still be there and unchanged. adam: null, or a step to make
 // instead of writing gradients; it changes the arrays. row_memory: gradient_rows bytes.
 GGSLAM_EXPORT int ggslam_cuda_backward(const ggslam::cuda::Rendering* r, const ggslam::ImageGradients* image_gradients,

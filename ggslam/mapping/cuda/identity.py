@@ -183,17 +183,27 @@ class CudaIdentityLearner(IdentityLearner):
 
     def begin(self, gaussians: GaussianMap, rows: slice, labels: torch.Tensor) -> None:
         labels = labels.to(torch.int32).contiguous()
-        self._begin(gaussians, rows, BirthLabelJob(labels=labels.data_ptr()))
+        if rows.stop > rows.start:
+            job = self._fill_births(gaussians, rows, BirthLabelJob(labels=labels.data_ptr()))
+            self.library.call("birth_labels", ctypes.byref(job))
+            self.finish_births(gaussians, rows)
 
-    def begin_at(self, gaussians: GaussianMap, keyframe: CudaMaskedKeyframe, new: NewRows) -> None:
-        """As `begin`, of Gaussians that a keyframe brought."""
-        self._begin(gaussians, new.rows, BirthLabelJob(pixels=new.pixels, mask=address(keyframe.device_mask)))
+    def births(self, gaussians: GaussianMap, keyframe: CudaMaskedKeyframe, new: NewRows) -> BirthLabelJob:
+        """As `begin`, of Gaussians that a keyframe brings, of which there are some: what the library starts;
+        `finish_births` has to follow."""
+        objects = BirthLabelJob(pixels=new.pixels, mask=address(keyframe.device_mask))
+        return self._fill_births(gaussians, new.rows, objects)
 
-    def _begin(self, gaussians: GaussianMap, rows: slice, job: Any) -> None:
-        """New Gaussians, whose votes are zero, get their first vectors and votes. `job` names their objects."""
+    def finish_births(self, gaussians: GaussianMap, rows: slice) -> None:
+        """First vectors of new Gaussians that do not follow from their votes."""
+        if self.settings.initialisation != "votes" and rows.stop > rows.start:
+            shape = (rows.stop - rows.start, IDENTITY_CHANNELS)
+            random = torch.rand(shape, generator=self._drawer.generator, device=self.device)
+            gaussians.features[rows] = (random - 0.5) / SH_C0
+
+    def _fill_births(self, gaussians: GaussianMap, rows: slice, job: BirthLabelJob) -> BirthLabelJob:
+        """Fills in `job`, which names the objects of new Gaussians, whose votes are zero."""
         count, by_votes = rows.stop - rows.start, self.settings.initialisation == "votes"
-        if count == 0:
-            return
         storage, channels = gaussians.storage, gaussians.feature_channels
         job.alias, job.class_of = self.device_alias.data_ptr(), self.table.class_of.data_ptr()
         job.class_rows, job.code_length = self.table.training_arrays[0].data_ptr(), ClassTuning.code_length
@@ -202,11 +212,7 @@ class CudaIdentityLearner(IdentityLearner):
         job.features = storage["features"].data_ptr() + 4 * channels * rows.start if by_votes else None
         job.vote, job.count, job.channels, job.slots = IdentityTuning.birth_vote, count, channels, VOTE_SLOTS
         job.device, job.stream = self.device.index or 0, self.library.stream(self.device)
-        self.library.call("birth_labels", ctypes.byref(job))
-        if not by_votes:
-            shape = (count, IDENTITY_CHANNELS)
-            random = torch.rand(shape, generator=self._drawer.generator, device=self.device)
-            gaussians.features[rows] = (random - 0.5) / SH_C0
+        return job
 
     def observe(self, mask: np.ndarray) -> None:
         super().observe(mask)

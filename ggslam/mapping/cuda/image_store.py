@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -67,7 +67,7 @@ class CudaKeyframeImages:
     @property
     def nbytes(self) -> int:
         """Memory that they take."""
-        return sum(image.nbytes for image in (self.color, self.depth, self.mask) if image is not None)
+        return self.color.nbytes + self.depth.nbytes + (0 if self.mask is None else self.mask.nbytes)
 
 
 _TYPES: Final = {np.dtype(np.uint8): torch.uint8, np.dtype(np.uint16): torch.uint16}
@@ -108,12 +108,14 @@ class ImageStore:
         if depth_now is not None and images.depth_of is not depth_now:
             self._drop(images.depth)
             images.depth, images.depth_of = self._upload(grid.depth_of(depth_now)), depth_now
-        self.use(images)
+        self._images.move_to_end(key)
         return images
 
-    def use(self, images: CudaKeyframeImages) -> None:
+    def use(self, images: Iterable[CudaKeyframeImages]) -> None:
         """Of all images that are kept these were used last."""
-        self._images.move_to_end(images.key)
+        for used in images:
+            if used.is_kept:
+                self._images.move_to_end(used.key)
 
     def mask_of(self, keyframe: ImageSource, grid: PixelGrid = ALL_PIXELS) -> torch.Tensor | None:
         """The mask that a keyframe has now, at a grid's pixels."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,7 +19,7 @@ import numpy as np
 import torch
 
 from ggslam.abi.arrays import address
-from ggslam.abi.cuda import InsertionJob
+from ggslam.abi.cuda import BirthLabelJob, InsertionJob
 from ggslam.cuda.library import CudaLibrary, library_and_device
 from ggslam.cuda.memory import GrowingMemory
 from ggslam.errors import RenderError
@@ -43,10 +44,16 @@ class Selection:
     Attributes:
         job: for `CudaInsertion.build`.
         total: their number, int32 [1] on the device.
+        library: the kernels.
     """
 
     job: InsertionJob
     total: torch.Tensor
+    library: CudaLibrary
+
+    def start(self) -> None:
+        """Starts to choose the pixels."""
+        self.library.call("insertion_select", ctypes.byref(self.job))
 
 
 @dataclass(frozen=True)
@@ -85,11 +92,12 @@ class CudaInsertion:
         """Of maps that are inserted to."""
 
     def new_gaussians(self, *arguments: Any, **named: Any) -> NewGaussians[torch.Tensor]:
-        """`select` and `build`. Waits for the device once, for the number of Gaussians."""
-        selection = self.select(*arguments, **named)
+        """`selection` and `build`. Waits for the device once, for the number of Gaussians."""
+        selection = self.selection(*arguments, **named)
+        selection.start()
         return self.build(selection, int(selection.total.item()))
 
-    def select(
+    def selection(
         self,
         color: torch.Tensor,
         depth: torch.Tensor,
@@ -101,8 +109,9 @@ class CudaInsertion:
         settings: InsertionSettings,
         total: torch.Tensor | None = None,
     ) -> Selection:
-        """Starts to choose what the map lacks: first the pixels that `find_unexplained` gives `new_gaussians`, then, if
-        holes are filled, those of `fill_gaussians`. Valid until the next one; the images have to stay till `build`.
+        """What chooses, once it is started, what the map lacks: first the pixels that `find_unexplained` gives
+        `new_gaussians`, then, if holes are filled, those of `fill_gaussians`. Valid until the next one; the images have
+        to stay till `build`.
 
         Args:
             color: measured, uint8 [H, W, 3].
@@ -130,8 +139,7 @@ class CudaInsertion:
         if key not in self._sizes:
             self._sizes = {key: self.library.functions.ggslam_cuda_insertion_bytes(ctypes.byref(job))}
         job.workspace = self._memory.block("insertion", self._sizes[key]).data_ptr()
-        self.library.call("insertion_select", ctypes.byref(job))
-        return Selection(job, total)
+        return Selection(job, total, self.library)
 
     def build(self, selection: Selection, count: int) -> NewGaussians[torch.Tensor]:
         """The Gaussians of a selection, `count` being the number in its `total`."""
@@ -145,10 +153,13 @@ class CudaInsertion:
         return new
 
     def insert(
-        self, selection: Selection, count: int, gaussians: GaussianMap, opacity: float, keyframe: int
-    ) -> NewRows:
-        """The Gaussians of a selection, as of `build`, in a map: of one opacity, born at keyframe number `keyframe`."""
-        rows = self.rows.append(gaussians, count, float(np.log(opacity / (1 - opacity))), keyframe)
+        self, selection: Selection, count: int, gaussians: GaussianMap, opacity: float, keyframe: int,
+        births: Callable[[NewRows], BirthLabelJob] | None = None,
+    ) -> NewRows:  # fmt: skip
+        """The Gaussians of a selection, as of `build`, in a map: of one opacity, born at keyframe number `keyframe`,
+        and with the first labels that `births` says, which is asked if there are any Gaussians."""
+        logit = float(np.log(opacity / (1 - opacity)))
+        rows, fill = self.rows.extend(gaussians, count, logit, keyframe)
         if count == 0:
             return NewRows(rows, 0)
         job, places = selection.job, self.rows.places(gaussians, rows.start)
@@ -157,8 +168,10 @@ class CudaInsertion:
             setattr(job, name, places[name])
         job.colors, job.color_numbers, job.as_harmonics = places["sh"], 3 * (gaussians.sh_degree + 1) ** 2, 1
         job.pixels = self._memory.block("pixels", 4 * count).data_ptr()
-        self.library.call("insertion_build", ctypes.byref(job))
-        return NewRows(rows, job.pixels)
+        new = NewRows(rows, job.pixels)
+        labels = None if births is None else ctypes.byref(births(new))
+        self.library.call("insert_rows", ctypes.byref(fill), ctypes.byref(job), labels)
+        return new
 
     def _job(self, camera: Camera, T_world_camera: np.ndarray, settings: InsertionSettings) -> InsertionJob:
         job = InsertionJob(

@@ -67,22 +67,24 @@ class KeyframeLook:
 
     def _start(self, with_room: bool) -> None:
         mapper, keyframe, self._with_room = self._mapper, self._keyframe, with_room
-        valid = mapper.valid_on_device(keyframe)
-        self._explained: Explained = _nothing_explained(valid)
-        if self.shows:
-            self._view = mapper.render_keyframe(keyframe, with_room)
-            self._memory.see(mapper.map, self._view, keyframe.device_images(), keyframe.depth_unit, valid)
-            self._explained = self._memory.explained
-        self._select(keyframe.device_images().color)
+        valid, images = mapper.valid_on_device(keyframe), keyframe.device_images()
+        if not self.shows:
+            self._explained: Explained = _nothing_explained(valid)
+            self._select(images.color).start()
+            return
+        self._view, self._explained = mapper.render_keyframe(keyframe, with_room), self._memory.explained
+        chosen = self._select(images.color)
+        self._memory.see(mapper.map, self._view, images, keyframe.depth_unit, valid, chosen)
 
-    def _select(self, color: torch.Tensor) -> None:
+    def _select(self, color: torch.Tensor) -> Selection:
         self.selection = self._mapper.selection(color, self._keyframe, self._explained, self._T, self._memory.total)
+        return self.selection
 
     def select_again(self, color: torch.Tensor) -> None:
         """Chooses pixels of the keyframe with other colours, uint8 [H, W, 3] on the device."""
         self.count()  # by now it is known whether there was room
         self._color = color  # it has to stay
-        self._select(color)
+        self._select(color).start()
         self._count = int(download(self.selection.total)[0][0])
 
     def labels(self) -> MapLabels:

@@ -111,24 +111,26 @@ class CudaLessons:
         s: IdentitySettings = self._learner.settings
         few = s.neighbours.weight == 0 or s.neighbours.neighbours <= MOST_NEIGHBOURS
         fits = gaussians.with_moments and gaussians.feature_channels == IDENTITY_CHANNELS
-        return fits and few and s.schedule in _SCHEDULES and len(gaussians) > 0
+        return fits and few and s.schedule in _SCHEDULES and gaussians.count > 0
 
     def run(self, gaussians: GaussianMap, rasterizer: CudaRasterizer, keyframe: Any, rate_factor: float) -> None:
         """A step at pixels of what was rendered last."""
         rendering, library = rasterizer.last_rendering.native, self._learner.library
         rendering.stream = library.stream(self._device)
         size = (rendering.view.height, rendering.view.width)
-        job = self.fill(self._step, gaussians, keyframe, size, rate_factor)
+        job = self.fill(self._step, gaussians, keyframe, keyframe.device_mask, size, rate_factor)
         library.call("learn", ctypes.byref(job), ctypes.byref(self._step), ctypes.byref(rendering))
 
     def fill(
-        self, step: IdentityStep, gaussians: GaussianMap, keyframe: Any, size: tuple[int, int], rate_factor: float
-    ) -> IdentityJob:
+        self, step: IdentityStep, gaussians: GaussianMap, keyframe: Any, mask: torch.Tensor, size: tuple[int, int],
+        rate_factor: float,
+    ) -> IdentityJob:  # fmt: skip
         """Fills in the next step on a keyframe, or its mask on a grid, whose picture is of `size` (height, width), and
-        counts it; returns the job that goes with it. Valid until map, masks or classes change."""
+        counts it; returns the job that goes with it. Valid until map, masks or classes change. `mask`: what the
+        keyframe gives as `device_mask`."""
         learner = self._learner
         self._fill_job(gaussians, size)
-        step.mask, step.rate_factor = keyframe.device_mask.data_ptr(), rate_factor
+        step.mask, step.rate_factor = mask.data_ptr(), rate_factor
         if isinstance(keyframe, MaskOnGrid):
             self._fill_once(step)
         else:

@@ -12,9 +12,10 @@ import numpy as np
 import torch
 
 from ggslam.abi.arrays import address
-from ggslam.abi.cuda import BrightnessRatios, KeyframeLookJob
+from ggslam.abi.cuda import BrightnessRatios, KeyframeLookJob, SeenLabelJob
 from ggslam.cuda.transfers import Download
 from ggslam.mapping.cuda.image_store import CudaKeyframeImages
+from ggslam.mapping.cuda.insertion import Selection
 from ggslam.mapping.cuda.vote_labels import CudaVoteLabels
 from ggslam.rendering.cuda.pixel_terms import CudaPixelTerms
 from ggslam.rendering.cuda.rasterizer import CudaRasterizer
@@ -96,39 +97,54 @@ class LookMemory:
             self._pixels = _grid_pixels(size, LABEL_STRIDE, device)
             self._terms = CudaPixelTerms.empty(len(self._pixels), _MOST_TERMS, rasterizer.library, device)
             self._votes = CudaVoteLabels(device, rasterizer.library)
+            self._labels = SeenLabelJob(
+                terms=self._terms.native(), pixels=address(self._pixels), ids=address(self._ids[0]),
+                shares=address(self._shares[0]), min_weight=_LEAST_WEIGHT,
+            )  # fmt: skip
         self.explained = torch.empty(size, device=device), depth
         """Alpha and depth in metres, float32 [H, W], of what the map explains."""
+        self._job = self._new_job()
+
+    def _new_job(self) -> KeyframeLookJob:
+        """What all looks have in common."""
+        (height, width), t, alpha = self.kind.size, ExposureTuning, self.explained[0]
+        job = KeyframeLookJob(
+            overflowed=address(self._rasterizer.last_overflowed), was_short=address(self._short),
+            explained_alpha=address(alpha), explained_depth=address(self.explained[1]), height=height, width=width,
+            device=alpha.device.index or 0, ratio_stride=t.stride, label_stride=LABEL_STRIDE, least_alpha=t.min_alpha,
+            largest_depth_error=t.max_depth_error, dark=t.dark, bright=t.bright,
+        )  # fmt: skip
+        if self.kind.with_colors:
+            job.pixel_ratios, job.ratios = address(self._pixel_ratios), address(self._ratios)
+        if self.kind.with_labels:
+            job.shares = address(self._shares[0])
+        return job
 
     def see(
         self, gaussians: GaussianMap, view: RenderBuffers, images: CudaKeyframeImages, depth_unit: float,
-        valid: torch.Tensor | None,
+        valid: torch.Tensor | None, selection: Selection,
     ) -> None:  # fmt: skip
-        """Starts to look at what was rendered last, `view`.
+        """Starts to look at what was rendered last, `view`, and then to choose what it lacks.
 
         Args:
             images: of the keyframe.
             depth_unit: of their depth, metres.
             valid: bool [H, W] on the device, where the keyframe shows something: elsewhere there is nothing to explain;
                 None: everywhere.
+            selection: of pixels that the view, as `explained`, does not explain; not started.
         """
-        rasterizer, (height, width), t = self._rasterizer, self.kind.size, ExposureTuning
+        job, labels, rasterizer = self._job, None, self._rasterizer
+        rendering = rasterizer.last_rendering.native
+        job.stream = rendering.stream
         if self.kind.with_labels:
-            self._terms.collect(rasterizer.last_rendering.native, self._pixels, _LEAST_WEIGHT)
-            self._terms.label(self._votes.of(gaussians), self._ids[0], self._shares[0])
-        job = KeyframeLookJob(
-            image=address(view.image), depth=address(view.depth), alpha=address(view.alpha), valid=address(valid),
-            overflowed=address(rasterizer.last_overflowed), was_short=address(self._short),
-            measured_color=address(images.color), measured_depth=address(images.depth),
-            stream=rasterizer.library.stream(rasterizer.device), device=rasterizer.device.index or 0, height=height,
-            width=width, ratio_stride=t.stride, label_stride=LABEL_STRIDE, units_per_metre=1 / depth_unit,
-            least_alpha=t.min_alpha, largest_depth_error=t.max_depth_error, dark=t.dark, bright=t.bright,
-        )  # fmt: skip
-        job.explained_alpha, job.explained_depth = map(address, self.explained)
-        if self.kind.with_colors:
-            job.pixel_ratios, job.ratios = address(self._pixel_ratios), address(self._ratios)
-        if self.kind.with_labels:
-            job.shares = address(self._shares[0])
-        rasterizer.library.call("keyframe_look", ctypes.byref(job))
+            self._labels.votes, self._labels.terms.stream = self._votes.job(gaussians), job.stream
+            labels = ctypes.byref(self._labels)
+        assert view.depth is not None
+        job.image, job.depth, job.alpha = view.image.data_ptr(), view.depth.data_ptr(), view.alpha.data_ptr()
+        job.measured_color, job.measured_depth = images.color.data_ptr(), images.depth.data_ptr()
+        job.valid, job.units_per_metre = address(valid), 1 / depth_unit
+        looks = ctypes.byref(rendering), labels, ctypes.byref(job), ctypes.byref(selection.job)
+        rasterizer.library.call("see_map", *looks)
 
     # --- on the host -------------------------------------------------------------------------------------------------
 
@@ -140,7 +156,7 @@ class LookMemory:
 
     def exposure(self) -> np.ndarray | None:
         """Of the keyframe against the map, as `SeenAgain.measure`."""
-        if not all(is_enough(used, self._compared) for used in self._found.used):
+        if not is_enough(min(self._found.used), self._compared):
             return None
         return exposure_of(self._found.medians)
 

@@ -71,6 +71,7 @@ class CudaImageLoss:
         self._leaves_saturated = leaves_saturated
         self.memory = GrowingMemory(self.device)
         self._results = torch.empty(_VALUES + 6, dtype=torch.float64, device=self.device)
+        self._sizes: dict[tuple[int, int, bool], int] = {}  # of the workspace
         self._images = ByKind(self._new_gradients)
         self._gradients = self._images.of((0, 0))
 
@@ -120,8 +121,10 @@ class CudaImageLoss:
         self._gradients = self._images.of((height, width))
         job.d_image, job.d_depth, job.d_alpha = (gradient.data_ptr() for gradient in self._gradients)
         job.results = self._results.data_ptr()
-        size_of_block = self.library.functions.ggslam_cuda_image_loss_bytes(ctypes.byref(job))
-        job.workspace = self.memory.block("loss", size_of_block).data_ptr()
+        case = height, width, job.dssim_weight > 0
+        if case not in self._sizes:
+            self._sizes[case] = self.library.functions.ggslam_cuda_image_loss_bytes(ctypes.byref(job))
+        job.workspace = self.memory.block("loss", self._sizes[case]).data_ptr()
         return job
 
     def _new_gradients(self, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

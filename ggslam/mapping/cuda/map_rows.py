@@ -51,6 +51,15 @@ class MapRows:
     def append(self, gaussians: GaussianMap, added: int, opacity_logit: float, birth_keyframe: int) -> slice:
         """Appends so many Gaussians; returns their rows. Of one opacity, and otherwise as `GaussianMap.insert` begins
         them, but for means, rotations, sizes and colours, which the caller has to write."""
+        rows, job = self.extend(gaussians, added, opacity_logit, birth_keyframe)
+        self._library.call("fill_words", ctypes.byref(job))
+        return rows
+
+    def extend(
+        self, gaussians: GaussianMap, added: int, opacity_logit: float, birth_keyframe: int
+    ) -> tuple[slice, FillJob]:
+        """As `append`, but that their values are not written: by what is returned with the rows, valid until the next
+        call, the library does it."""
         rows = gaussians.extend(added)
         arrays, job = self._find_arrays(gaussians), self._fill
         values = {"opacity_logits": _bits(opacity_logit), "birth_keyframe": birth_keyframe}
@@ -61,8 +70,7 @@ class MapRows:
                 fill.words = array.place + rows.start * array.row_bytes
                 fill.count, fill.value = added * array.row_bytes // _WORD, values.get(name, 0)
                 job.count += 1
-        self._library.call("fill_words", ctypes.byref(job))
-        return rows
+        return rows, job
 
     def places(self, gaussians: GaussianMap, row: int) -> Mapping[str, int]:
         """Address of a row in every array."""

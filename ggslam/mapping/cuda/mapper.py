@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 
 import numpy as np
 import torch
@@ -105,11 +106,12 @@ class CudaMapper(TrainingMapper):
             look.select_again(upload(color, self.device))
         if self.identity is not None and labeller is not None:
             self._take_labels(keyframe, labeller(keyframe, look.labels if look.shows else None))
+        births = None if self.identity is None else partial(self.identity.births, self.map, keyframe)
         new = self._insertion.insert(
-            look.selection, look.count(), self.map, self.settings.insertion.opacity, keyframe.index
+            look.selection, look.count(), self.map, self.settings.insertion.opacity, keyframe.index, births
         )
         if self.identity is not None:
-            self.identity.begin_at(self.map, keyframe, new)
+            self.identity.finish_births(self.map, new.rows)
 
     def _prune(self) -> None:
         self._insertion.rows.prune(self.map, self.settings.pruning)
@@ -175,9 +177,9 @@ class CudaMapper(TrainingMapper):
         self, color: torch.Tensor, keyframe: CudaKeyframe, explained: Explained, T_world_camera: np.ndarray,
         total: torch.Tensor,
     ) -> Selection:  # fmt: skip
-        """Starts to choose the pixels of a keyframe, whose colours are those given, that the map does not explain;
-        `explained` has to stay. Their number goes to `total`, int32 [1] on the device."""
-        return self._insertion.select(
+        """What chooses, once it is started, the pixels of a keyframe, whose colours are those given, that the map does
+        not explain; `explained` has to stay. Their number goes to `total`, int32 [1] on the device."""
+        return self._insertion.selection(
             color, keyframe.device_images().depth, keyframe.depth_unit, *explained, keyframe.camera, T_world_camera,
             self._insertion_settings, total,
         )  # fmt: skip

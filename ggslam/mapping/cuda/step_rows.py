@@ -4,10 +4,8 @@ something that they are made from is another."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from operator import is_
-from typing import Final, Protocol, TypeVar
+from typing import Final
 
 import torch
 
@@ -67,10 +65,11 @@ class StepRow:
 
     Attributes:
         kind: of the steps.
-        step: for the library.
+        step: for the library, with rates of the map and of the pose.
         images: what a step is compared with.
         shown: bool [h, w] on the device, where colours count; None: everywhere.
         is_world: whether its pose stays for good.
+        optimizer, pose_rate: that the rates are of.
     """
 
     kind: StepKind
@@ -78,18 +77,15 @@ class StepRow:
     images: CudaKeyframeImages
     shown: torch.Tensor | None
     is_world: bool
-    _optimizer: AdamSettings | None = None
-    _pose_rate: float = -1.0
+    optimizer: AdamSettings | None = None
+    pose_rate: float = -1.0
 
-    def at_rates(self, optimizer: AdamSettings, pose_rate: float) -> TrainingStep:
-        """The step with these rates of the map; `pose_rate`: size of the pose's step in metres and radians, 0: it
-        stays."""
-        if optimizer is not self._optimizer:
-            self._optimizer = optimizer
-            self.step.rates[:] = [float(optimizer.learning_rates.get(name, 0.0)) for name in ADAM_GROUPS]
-        if pose_rate != self._pose_rate:
-            self._pose_rate = self.step.keyframe.pose_rate = pose_rate
-        return self.step
+    def set_rates(self, optimizer: AdamSettings, pose_rate: float) -> None:
+        """The steps that follow have the optimizer's rates; `pose_rate`: size of the pose's step in metres and radians
+        where it is not the world's, 0: it stays."""
+        self.optimizer, self.pose_rate = optimizer, pose_rate
+        self.step.rates[:] = [float(optimizer.learning_rates.get(name, 0.0)) for name in ADAM_GROUPS]
+        self.step.keyframe.pose_rate = 0.0 if self.is_world else pose_rate
 
 
 @dataclass(eq=False)
@@ -105,29 +101,3 @@ class KeptRow:
     grid: PixelGrid
     sources: tuple[object, ...]
     row: StepRow
-
-
-class HasRows(Protocol):
-    """A keyframe with the rows that were made of it."""
-
-    rows: list[KeptRow]
-
-
-_Keyframe = TypeVar("_Keyframe", bound=HasRows)
-
-
-def row_of(
-    keyframe: _Keyframe, grid: PixelGrid, sources: tuple[object, ...],
-    make: Callable[[_Keyframe, PixelGrid], StepRow],
-) -> StepRow:  # fmt: skip
-    """The row of a keyframe on a grid's pixels, made by `make` if there is none that holds. `sources` as those of a
-    `KeptRow`."""
-    for kept in keyframe.rows:
-        if kept.grid is grid:
-            if kept.row.images.is_kept and all(map(is_, kept.sources, sources)):
-                return kept.row
-            keyframe.rows.remove(kept)
-            break
-    row = make(keyframe, grid)
-    keyframe.rows.append(KeptRow(grid, sources, row))
-    return row

@@ -9,6 +9,7 @@ the keyframe's step.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import Any, Final
 
 import torch
@@ -67,36 +68,45 @@ class CudaTraining:
             self._recent.value = self._rasterizer.counter.recent_pairs()
         return self._recent.value > 0
 
-    def add(self, row: StepRow, optimizer: AdamSettings, pose_rate: float) -> bool:
-        """A step joins those that were gathered. False: it does not go with them, which have to be started before.
+    def add(self, rows: Sequence[StepRow], optimizer: AdamSettings, pose_rate: float) -> bool:
+        """Steps join those that were gathered. False: none does. They do not go together, their images are not kept
+        any more, or others have to be started before.
 
         Args:
-            row: of a keyframe, or of a frame between keyframes; none is appended until the step is started.
+            rows: of keyframes, or of frames between keyframes; none is appended until the steps are started.
             optimizer: of the map.
-            pose_rate: size of the pose's step in metres and radians; 0: the pose stays.
+            pose_rate: size of a pose's step in metres and radians where it is not the world's; 0: poses stay.
         """
-        if self.count and (row.kind is not self._kind or self.count == _MOST_STEPS):
+        kind, count = self._kind if self.count else rows[0].kind, self.count
+        if count + len(rows) > _MOST_STEPS:
             return False
-        self._kind, self._optimizer = row.kind, optimizer
-        self._steps[self.count] = row.at_rates(optimizer, pose_rate)
-        self._named.append((row.images.color, row.images.depth, row.shown))
-        self.count += 1
+        for row in rows:
+            if row.kind is not kind or not row.images.is_kept:
+                return False
+        self._kind, self._optimizer = kind, optimizer
+        for row in rows:  # at every frame, and so without calls
+            if row.optimizer is not optimizer or row.pose_rate != pose_rate:
+                row.set_rates(optimizer, pose_rate)
+            self._steps[count] = row.step
+            self._named.append((row.images.color, row.images.depth, row.shown))
+            count += 1
+        self.count = count
         return True
 
-    def teach_last(self, lessons: CudaLessons, gaussians: GaussianMap, keyframe: Any) -> None:
-        """On the rendering of the last step that was gathered, a step of identity learning is made, too, with a
-        keyframe's mask on its grid."""
+    def teach(self, number: int, lessons: CudaLessons, gaussians: GaussianMap, keyframe: Any) -> None:
+        """On the rendering of a step that was gathered, by its number, a step of identity learning is made, too, with
+        a keyframe's mask on its grid. Of several steps, the earlier one is to be told first."""
         assert self._kind is not None
-        number, camera = self._lesson_count, self._kind.camera
+        lesson, camera, mask = self._lesson_count, self._kind.camera, keyframe.device_mask
         size = (camera.height, camera.width)
-        self._identity = lessons.fill(self._lessons[number], gaussians, keyframe, size, 1.0)
-        self._steps[self.count - 1].lesson = number
-        self._named.append(keyframe.device_mask)
+        self._identity = lessons.fill(self._lessons[lesson], gaussians, keyframe, mask, size, 1.0)
+        self._steps[number].lesson = lesson
+        self._named.append(mask)
         self._lesson_count += 1
 
-    def bound_last(self) -> None:
-        """After the last step that was gathered, sizes and, of degree 0, colours are brought within their bounds."""
-        self._steps[self.count - 1].bounded = 1
+    def clamp_after(self, number: int) -> None:
+        """After a step that was gathered, sizes and, of degree 0, colours are brought within their bounds."""
+        self._steps[number].bounded = 1
 
     def start(self, gaussians: GaussianMap) -> None:
         """Starts the steps that were gathered, on torch's current stream."""

@@ -10,7 +10,6 @@ from typing import Final
 
 import torch
 
-from ggslam.abi.arrays import address
 from ggslam.abi.core import GaussianGradients
 from ggslam.abi.cuda import KeyframeStepJob, TrainingJob
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
@@ -98,14 +97,15 @@ class TrainingJobs:
         gradients = (result.d_image, result.d_depth, result.d_alpha, None)
         job.image_gradients = image_gradients(rendering.buffers, gradients, True, rasterizer.device)
         touched = memory.block("touched", max(1, len(gaussians)))
-        job.gradients = GaussianGradients(twist=address(self._twist), touched=address(touched))
+        twist = self._twist.data_ptr()
+        job.gradients = GaussianGradients(twist=twist, touched=touched.data_ptr())
         job.adam = self._adam_steps.make(gaussians, optimizer, rasterizer.device)
         job.keyframe = KeyframeStepJob(
-            twist=address(self._twist), results=address(result.results), skipped=address(rasterizer.last_overflowed),
-            totals=address(self._states.totals), exposure_rate=settings.exposure.rate,
+            twist=twist, results=result.results.data_ptr(), skipped=rasterizer.last_overflowed.data_ptr(),
+            totals=self._states.totals.data_ptr(), exposure_rate=settings.exposure.rate,
             exposure_regularization=settings.exposure.regularization,
         )  # fmt: skip
-        job.row_memory, job.desk = address(rows), address(self._desk)
+        job.row_memory, job.desk = rows.data_ptr(), self._desk.data_ptr()
         job.largest_log_scale = math.log(settings.pruning.max_scale_m)
         job.darkest, job.brightest = -0.5 / SH_C0, 0.5 / SH_C0
         job.bounds_colors = gaussians.sh_degree == 0

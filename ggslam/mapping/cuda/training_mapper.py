@@ -8,6 +8,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import is_
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +26,7 @@ from ggslam.mapping.cuda.image_store import ImageStore
 from ggslam.mapping.cuda.keyframe import CudaKeyframe, DeviceKeyframe
 from ggslam.mapping.cuda.keyframe_states import KeyframeStates
 from ggslam.mapping.cuda.losses import CudaImageLoss, CudaLossResult
-from ggslam.mapping.cuda.step_rows import StepKind, StepKinds, StepRow, row_of
+from ggslam.mapping.cuda.step_rows import KeptRow, StepKind, StepKinds, StepRow
 from ggslam.mapping.cuda.training import CudaTraining
 from ggslam.mapping.cuda.usable_pixels import UsablePixels
 from ggslam.mapping.extra_loss import new_faults, refuse_faults
@@ -184,20 +186,28 @@ class TrainingMapper(ComparingMapper):
     @property
     def _knows_all_steps(self) -> bool:
         """Whether the library makes all steps of `run` by one call."""
-        if self.residency is not None or not self._training.is_ready or self._needs_all_pixels:
-            return False
-        return self.identity is None or self.identity.lessons.takes(self.map)
+        return self.residency is None and self._is_known(learns=True)
 
     def _run_steps(self, iterations: int) -> None:
-        optimizer, pose_rate, identity = self._optimizer(1.0, False), self._pose_rate, self.identity
-        for number in self._sampler.choose_many(self._trainable(), iterations):
-            keyframe = self.keyframes[number]
-            assert isinstance(keyframe, CudaKeyframe)
-            learns = identity is not None and identity.due(keyframe)
-            self._gather(keyframe, ALL_PIXELS, optimizer, pose_rate, learns)
+        if iterations == 0:
+            return
+        optimizer, pose_rate, identity = self._standard_adam(), self._pose_rate, self.identity
+        keyframes: list[Any] = [
+            self.keyframes[number] for number in self._sampler.choose_many(self._trainable(), iterations)
+        ]
+        lessons = range(0) if identity is None else identity.due_turns(iterations)
+        together = self._training.add(self._rows_of(keyframes, ALL_PIXELS), optimizer, pose_rate)
+        for turn, keyframe in enumerate(keyframes):
+            if not together:
+                self._gather(keyframe, ALL_PIXELS, optimizer, pose_rate)
+            number = turn if together else self._training.count - 1
+            if turn in lessons and identity is not None and keyframe.mask is not None:
+                self._training.teach(number, identity.lessons, self.map, keyframe)
+            keyframe.iterations += 1
+            self.times.steps += 1
             self.times.iterations += 1
             if self.times.iterations % MapperTuning.bound_every == 0:
-                self._training.bound_last()
+                self._training.clamp_after(number)
 
     def _step(
         self, keyframe: Keyframe, factors: tuple[float, float], grid: PixelGrid, learns: bool, settles: bool = False
@@ -209,7 +219,12 @@ class TrainingMapper(ComparingMapper):
             super()._step(keyframe, factors, grid, learns, settles)
             return
         pose_rate = self._pose_rate_of(keyframe, grid, pose_factor)
-        self._gather(keyframe, grid, self._optimizer(rate_factor, settles), pose_rate, learns)
+        self._gather(keyframe, grid, self._optimizer(rate_factor, settles), pose_rate)
+        if learns and self.identity is not None:
+            masked, last = self._masks_on(keyframe, grid), self._training.count - 1
+            self._training.teach(last, self.identity.lessons, self.map, masked)
+        self.times.steps += 1
+        keyframe.iterations += 1
 
     def _is_known(self, learns: bool) -> bool:
         """Whether the library makes a step by one call, one of identity learning with it if `learns`."""
@@ -218,28 +233,34 @@ class TrainingMapper(ComparingMapper):
         return not learns or self.identity is None or self.identity.lessons.takes(self.map)
 
     def _gather(
-        self, keyframe: DeviceKeyframe, grid: PixelGrid, optimizer: AdamSettings, pose_rate: float, learns: bool
+        self, keyframe: DeviceKeyframe, grid: PixelGrid, optimizer: AdamSettings, pose_rate: float
     ) -> None:
-        """A step joins those that are started together; as `_step`, `pose_rate` being that of a keyframe that is not
-        the world."""
-        training = self._training
-        row = row_of(keyframe, grid, self._row_sources(keyframe), self._make_row)
-        self._images.use(row.images)
-        while not training.add(row, optimizer, 0.0 if row.is_world else pose_rate):
+        """A step joins those that are started together; arguments as of `CudaTraining.add`."""
+        rows = self._rows_of([keyframe], grid)
+        while not self._training.add(rows, optimizer, pose_rate):
             self._start_steps()
-        if learns and self.identity is not None:
-            training.teach_last(self.identity.lessons, self.map, self._masks_on(keyframe, grid))
-        self.times.steps += 1
-        keyframe.iterations += 1
 
-    def _row_sources(self, keyframe: DeviceKeyframe) -> tuple[object, ...]:
-        """What a keyframe's row is made from: it holds while these are the same objects."""
-        own, number, exposures = vars(keyframe), keyframe.index, self._exposures
-        return (
-            own.get("depth"), own.get("moving"), self._valid.get(keyframe.camera_number), exposures.blind[number],
-            exposures.optimizers[number].anchor, self._states.table, self.settings, self.has_soft_outlines,
-            number in self._beside, self._usable.kept_since,
-        )  # fmt: skip
+    def _rows_of(self, keyframes: Sequence[DeviceKeyframe], grid: PixelGrid) -> list[StepRow]:
+        """Rows of keyframes on a grid's pixels. A row is made once and holds while what it was made from are the same
+        objects; this is asked for every step, and so in one loop without calls."""
+        rows, exposures, valid, beside = list[StepRow](), self._exposures, self._valid, self._beside
+        of_all = (self._states.table, self.settings, self.has_soft_outlines, self._usable.kept_since)
+        for keyframe in keyframes:
+            own, number = vars(keyframe), keyframe.index
+            sources = (
+                own.get("depth"), own.get("moving"), valid.get(keyframe.camera_number), exposures.blind[number],
+                exposures.optimizers[number].anchor, number in beside, *of_all,
+            )  # fmt: skip
+            for kept in keyframe.rows:
+                if kept.grid is grid and kept.row.images.is_kept and all(map(is_, kept.sources, sources)):
+                    rows.append(kept.row)
+                    break
+            else:
+                made = KeptRow(grid, sources, self._make_row(keyframe, grid))
+                keyframe.rows = [kept for kept in keyframe.rows if kept.grid is not grid] + [made]
+                rows.append(made.row)
+        self._images.use([row.images for row in rows])
+        return rows
 
     def _make_row(self, keyframe: DeviceKeyframe, grid: PixelGrid) -> StepRow:
         images, shown = keyframe.device_images(grid), self._comparable_on_device(keyframe, grid)
@@ -249,7 +270,7 @@ class TrainingMapper(ComparingMapper):
         kind = StepKind(camera, self.settings, self._loss_settings(keyframe), exposed, *filters)
         step = TrainingStep(lesson=-1, T_camera_keyframe=address(keyframe.T_camera_keyframe_on_device))
         step.images = TargetImages(
-            address(images.color), address(images.depth), address(shown), keyframe.depth_unit, False
+            images.color.data_ptr(), images.depth.data_ptr(), address(shown), keyframe.depth_unit, False
         )  # fmt: skip
         step.keyframe = KeyframeChoice(self._states.address(number), 0.0, exposed and number > 0)
         return StepRow(self._kinds.only(kind), step, images, shown, self.is_world(keyframe))
@@ -268,7 +289,7 @@ class TrainingMapper(ComparingMapper):
 
     def _bound_values(self) -> None:
         if self._training.count:
-            self._training.bound_last()
+            self._training.clamp_after(self._training.count - 1)
         else:
             super()._bound_values()
 

@@ -49,7 +49,7 @@ class UsablePixels:
             make: gives the mask, bool [H, W]; None: everywhere.
             grid: whose pixels.
         """
-        if all(source is None for source in sources):
+        if not [source for source in sources if source is not None]:
             return None
         whose: Hashable = keyframe.index
         if keyframe.moving is None:

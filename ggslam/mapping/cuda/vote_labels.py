@@ -27,13 +27,16 @@ class CudaVoteLabels:
     def of(self, gaussians: GaussianMap) -> torch.Tensor:
         """Object with the most votes of each Gaussian of a map with votes, int32 [N], 0 where there are none; the next
         call overwrites it."""
-        if len(self._labels) < len(gaussians):
+        self._library.call("vote_labels", ctypes.byref(self.job(gaussians)))
+        return self._labels[: len(gaussians)]
+
+    def job(self, gaussians: GaussianMap) -> VoteLabelJob:
+        """The same, for the library; its labels are valid until the next call."""
+        if len(self._labels) < gaussians.count:
             self._labels = torch.empty(gaussians.capacity, dtype=torch.int32, device=self._device)
         storage = gaussians.storage
-        job = VoteLabelJob(
+        return VoteLabelJob(
             vote_ids=storage["vote_ids"].data_ptr(), vote_weights=storage["vote_weights"].data_ptr(),
-            labels=self._labels.data_ptr(), stream=self._library.stream(self._device), count=len(gaussians),
+            labels=self._labels.data_ptr(), stream=self._library.stream(self._device), count=gaussians.count,
             device=self._device.index or 0, slots=VOTE_SLOTS,
         )  # fmt: skip
-        self._library.call("vote_labels", ctypes.byref(job))
-        return self._labels[: len(gaussians)]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 
@@ -46,14 +47,14 @@ class AdamSteps:
         return self._step
 
     def _point_to(self, gaussians: GaussianMap) -> None:
-        self._step.updates = address(gaussians.storage["updates"])
+        storage = gaussians.storage
+        self._step.updates = address(storage["updates"])
         for name in PARAMETERS:
-            setattr(self._step, name, adam_arrays(gaussians, name))
+            setattr(self._step, name, adam_arrays(storage, name))
 
 
-def adam_arrays(gaussians: GaussianMap, name: str) -> AdamArrays:
-    """A parameter of a map with moments, and these."""
-    storage = gaussians.storage
+def adam_arrays(storage: Mapping[str, torch.Tensor], name: str) -> AdamArrays:
+    """A parameter of a map with moments, and these, in the map's `storage`."""
     first, second = storage[f"{name}.first"], storage[f"{name}.second"]
     return AdamArrays(storage[name].data_ptr(), first.data_ptr(), second.data_ptr())
 

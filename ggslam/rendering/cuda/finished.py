@@ -11,7 +11,6 @@ from typing import Final
 import torch
 
 from ggslam.abi import core as structures
-from ggslam.abi.arrays import address
 from ggslam.abi.cuda import Rendering, Sizes
 from ggslam.cuda.library import CudaLibrary
 from ggslam.errors import RenderError
@@ -19,6 +18,7 @@ from ggslam.rendering.types import GaussianTensors, RenderBuffers
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.system.tuning import Tuning
 
+_TARGETS: Final = tuple(field_[0] for field_ in structures.RenderTargets._fields_)
 _MAX_PAIRS: Final = 2**31 - 1
 """Largest number of pairs: kernels number them in 31 bits."""
 
@@ -142,7 +142,7 @@ class FinishedRendering:
     def use(self, name: str, block: torch.Tensor) -> None:
         """Lets the rendering work in this block, one of Rendering's workspaces."""
         self.memory[name] = block
-        setattr(self.native, name, address(block))
+        setattr(self.native, name, block.data_ptr())
 
 
 @dataclass(frozen=True)
@@ -162,5 +162,5 @@ class MapState:
 
 def target_pointers(buffers: RenderBuffers) -> structures.RenderTargets:
     """Addresses of the images."""
-    names = [field_[0] for field_ in structures.RenderTargets._fields_]
-    return structures.RenderTargets(**{name: address(getattr(buffers, name)) for name in names})
+    images = [(name, getattr(buffers, name)) for name in _TARGETS]
+    return structures.RenderTargets(**{name: image.data_ptr() for name, image in images if image is not None})

@@ -196,12 +196,16 @@ class CudaPixelTerms:
 
     # --- the C interface ---------------------------------------------------------------------------------------------
 
-    def _call(self, name: str, *arguments: object) -> None:
-        """Calls ggslam_cuda_terms_<name> for these terms; structures are passed by their address."""
-        terms = PixelTerms(
+    def native(self) -> PixelTerms:
+        """As the library takes them, on torch's current stream."""
+        return PixelTerms(
             len(self), address(self.gaussians), address(self.weights), address(self.counts),
             self.library.stream(self.device), self.capacity, self.device.index or 0,
         )  # fmt: skip
+
+    def _call(self, name: str, *arguments: object) -> None:
+        """Calls ggslam_cuda_terms_<name> for these terms; structures are passed by their address."""
+        terms = self.native()
         given = [ctypes.byref(value) if isinstance(value, ctypes.Structure) else value for value in arguments]
         self.library.call(f"terms_{name}", ctypes.byref(terms), *given)
 
@@ -241,11 +245,11 @@ def feature_step(gaussians: GaussianMap, optimizer: FeatureAdamSettings) -> Adam
     def logarithm(factor: float) -> float:
         return math.log(factor) if factor > 0 else -math.inf
 
+    storage = gaussians.storage
     step = AdamStep(
-        features=adam_arrays(gaussians, "features"),
-        updates=address(gaussians.storage["feature_updates"]), decayed_groups=0, log_decay=0.0, decay_floor=1.0,
-        beta1=optimizer.beta1, beta2=optimizer.beta2, log_beta1=logarithm(optimizer.beta1),
-        log_beta2=logarithm(optimizer.beta2), epsilon=optimizer.epsilon,
+        features=adam_arrays(storage, "features"), updates=address(storage["feature_updates"]), decayed_groups=0,
+        log_decay=0.0, decay_floor=1.0, beta1=optimizer.beta1, beta2=optimizer.beta2,
+        log_beta1=logarithm(optimizer.beta1), log_beta2=logarithm(optimizer.beta2), epsilon=optimizer.epsilon,
     )  # fmt: skip
     step.rates[ADAM_GROUPS.index("features")] = optimizer.rate
     return step

@@ -197,8 +197,7 @@ class CudaRasterizer:
         sizes, memory = self._plan(rendering, room), self.memory
         rendering.use("gaussian_workspace", memory.block("gaussians", sizes.gaussian_workspace))
         rendering.use("pixel_workspace", memory.block("pixels", sizes.pixel_workspace))
-        rendering.use("pair_workspace", memory.block("pairs", sizes.pair_workspace))
-        rendering.gradient_bytes = sizes.gradient_rows
+        self._use_pairs(rendering, sizes, memory)
         return rendering
 
     def forget(self) -> None:
@@ -226,11 +225,13 @@ class CudaRasterizer:
         sizes = self._plan(rendering, room or 0)
         rendering.use("gaussian_workspace", memory.block("gaussians", sizes.gaussian_workspace))
         rendering.use("pixel_workspace", memory.block("pixels", sizes.pixel_workspace))
+        if room is not None and not self.waits:
+            self._use_pairs(rendering, sizes, memory)
+            self.library.call("render", ctypes.byref(rendering.native), counter.handle)
+            return
         self.library.call("project", ctypes.byref(rendering.native), counter.handle)
         if room is not None:
             self._composite(rendering, sizes, memory)
-            if not self.waits:
-                return
         rendering.visible, rendering.pairs = counter.wait()
         if room is None or rendering.pairs > room:
             self._composite(rendering, self._plan(rendering, rendering.pairs), memory)
@@ -247,9 +248,12 @@ class CudaRasterizer:
         _, sizes, native.gaussian_sorting_bytes, native.pair_sorting_bytes = self._planned
         return sizes
 
-    def _composite(self, rendering: FinishedRendering, sizes: Sizes, memory: GrowingMemory) -> None:
+    def _use_pairs(self, rendering: FinishedRendering, sizes: Sizes, memory: GrowingMemory) -> None:
         rendering.gradient_bytes = sizes.gradient_rows
         rendering.use("pair_workspace", memory.block("pairs", sizes.pair_workspace))
+
+    def _composite(self, rendering: FinishedRendering, sizes: Sizes, memory: GrowingMemory) -> None:
+        self._use_pairs(rendering, sizes, memory)
         self.library.call("composite", ctypes.byref(rendering.native))
 
     def statistics(self) -> dict[str, int]:
@@ -380,7 +384,7 @@ class CudaRasterizer:
 
     def _parameters(self, gaussians: Gaussians) -> GaussianTensors:
         if isinstance(gaussians, GaussianMap) and gaussians.device == self.device:  # shaped as it should by itself
-            return GaussianTensors(*(getattr(gaussians, name) for name in PARAMETERS))
+            return GaussianTensors(*[getattr(gaussians, name) for name in PARAMETERS])
         return checked_parameters(gaussians, self.device)
 
     @property

@@ -4,6 +4,7 @@
 #include "abi/cuda/mapping.hpp"
 #include "abi/cuda/rendering.hpp"
 #include "abi/cuda/sampled_identity.hpp"
+#include "abi/cuda/seen_map.hpp"
 #include "abi/cuda/sight.hpp"
 #include "abi/cuda/tracked_features.hpp"
 #include "abi/cuda/tracking.hpp"

@@ -6,7 +6,6 @@
 #include <algorithm>
 
 #include "common/host.cuh"
-#include "mapping/keyframe_look.cuh"
 
 using namespace ggslam::cuda;
 
@@ -31,16 +30,6 @@ GGSLAM_EXPORT int ggslam_cuda_fill_words(const FillJob* job) {
 
 GGSLAM_EXPORT int ggslam_cuda_vote_labels(const VoteLabelJob* job) {
   return run(*job, vote_labels_kernel, job->count);
-}
-
-GGSLAM_EXPORT int ggslam_cuda_keyframe_look(const KeyframeLookJob* job) {
-  return on_device(job->device, [&] {
-    const cudaStream_t stream = static_cast<cudaStream_t>(job->stream);
-    const std::int64_t pixels = static_cast<std::int64_t>(job->height) * job->width;
-    launch(keyframe_look_kernel, blocks_for(pixels, kLookThreads), kLookThreads, stream, *job);
-    if (job->ratios != nullptr) launch(brightness_kernel, 3, kMedianThreads, stream, *job);
-    return cudaSuccess;
-  });
 }
 
 GGSLAM_EXPORT int ggslam_cuda_birth_labels(const BirthLabelJob* job) {

@@ -2,7 +2,7 @@
 // What a new keyframe sees of the map: what there is nothing to add to, and how bright it is against it, as
 // SeenAgain.measure (ggslam/rendering/exposure.py).
 #pragma once
-#include "abi/cuda/growth.hpp"
+#include "abi/cuda/seen_map.hpp"
 #include "common/block_median.cuh"
 #include "common/platform.cuh"
 

@@ -240,6 +240,13 @@ GGSLAM_EXPORT int ggslam_cuda_composite(const Rendering* r) {
   return on_device(r->device, [&] { return composite_all(*r); });
 }
 
+GGSLAM_EXPORT int ggslam_cuda_render(const Rendering* r, void* counter) {
+  return on_device(r->device, [&] {
+    const cudaError_t projected = project_all(*r, static_cast<Counter*>(counter));
+    return projected != cudaSuccess ? projected : composite_all(*r);
+  });
+}
+
 GGSLAM_EXPORT int ggslam_cuda_backward(const Rendering* r, const ImageGradients* image_gradients,
                                        const GaussianGradients* gradients, const AdamStep* adam, float* row_memory) {
   return on_device(r->device, [&] { return differentiate_all(*r, *image_gradients, *gradients, adam, row_memory); });
