@@ -20,7 +20,7 @@ import torch
 from device_watch import DeviceTensor, DeviceWatch
 from torch.utils._pytree import tree_flatten
 
-from ggslam.abi.cuda import AlignResult, TrackJob
+from ggslam.abi.cuda import AlignResult, PointsHeader, TrackJob
 
 TOOLS = ("/device_watch/", "/torch/utils/_python_dispatch.py", "/torch/overrides.py", "host_counts.py")
 """Code that only watches: neither it nor what it calls is counted, but for a call of what it stands in for."""
@@ -108,6 +108,8 @@ class KernelThread:
             self.alignment = type(results).from_buffer_copy(results)
         elif self.alignment is not None:
             results[:] = self.alignment[:]
+            header = PointsHeader.from_address(job.points.out.header)
+            header.count = min(int(results[AlignResult.POINT_COUNT]), job.points.columns * job.points.rows)
 
     def _there(self, function: Any, *arguments: Any) -> Any:
         if self.leaves_out:
