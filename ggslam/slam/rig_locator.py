@@ -37,7 +37,9 @@ class DarkImageTuning(Tuning):
     """Distance, in rows and columns, between the pixels that are looked at."""
 
 
-@savable(not_saved="_config _surface _masks _tracker _loops _pager _policy _poses _filters _rig _engine _chains")
+@savable(
+    not_saved="before_search _config _surface _masks _tracker _loops _pager _policy _poses _filters _rig _engine _chains"
+)
 class RigLocator(FrameLocator):
     """See `FrameLocator`. A camera that sees nothing, or has no frame at an instant, is carried along by the others.
     No parts begin in a lost rig, and colour does not correct its poses.
