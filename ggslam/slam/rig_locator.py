@@ -38,7 +38,8 @@ class DarkImageTuning(Tuning):
 
 
 @savable(
-    not_saved="before_search _config _surface _masks _tracker _loops _pager _policy _poses _filters _rig _engine _chains"
+    not_saved="before_search _config _surface _masks _tracker _loops _pager _policy _poses _filters "
+    "_rig _engine _chains"
 )
 class RigLocator(FrameLocator):
     """See `FrameLocator`. A camera that sees nothing, or has no frame at an instant, is carried along by the others.
