@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,8 +66,9 @@ class FrameLocator:
         self._policy, self._poses, self._filters = policy, poses, filters
         self.color_poses = ColorPoses(parts.mapper, poses, parts.tracker.state)
         self.part_start, self.left_parts = PartStart(), LeftParts()
-        self.before_search: Callable[[], None] = lambda: None
-        """Is called before a lost camera is looked for: all keyframes have to be known then."""
+        self.before_search: Callable[[], Sequence[np.ndarray]] = tuple
+        """Is called before a lost camera is looked for: all keyframes have to be known then. What it says has moved the
+        world about the camera, [4, 4] each."""
 
     def target(self, published: GicpTarget | None) -> GicpTarget | None:
         """What the next frames are aligned to: the surface as it was published last, or what a part has begun with
@@ -92,7 +93,8 @@ class FrameLocator:
         expected = self._filters.expect(frame)
         result, early = self._tracker.track(expected), list[tuple[Frame, TrackingResult]]()
         if result.status is TrackingStatus.LOST and self._loops is not None and self._tracker.target is not None:
-            self.before_search()
+            for T_new_old in self.before_search():
+                result = replace(result, T_world_camera=T_new_old @ result.T_world_camera)
             found = self._find_again(frame, expected, result, self._loops)
             if found is not None:
                 result = found

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -57,6 +58,13 @@ class Joining(Generic[Found]):
         assert self._under_way is None
         self._under_way = _UnderWay(finish, self._step + STEPS_BESIDE + 1)
         self._thread.start(work)
+
+    def drop(self) -> None:
+        """Waits for what is under way, if anything is, and forgets it, whatever it found or raised."""
+        if self._under_way is not None:
+            self._under_way = None
+            with suppress(Exception):
+                self._thread.take()
 
     def end(self) -> None:
         """Waits for what is under way, if anything is, and takes it over; raises what it raised."""

@@ -188,8 +188,7 @@ class LoopCloser:
             The correction if this closes a loop. `apply` it.
         """
         start = time.perf_counter()
-        with self._lock:
-            self.comparison.noise_then = noise
+        with self._lock, self.comparison.noise_as(noise):
             T = tracking.T_world_camera
             place = self._describe(frame, T)
             # In real time, keyframes from before the camera was lost may still come after it was found.
@@ -207,7 +206,6 @@ class LoopCloser:
             correction = None if belated else self._look_back(frame, place, tracking)
             if correction is None and (self.activity.update() or belated or begins):
                 self._surface.arrange(self.activity.active)
-            self.comparison.noise_then = None
         self.seconds += time.perf_counter() - start
         return correction
 

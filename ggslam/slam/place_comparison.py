@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -41,8 +42,7 @@ class PlaceComparison:
         self.settings = settings
         self._neighbourhood, self._surface = neighbourhood, surface
         self._tracker, self._context = tracker, context
-        self.noise_then: DepthNoise | None = None
-        """Noise of the depth camera while what is compared was located; None: as the tracker knows it."""
+        self._noise_then: DepthNoise | None = None
 
     def find(
         self, source: PointSource, place: Place, places: PlaceIndex, poses: Sequence[np.ndarray], old: int,
@@ -87,7 +87,16 @@ class PlaceComparison:
     @property
     def noise(self) -> DepthNoise:
         """Of the depth camera."""
-        return self.noise_then or self._tracker.noise or DepthNoise()
+        return self._noise_then or self._tracker.noise or DepthNoise()
+
+    @contextmanager
+    def noise_as(self, noise: DepthNoise | None) -> Iterator[None]:
+        """Within, noise is as it was known when what is compared was located; None: as the tracker knows it."""
+        self._noise_then = noise
+        try:
+            yield
+        finally:
+            self._noise_then = None
 
     def around(self, number: int, count: int) -> list[int]:
         """The keyframes of `count` whose points make the surface at one of them."""

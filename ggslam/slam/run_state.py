@@ -87,7 +87,7 @@ class RunState:
         if parts.on_device:
             self.schedule = BesideTraining(self.mapper.beside_others(host_waits=False))
             self.use_context_beside_mapping()
-        self.locator.before_search = self.end_joining
+        self.locator.before_search = self.catch_up
         self.corrections = MapCorrections(self.surface, self.mapper, self.pager, self.masks)
         self.removal = MapRemoval(self.surface, self.mapper, self.pager, self.corrections.publishing)
         self.parts = MapParts(self.mapper, self.poses, self.corrections, self.loops)
@@ -177,12 +177,26 @@ class RunState:
         """Waits for the newest keyframe, if it still joins what frames are aligned to."""
         self.joining.end()
 
+    def catch_up(self) -> list[np.ndarray]:
+        """The newest keyframe has joined, if it was at it, and everything that knows a pose of the camera has followed;
+        what moved it, [4, 4] each."""
+        before = self.moves_followed
+        if self.joining.is_under_way:
+            self.end_joining()
+            self.follow_corrections()
+        return self.corrections.moves[before : self.moves_followed]
+
+    def follow_corrections(self) -> None:
+        """See `Slam`."""
+        raise NotImplementedError
+
     def join_parts(self) -> None:
         """Makes one part of those that the recording fell into, see `MapParts`; when there are no more frames."""
+        self.end_joining()
         self.parts.join_parts()
 
     def close(self) -> None:
         """Removes what is on disk of map and keyframes, for a run that has no result."""
-        self.end_joining()
+        self.joining.drop()
         if self.pager is not None:
             self.pager.close()

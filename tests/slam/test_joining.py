@@ -130,6 +130,52 @@ def test_runs_repeat_bit_for_bit_however_long_it_takes(
     assert found[0][1] == found[1][1]
 
 
+def test_a_lost_frame_goes_along_with_a_loop_that_is_closed_before_it_is_looked_for(
+    frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slam = start(frames, "keyframes.max_gap=1", "keyframes.min_overlap=0.01")
+    track, apply, lost = slam.tracker.track, slam.corrections.apply, list[np.ndarray]()
+    T_new_old, status = se3_exp(np.array([0.1, 0, 0, 0, 0.05, 0])), TrackingStatus.OK
+
+    def find(loops: LoopCloser, frame: Frame, tracking: TrackingResult) -> None:
+        lost.append(tracking.T_world_camera)
+
+    def close(correction: object, loops: LoopCloser) -> None:
+        slam.corrections.moves.append(T_new_old)
+
+    slam.tracker.track = lambda frame: dataclasses.replace(  # type: ignore[method-assign]
+        track(frame), overlap=0.9, status=status
+    )
+    for frame in frames[:2]:
+        slam.step(frame)
+    slam.end_joining()
+    with monkeypatch.context() as patch:
+        patch.setattr(LoopCloser, "add", lambda *_: "a correction")
+        patch.setattr(slam.corrections, "apply", close)
+        patch.setattr(LoopCloser, "find", find)
+        slam.step(frames[2])
+        assert slam.joining.is_under_way and not len(slam.corrections)
+        status, before = TrackingStatus.LOST, slam.tracker.state.motion.T_world_camera.copy()
+        moved: list[np.ndarray] = []
+        patch.setattr(slam.filters, "move", moved.append)
+        slam.step(frames[3])
+    assert slam.moves_followed == len(slam.corrections) == 1 and len(moved) == 1
+    assert len(lost) == 1 and not np.allclose(lost[0], before)
+    np.testing.assert_allclose(apply.__self__.moves[0], T_new_old)
+
+
+def test_a_run_that_is_closed_takes_nothing_over(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+    slam = start(frames, "keyframes.max_gap=1", "keyframes.min_overlap=0.01")
+    track = slam.tracker.track
+    slam.tracker.track = lambda frame: dataclasses.replace(track(frame), overlap=0.9)  # type: ignore[method-assign]
+    slam.step(frames[0])
+    monkeypatch.setattr(LoopCloser, "add", lambda *_: 1 / 0)
+    slam.step(frames[1])
+    assert slam.joining.is_under_way
+    slam.close()
+    assert not slam.joining.is_under_way
+
+
 def test_where_the_target_shows_little_the_next_frame_waits(frames: list[Frame]) -> None:
     slam = start(frames, "keyframes.max_gap=1")
     track, overlap = slam.tracker.track, 0.74
