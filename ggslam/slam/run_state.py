@@ -187,8 +187,16 @@ class RunState:
         return self.corrections.moves[before : self.moves_followed]
 
     def follow_corrections(self) -> None:
-        """See `Slam`."""
-        raise NotImplementedError
+        """Everything that knows a pose of the camera goes along with corrections of the map made since the last frame.
+        """
+        published, moves = self.corrections.pending_moves(self.moves_followed)
+        self.moves_followed += len(moves)
+        for T_new_old in moves:
+            for holder in (self.tracker, self.locator, self.filters, self.policy, self.poses):
+                holder.move(T_new_old)
+        target = self.locator.target(published)
+        if target is not None and target is not self.tracker.state.target:
+            self.tracker.set_target(target)
 
     def join_parts(self) -> None:
         """Makes one part of those that the recording fell into, see `MapParts`; when there are no more frames."""

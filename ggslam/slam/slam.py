@@ -260,18 +260,6 @@ class Slam(RunState):
         self.times.tracking += seconds
         return Located(seen, located.joint, tracked, located.early)
 
-    def follow_corrections(self) -> None:
-        """Everything that knows a pose of the camera goes along with corrections of the map made since the last frame.
-        """
-        published, moves = self.corrections.pending_moves(self.moves_followed)
-        self.moves_followed += len(moves)
-        for T_new_old in moves:
-            for holder in (self.tracker, self.locator, self.filters, self.policy, self.poses):
-                holder.move(T_new_old)
-        target = self.locator.target(published)
-        if target is not None and target is not self.tracker.state.target:
-            self.tracker.set_target(target)
-
     def use_scale(self, scale: float) -> None:
         """Fits tracker and mapper to a scene of this size; before the first keyframe."""
         self.scale, self.tracker.settings = scale, scale_settings(self.config.tracking, scale)
@@ -346,7 +334,6 @@ class Slam(RunState):
     @opencv_errors("after the last frame")
     def finish(self, progress: Callable[[int, int], None] | None = None) -> SlamResult:
         """Final refinement (`refinement_steps`), then the result. `progress(done, total)` is called now and then."""
-        self.end_joining()
         refine(self, progress)
         return self.result()
 
