@@ -10,7 +10,8 @@ import numpy as np
 
 from ggslam.mapping.mapper import Mapper
 from ggslam.objects.same_object import LabelledVoxels, SameObjectTuning
-from ggslam.slam.loop_closing import Correction, LoopCloser
+from ggslam.slam.loop_closing import LoopCloser
+from ggslam.slam.loop_results import Correction
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.system.array_forms import Pose

@@ -20,7 +20,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.config import Config
-from ggslam.slam.loop_closing import LoopEvent
+from ggslam.slam.loop_results import LoopEvent
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable

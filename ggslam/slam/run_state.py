@@ -24,7 +24,7 @@ from ggslam.slam.filters.movers import MoverFilter
 from ggslam.slam.frame_locator import FrameLocator
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.joining import Joining
-from ggslam.slam.loop_closing import Correction
+from ggslam.slam.loop_results import Correction
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
 from ggslam.slam.map_removal import MapRemoval

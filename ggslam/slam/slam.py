@@ -28,7 +28,7 @@ from ggslam.scene.frame_checks import check_frame
 from ggslam.slam.filters.depth_edges import DepthEdges
 from ggslam.slam.frame_locator import Located
 from ggslam.slam.joining import JoiningTuning
-from ggslam.slam.loop_closing import Correction
+from ggslam.slam.loop_results import Correction
 from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.run_end import refine, result_of
 from ggslam.slam.run_state import RunState

@@ -22,6 +22,7 @@ from ggslam.slam.joining import Joining
 from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.map_corrections import MapCorrections
+from ggslam.slam.relocalization import Relocalizer
 from ggslam.slam.schedules import BesideTraining
 from ggslam.slam.slam import Slam
 from ggslam.tracking.gicp import GicpTarget
@@ -137,7 +138,7 @@ def test_a_lost_frame_goes_along_with_a_loop_that_is_closed_before_it_is_looked_
     track, apply, lost = slam.tracker.track, slam.corrections.apply, list[np.ndarray]()
     T_new_old, status = se3_exp(np.array([0.1, 0, 0, 0, 0.05, 0])), TrackingStatus.OK
 
-    def find(loops: LoopCloser, frame: Frame, tracking: TrackingResult) -> None:
+    def find(relocalizer: Relocalizer, frame: Frame, tracking: TrackingResult) -> None:
         lost.append(tracking.T_world_camera)
 
     def close(correction: object, loops: LoopCloser) -> None:
@@ -152,7 +153,7 @@ def test_a_lost_frame_goes_along_with_a_loop_that_is_closed_before_it_is_looked_
     with monkeypatch.context() as patch:
         patch.setattr(LoopCloser, "add", lambda *_: "a correction")
         patch.setattr(slam.corrections, "apply", close)
-        patch.setattr(LoopCloser, "find", find)
+        patch.setattr(Relocalizer, "find", find)
         slam.step(frames[2])
         assert slam.joining.is_under_way and not len(slam.corrections)
         status, before = TrackingStatus.LOST, slam.tracker.state.motion.T_world_camera.copy()
@@ -192,10 +193,10 @@ def test_a_lost_camera_is_looked_for_at_all_keyframes(frames: list[Frame], monke
     slam = start(frames, "keyframes.max_gap=1", "keyframes.min_overlap=0.01")
     known, track, status = list[int](), slam.tracker.track, TrackingStatus.OK
 
-    def find(loops: LoopCloser, *_: object) -> None:
-        known.append(len(loops))
+    def find(relocalizer: Relocalizer, *_: object) -> None:
+        known.append(len(relocalizer.loops))
 
-    monkeypatch.setattr(LoopCloser, "find", find)
+    monkeypatch.setattr(Relocalizer, "find", find)
     slam.tracker.track = lambda frame: dataclasses.replace(  # type: ignore[method-assign]
         track(frame), overlap=0.9, status=status
     )
