@@ -22,6 +22,7 @@ from ggslam.loops.pose_graph import SURE_INFORMATION, GraphResult, PoseGraph
 from ggslam.loops.revisits import Revisits
 from ggslam.loops.uncertainty import information_in_frame
 from ggslam.loops.verification import Verification
+from ggslam.mapping.keyframe import Keyframe
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
@@ -158,7 +159,7 @@ class LoopCloser:
             belated = self._found_at is not None and _moment(frame) < self._found_at[0]
             before, rigid = self._came_from(frame)
             begins = _moment(frame) in self._parts_begin
-            self._connect(tracking, belated, before, rigid, begins)
+            self._connect(T, tracking.information, before, belated, rigid, begins)
             if begins:
                 self._leave_behind(frame, belated)
             self.activity.add(T, tracking.median_depth_m, None if rigid or begins else before)
@@ -170,6 +171,20 @@ class LoopCloser:
             if correction is None and (self.activity.update() or belated or begins):
                 self._surface.arrange(self.activity.active)
         return correction
+
+    def add_unseen(self, keyframe: Keyframe) -> None:
+        """A keyframe was made of which nothing is known but its pose, which `poses` has: no frame is ever found at it,
+        and it closes no loop."""
+        with self._lock:
+            T, (before, rigid), self._begun = self.poses[keyframe.index], self._came_from(keyframe), None
+            moment = keyframe.frame_index if keyframe.instant is None else keyframe.instant
+            begins = moment in self._parts_begin
+            self._connect(T, None, before, rigid=rigid, begins=begins)
+            self._parts_begin.discard(moment)
+            median_depth_m = float(self.activity.median_depths[before]) if len(self) else 1.0
+            self.activity.add(T, median_depth_m, None if rigid or begins else before)
+            self._taken.append((keyframe.instant, keyframe.camera_number))
+            self.places.add(keyframe.index, self.places.empty_place())
 
     @contextmanager
     def work(self) -> Iterator[None]:
@@ -187,7 +202,7 @@ class LoopCloser:
             self._surface.arrange(correction.active, correction.T_world_camera)
             self._verified.clear()
 
-    def _came_from(self, frame: Frame) -> tuple[int, bool]:
+    def _came_from(self, frame: Frame | Keyframe) -> tuple[int, bool]:
         """The keyframe before that of a new frame, -1 without one, and whether it is of the same instant. In a rig that
         is one of this instant, else the same camera's of the instant before, else any of that."""
         newest = len(self) - 1
@@ -208,10 +223,13 @@ class LoopCloser:
             self.activity.leave()
             self._verified.clear()
 
-    def _connect(self, tracking: TrackingResult, belated: bool, before: int, rigid: bool, begins: bool) -> None:
-        """The new keyframe's node, tied to the one before it, or to where a lost camera was found again; where a part
-        begins, by a motion that nothing is known of."""
-        T, number = tracking.T_world_camera, len(self)
+    def _connect(
+        self, T: np.ndarray, alignment: np.ndarray | None, before: int, belated: bool = False, rigid: bool = False,
+        begins: bool = False,
+    ) -> None:  # fmt: skip
+        """The new keyframe's node, at T_world_camera `T` by an alignment's information, tied to the one before it, or
+        to where a lost camera was found again; where a part begins, by a motion that nothing is known of."""
+        number = len(self)
         self.graph.add_node(T)
         found = self._found_at is not None and not belated
         if self._found_at is not None and found:
@@ -220,8 +238,8 @@ class LoopCloser:
         if before >= 0:
             T_before_world = inverse(self.poses[before])
             information = SURE_INFORMATION  # without an alignment, what drift allows for is all that is unsure
-            if tracking.information is not None:
-                information = information_in_frame(tracking.information, T_before_world)
+            if alignment is not None:
+                information = information_in_frame(alignment, T_before_world)
             self.graph.add_odometry(before, number, T_before_world @ T, information, found, rigid, unknown=begins)
         if begins:
             self.parts.begin()

@@ -83,12 +83,14 @@ class MapCorrections:
         and trains both ends of the loop."""
         ends = correction.kept & correction.active
         self._mapper.move_keyframes(correction.T_new_old)
-        if self._pager is not None:
-            self._pager.move_keyframes(correction.T_new_old)
-            self._pager.bring_ends(ends)
-        with self.publishing:
-            loops.apply(correction)
-            self.moves.append(correction.T_new_old[-1])
+        try:
+            if self._pager is not None:
+                self._pager.move_keyframes(correction.T_new_old)
+                self._pager.bring_ends(ends)
+        finally:  # the map has moved: whatever fails, everything else follows
+            with self.publishing:
+                self.moves.append(correction.T_new_old[-1])
+                loops.apply(correction)
         self._unite_objects(correction)
         self._mapper.retrain_loop_ends(sorted(ends), sorted(correction.doubted), loops.settings.repair_iterations)
 

@@ -52,7 +52,7 @@ class TrimTuning(Tuning):
     """Keyframes between two calls that return freed memory. A call takes milliseconds."""
 
 
-@savable(not_saved="camera config context pager start_notes schedule joining", after="use_scale_again")
+@savable(not_saved="camera config context pager start_notes end_notes schedule joining", after="use_scale_again")
 class Slam(RunState):
     """Synchronous SLAM: each step tracks one frame, maybe makes a keyframe of it, and trains the map a fixed number
     of iterations. Deterministic for a given configuration and machine.
@@ -194,6 +194,7 @@ class Slam(RunState):
         tracking.points.read()  # what waits for the GPU is done in this thread
         noise = self.tracker.noise  # frames change it
 
+        @opencv_errors(f"frame {frame.index}")
         def join() -> Correction | None:
             self.corrections.add_points(tracking)
             return self._look_for_loop(frame, tracking, noise)
@@ -207,7 +208,7 @@ class Slam(RunState):
         shown = 0.0 if self.tracker.target is None else tracking.overlap
         waits = shown < JoiningTuning.min_overlap or self.locator.part_start.target is not None
         self.corrections.hold_target()
-        self.joining.start(join, finish)
+        self.joining.start(join, finish, self.give_up_joining)
         train()
         if waits:
             self.end_joining()
@@ -338,6 +339,6 @@ class Slam(RunState):
         return self.result()
 
     def result(self) -> SlamResult:
-        """What there is so far. The first call settles the objects: it is for the end."""
-        self.end_joining()
+        """What there is so far, also after an error. The first call settles the objects: it is for the end."""
+        self.settle()
         return result_of(self)

@@ -43,11 +43,13 @@ class SideThread(Generic[Result]):
 
     def take(self) -> Result:
         """The result of the piece that was started; waits for it, and raises what it raised."""
-        work, self._work = self._work, None
+        work = self._work
         assert work is not None
         if self._process != os.getpid():
+            self._work = None
             return work()
         result, error = self._done.get()
+        self._work = None  # not if waiting was interrupted: the result is still to be taken
         if error is not None:
             raise error
         return result  # type: ignore[return-value]
