@@ -36,7 +36,7 @@ from ggslam.slam.schedules import NewKeyframe
 from ggslam.system.opencv import opencv_errors
 from ggslam.system.process_memory import trim
 from ggslam.system.savable import savable
-from ggslam.system.spent import part
+from ggslam.system.spent import count_beside, part
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.settings import DepthNoise
@@ -196,8 +196,11 @@ class Slam(RunState):
 
         @opencv_errors(f"frame {frame.index}")
         def join() -> Correction | None:
+            start = time.perf_counter()
             self.corrections.add_points(tracking)
-            return self._look_for_loop(frame, tracking, noise)
+            correction = self._look_for_loop(frame, tracking, noise)
+            self.times.beside += time.perf_counter() - start  # no other thread writes it
+            return correction
 
         def finish(correction: Correction | None) -> None:
             self.corrections.show_target()
@@ -208,7 +211,7 @@ class Slam(RunState):
         shown = 0.0 if self.tracker.target is None else tracking.overlap
         waits = shown < JoiningTuning.min_overlap or self.locator.part_start.target is not None
         self.corrections.hold_target()
-        self.joining.start(join, finish, self.give_up_joining)
+        self.joining.start(count_beside(join, "mapping"), finish, self.give_up_joining)
         train()
         if waits:
             self.end_joining()
