@@ -33,7 +33,7 @@ from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.run_end import refine, result_of
 from ggslam.slam.run_state import RunState
 from ggslam.slam.schedules import NewKeyframe
-from ggslam.system.opencv import opencv_errors
+from ggslam.system.opencv import opencv_errors, raise_as_ours
 from ggslam.system.process_memory import trim
 from ggslam.system.savable import savable
 from ggslam.system.spent import count_beside, part
@@ -93,9 +93,8 @@ class Slam(RunState):
         """
         try:
             return self._step(frames)
-        except cv2.error:
-            with opencv_errors(f"frame {frames[0].index}"):
-                raise
+        except cv2.error as error:
+            raise_as_ours(error, f"frame {frames[0].index}")
 
     def _step(self, frames: Sequence[Frame]) -> list[StepReport]:
         start = time.perf_counter()
