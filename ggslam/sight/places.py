@@ -22,6 +22,7 @@ from ggslam.abi.core import (
     DepthPlacesJob,
     OtherPlacesView,
     PlacesEvidenceJob,
+    PlacesRule,
     PlacesView,
 )
 from ggslam.native.loader import NativeContext, load_library
@@ -192,18 +193,14 @@ def compare(
     alive: list[np.ndarray] = []
     asked = (OtherPlacesView * len(others))()
     for one, other in zip(asked, others, strict=True):
-        one.places = _places(other, alive)
+        one.places = native_places(other, alive)
         T = (inverse(other.T_world_camera) @ view.T_world_camera)[:3].astype(np.float32)
         one.T_this_view[:] = T.ravel().tolist()
     found = np.empty((len(others), 5, *view.depth.shape), bool)
-    job = PlacesEvidenceJob(_places(view, alive), ctypes.addressof(asked), len(others))
+    job = PlacesEvidenceJob(native_places(view, alive), ctypes.addressof(asked), len(others))
     if moved is not None:
         job.moved = address(_of_places(moved, np.uint8, view, alive))
-    job.margin = margin.native()
-    t = PlaceTuning
-    job.rough, job.least_share, job.nearest = t.rough_sigmas, t.min_noise_share, t.nearest_factor
-    job.every, job.fewest = t.stride, t.min_places
-    job.found = address(found)
+    job.rule, job.found = native_rule(margin), address(found)
     load_library().ggslam_places_evidence(context.handle, ctypes.byref(job))
     return [PairEvidence(*images) for images in found]
 
@@ -218,8 +215,20 @@ def _depth_places(depth: np.ndarray, factor: int, reach: int, context: NativeCon
     return found
 
 
-def _places(view: CoarseView, alive: list[np.ndarray]) -> PlacesView:
-    """A view as the core takes it; `alive` gets arrays that must outlive it."""
+def native_rule(margin: Margin) -> PlacesRule:
+    """How views are compared, as the core takes it."""
+    t = PlaceTuning
+    return PlacesRule(
+        margin.native(), t.rough_sigmas, t.min_noise_share, t.nearest_factor, t.stride, t.min_places
+    )  # fmt: skip
+
+
+def native_places(view: CoarseView, alive: list[np.ndarray]) -> PlacesView:
+    """A view as the core takes it; `alive` gets arrays that must outlive it.
+
+    Raises:
+        ValueError: an array has another shape than the view's camera.
+    """
     camera = view.camera
     images = [_of_places(image, np.float32, view, alive) for image in (view.depth, view.near, view.far)]
     images += [_of_places(image, np.uint8, view, alive) for image in (view.whole, view.smooth)]

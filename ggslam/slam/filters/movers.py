@@ -11,15 +11,18 @@ import numpy as np
 from ggslam.geometry.moved_depth import shift_between
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor, grow
+from ggslam.movers.keyframe_views import KeyframeViews
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
-from ggslam.movers.trail import gone_since
+from ggslam.movers.trail import TrailTuning, fewest_gone, gone_since
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
+from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sight.margin import Margin
-from ggslam.sight.places import CoarseView, DepthPlaces
+from ggslam.sight.passed_voxels import passed_in_voxels
+from ggslam.sight.places import CoarseView
 from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
@@ -46,7 +49,7 @@ DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
 
 
-@savable(not_saved="_reads_masks _noise _margin _places context")
+@savable(not_saved="_reads_masks _noise _margin _views context")
 class MoverFilter(FrameFilter):
     """Detects movers in each located frame, if the settings ask for it.
 
@@ -69,7 +72,7 @@ class MoverFilter(FrameFilter):
         """The movers one by one."""
         self._noise: DepthNoise | None = None
         self._margin = _margin(settings, DepthNoise())
-        self._places: dict[int, tuple[np.ndarray, DepthPlaces]] = {}  # of keyframes, and of which depth image
+        self._views = KeyframeViews()
         self._before = None
         """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
 
@@ -174,25 +177,26 @@ class MoverFilter(FrameFilter):
         Returns:
             Of each, bool [H, W]; None: nothing.
         """
-        settings, camera, trail = self.detector.settings, newest.camera, self.detector.trail
+        settings, trail, margin = self.detector.settings, self.detector.trail, self._margin
+        camera, shape = newest.camera, newest.depth.shape
+        fitting = [k for k in earlier if k.depth.shape == shape]
+        if not fitting:
+            return [None] * len(earlier)
         factor = coarse_factor(camera, settings)
-        view = CoarseView.of(newest.depth, camera, factor, T_world_newest, self._margin, self.context)
-        found: list[np.ndarray | None] = []
-        places: dict[int, tuple[np.ndarray, DepthPlaces]] = {}
-        for k in earlier:
-            shape = k.depth.shape
-            if shape != newest.depth.shape:
-                found.append(None)
-                continue
-            of, known = self._places.get(k.index, (None, None))
-            if of is not k.depth or known is None or known.camera != view.camera:
-                known = DepthPlaces.of(k.depth_m(), camera, factor, self.context)
-            places[k.index] = k.depth, known
-            old = known.view(k.T_world_camera, self._margin)
-            part = gone_since(old, view, trail, k.mask, shape, factor, self._margin, settings, self.context)
-            found.append(None if part is None else grow(part, DetectorTuning.mask_margin))
-        self._places = places
-        return found
+        view = CoarseView.of(newest.depth, camera, factor, T_world_newest, margin, self.context)
+        kept = self._views.of(fitting, camera, factor, margin, self.context)
+        evidence = passed_in_voxels(
+            kept, inverse(np.array([k.T_camera_world for k in fitting])), view, trail.keys, TrailTuning.voxel_m,
+            [fewest_gone(k.mask, settings) for k in fitting], margin, self.context,
+        )  # fmt: skip
+        found: dict[int, np.ndarray] = {}
+        for k, places, said in zip(fitting, kept, evidence, strict=True):
+            if said is not None:
+                old = replace(places.view, T_world_camera=k.T_world_camera)
+                part = gone_since(old, said, trail, k.mask, shape, factor, settings)
+                if part is not None:
+                    found[k.index] = grow(part, DetectorTuning.mask_margin)
+        return [found.get(k.index) for k in earlier]
 
     def notes(self, frames: int) -> list[str]:
         """What the user should know of a run of so many frames."""
