@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -14,6 +13,7 @@ from ggslam.geometry.voxels import neighbour_step, voxel_keys
 from ggslam.movers.segments import Gathering, gather
 from ggslam.movers.settings import MoverSettings
 from ggslam.scene.poses import transform_points
+from ggslam.sight.passed_voxels import PassedParts
 from ggslam.sight.places import CoarseView, PairEvidence
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
@@ -62,9 +62,10 @@ class Trail:
         return (self.keys[at] == keys).reshape(view.depth.shape) & (view.depth > 0)
 
 
-def fewest_gone(segments: np.ndarray | None, settings: MoverSettings) -> int:
-    """Places of a view, in the trail or connected to those that are, without which nothing of it has gone."""
-    return settings.min_pixels if segments is None else math.ceil(settings.min_pixels / 4)
+def may_be_gone(passed: PassedParts, segments: np.ndarray | None, settings: MoverSettings) -> bool:
+    """Whether enough of a view is looked past for something of it to be gone, see `gone_since`."""
+    large_enough = segments is not None or passed.largest >= settings.min_pixels
+    return passed.places >= settings.min_pixels / 4 and large_enough
 
 
 def gone_since(

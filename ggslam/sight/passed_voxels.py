@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -32,10 +33,25 @@ class KeptPlaces:
         """As the core takes it."""
 
 
+@dataclass(frozen=True)
+class PassedParts:
+    """What a newer view says of an earlier one of which it looks past places in voxels.
+
+    Attributes:
+        evidence: as `compare` has it.
+        places: in all parts of which enough lies in the voxels...
+        largest: ...and in the largest one.
+    """
+
+    evidence: PairEvidence
+    places: int
+    largest: int
+
+
 def passed_in_voxels(
     earlier: Sequence[KeptPlaces], T_world_earlier: np.ndarray, newest: CoarseView, keys: np.ndarray, voxel_m: float,
-    fewest: Sequence[int], margin: Margin, context: NativeContext,
-) -> list[PairEvidence | None]:  # fmt: skip
+    least_share: float, margin: Margin, context: NativeContext,
+) -> list[PassedParts | None]:  # fmt: skip
     """What a newer view says of earlier ones, where it looks past some of their places in voxels.
 
     Args:
@@ -44,12 +60,12 @@ def passed_in_voxels(
         newest: the newer view.
         keys: int64, sorted, see `ggslam.geometry.voxels`.
         voxel_m: edge of a voxel, metres.
-        fewest: of each view, how many places have to be looked past: in voxels, or connected to those that are.
+        least_share: of a part, of connected places that are looked past, that has to lie in the voxels.
         margin: see there.
         context: that it is computed in.
 
     Returns:
-        As `compare` has it; None where the places are fewer.
+        Of each; None without such a part.
 
     Raises:
         ValueError: an array has another shape than its view's camera.
@@ -60,13 +76,15 @@ def passed_in_voxels(
     views = (PlacesView * len(earlier))(*[one.native for one in earlier])
     T_world = np.ascontiguousarray(T_world_earlier[:, :3], float)
     T_newest = np.ascontiguousarray((inverse(newest.T_world_camera) @ T_world_earlier)[:, :3], np.float32)
-    least, keys = np.array(fewest, np.int32), np.ascontiguousarray(keys, np.int64)
+    keys = np.ascontiguousarray(keys, np.int64)
     found = np.empty((len(earlier), 5, *earlier[0].view.depth.shape), bool)
-    passed = np.empty(len(earlier), np.int32)
+    passed = np.empty((len(earlier), 2), np.int32)
     job = PassedVoxelsJob(
-        ctypes.addressof(views), address(T_world), address(T_newest), address(least), len(earlier),
-        native_places(newest, alive), address(keys), len(keys), voxel_m, native_rule(margin), address(passed),
-        address(found),
+        ctypes.addressof(views), address(T_world), address(T_newest), len(earlier), native_places(newest, alive),
+        address(keys), len(keys), voxel_m, least_share, native_rule(margin), address(passed), address(found),
     )  # fmt: skip
     load_library().ggslam_passed_voxels(context.handle, ctypes.byref(job))
-    return [PairEvidence(*found[i]) if count else None for i, count in enumerate(passed.tolist())]
+    return [
+        PassedParts(PairEvidence(*found[i]), places, largest) if places else None
+        for i, (places, largest) in enumerate(passed.tolist())
+    ]

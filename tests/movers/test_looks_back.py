@@ -21,7 +21,6 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sight.places import CoarseView, compare
 from ggslam.slam.filters.movers import MoverFilter
-from ggslam.tracking.settings import DepthNoise
 
 CAMERA, SMALL = Camera(213, 160, 170.0, 171.0, 105.0, 81.0), Camera(96, 80, 90.0, 90.0, 47.0, 39.0)
 

@@ -117,21 +117,25 @@ struct PlacesEvidenceJob {
   uint8_t* found;
 };
 
+// Places of a view that another one looks past, in parts of which enough lies in some voxels.
+struct PassedPlaces {
+  int32_t all, largest;  // in all such parts, and in the largest one
+};
+
 // What a newer view says of earlier ones where it looks past places of theirs that lie in some voxels.
 struct PassedVoxelsJob {
-  const PlacesView* earlier;        // [count], all of one size
-  const double* T_world_earlier;    // [count, 12] rows of [R t]
-  const float* T_newest_earlier;    // [count, 12]
-  const int32_t* fewest;            // [count] places that have to be looked past, see `passed`
+  const PlacesView* earlier;      // [count], all of one size
+  const double* T_world_earlier;  // [count, 12] rows of [R t]
+  const float* T_newest_earlier;  // [count, 12]
   int32_t count;
   PlacesView newest;
-  const int64_t* voxels;            // [voxel_count] keys, sorted: x, y, z from the highest bits to the lowest, 21 bits each,
-  int64_t voxel_count;              // floor(coordinate / voxel) + 2^20
-  double voxel;                     // edge, metres
+  const int64_t* voxels;  // [voxel_count] sorted keys: floor(coordinate / voxel) + 2^20 of x, y, z in 21 bits each, x in
+  int64_t voxel_count;    // the highest
+  double voxel;           // edge, metres
+  double least_seeds;     // share of a part, of connected places that are looked past, that lies in the voxels
   PlacesRule rule;
-  // Results. [count]: the places that are looked past and lie in the voxels, and those looked past that are connected to
-  // them; 0 where they are less than `fewest`. [count, 5, height, width]: as of `PlacesEvidenceJob`, of those with places.
-  int32_t* passed;
+  // Results. [count]; and [count, 5, height, width], as of `PlacesEvidenceJob`, of views with such places.
+  PassedPlaces* passed;
   uint8_t* found;
 };
 

@@ -15,7 +15,7 @@ from ggslam.movers.keyframe_views import KeyframeViews
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
-from ggslam.movers.trail import TrailTuning, fewest_gone, gone_since
+from ggslam.movers.trail import TrailTuning, gone_since, may_be_gone
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
@@ -185,15 +185,15 @@ class MoverFilter(FrameFilter):
         factor = coarse_factor(camera, settings)
         view = CoarseView.of(newest.depth, camera, factor, T_world_newest, margin, self.context)
         kept = self._views.of(fitting, camera, factor, margin, self.context)
-        evidence = passed_in_voxels(
-            kept, inverse(np.array([k.T_camera_world for k in fitting])), view, trail.keys, TrailTuning.voxel_m,
-            [fewest_gone(k.mask, settings) for k in fitting], margin, self.context,
-        )  # fmt: skip
+        poses = inverse(np.array([k.T_camera_world for k in fitting]))
+        passed = passed_in_voxels(
+            kept, poses, view, trail.keys, TrailTuning.voxel_m, TrailTuning.min_in_trail, margin, self.context
+        )
         found: dict[int, np.ndarray] = {}
-        for k, places, said in zip(fitting, kept, evidence, strict=True):
-            if said is not None:
-                old = replace(places.view, T_world_camera=k.T_world_camera)
-                part = gone_since(old, said, trail, k.mask, shape, factor, settings)
+        for k, T_world_camera, one, parts in zip(fitting, poses, kept, passed, strict=True):
+            if parts is not None and may_be_gone(parts, k.mask, settings):
+                old = replace(one.view, T_world_camera=T_world_camera)
+                part = gone_since(old, parts.evidence, trail, k.mask, shape, factor, settings)
                 if part is not None:
                     found[k.index] = grow(part, DetectorTuning.mask_margin)
         return [found.get(k.index) for k in earlier]

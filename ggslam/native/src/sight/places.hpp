@@ -89,9 +89,10 @@ GGSLAM_DECLARE_KERNEL(void project_places(const PlacesView& view, const OtherPla
 // What the other one has there: near, far, known and smooth.
 GGSLAM_DECLARE_KERNEL(void look_up_places(const PlacesView& view, const PlacesView& other,
                                           const ProjectedPlaces& places))
-// Flags the places that the other view may look past, whatever share of the noise is measured, into `known`.
-GGSLAM_DECLARE_KERNEL(void flag_perhaps_passed(const PlacesRule& rule, const PlacesView& view, const PlacesView& other,
-                                               const ProjectedPlaces& places))
+// Flags the places that the other view may look past, whatever share of the noise is measured; `beyond`: what is near
+// about each place of the other view where it is whole, 0 elsewhere.
+GGSLAM_DECLARE_KERNEL(void flag_perhaps_passed(const PlacesRule& rule, const PlacesView& view, const float* beyond,
+                                               const ProjectedPlaces& places, uint8_t* flags))
 // The results by one other view, [5, count]; `share`: of a pixel's noise, where both views are smooth.
 GGSLAM_DECLARE_KERNEL(void judge_places(const PlacesRule& rule, float share, std::size_t count,
                                         const ProjectedPlaces& places, uint8_t* found))

@@ -12,7 +12,11 @@ constexpr float kRounding = 0.999f;  // a margin that rounding does not make lar
 
 }  // namespace
 
-void project_places(const PlacesView& a, const OtherPlacesView& other, const ProjectedPlaces& out) {
+void project_places(const PlacesView& view, const OtherPlacesView& other_, const ProjectedPlaces& places) {
+  // Copies, which nothing that is written can be a part of: the compiler takes many places at once.
+  const PlacesView a = view;
+  const OtherPlacesView other = other_;
+  const ProjectedPlaces out = places;
   const PlacesView& b = other.places;
   const float* T = other.T_this_view;
   const float right = static_cast<float>(b.width) - 0.5f, low = static_cast<float>(b.height) - 0.5f;
@@ -49,14 +53,18 @@ void look_up_places(const PlacesView& a, const PlacesView& b, const ProjectedPla
   }
 }
 
-void flag_perhaps_passed(const PlacesRule& rule, const PlacesView& a, const PlacesView& b, const ProjectedPlaces& out) {
-  const SightMargin margin = rule.margin;  // a copy: what is written may not change it
+void flag_perhaps_passed(const PlacesRule& rule, const PlacesView& a, const float* beyond,
+                         const ProjectedPlaces& places, uint8_t* flags) {
+  const SightMargin margin = rule.margin;  // copies: what is written may not change them
+  const ProjectedPlaces out = places;
+  const uint8_t* smooth = a.smooth;
   const std::size_t count = static_cast<std::size_t>(a.height) * a.width;
   const float least = kRounding * std::min(rule.least_share, rule.rough), rough = kRounding * rule.rough;
   for (std::size_t i = 0; i < count; ++i) {
-    const int at = out.where[i] < 0 ? 0 : out.where[i];
-    const float z = out.z[i], slack = kRounding * margin_at(margin, z, a.smooth[i] ? least : rough);
-    out.known[i] = (out.where[i] >= 0) & (b.whole[at] != 0) & (b.near[at] > z + slack);
+    const int at = out.where[i];
+    const float near = beyond[at < 0 ? 0 : at], z = out.z[i];
+    const float slack = kRounding * margin_at(margin, z, smooth[i] ? least : rough);
+    flags[i] = (at >= 0) & (near > z + slack);
   }
 }
 
