@@ -60,11 +60,10 @@ void flag_perhaps_passed(const PlacesRule& rule, const PlacesView& a, const floa
   const uint8_t* smooth = a.smooth;
   const std::size_t count = static_cast<std::size_t>(a.height) * a.width;
   const float least = kRounding * std::min(rule.least_share, rule.rough), rough = kRounding * rule.rough;
+  for (std::size_t i = 0; i < count; ++i) out.near[i] = out.where[i] < 0 ? 0.f : beyond[out.where[i]];
   for (std::size_t i = 0; i < count; ++i) {
-    const int at = out.where[i];
-    const float near = beyond[at < 0 ? 0 : at], z = out.z[i];
-    const float slack = kRounding * margin_at(margin, z, smooth[i] ? least : rough);
-    flags[i] = (at >= 0) & (near > z + slack);
+    const float z = out.z[i], slack = kRounding * margin_at(margin, z, smooth[i] ? least : rough);
+    flags[i] = (z > 0) & (out.near[i] > z + slack);
   }
 }
 
