@@ -62,10 +62,10 @@ class Trail:
         return (self.keys[at] == keys).reshape(view.depth.shape) & (view.depth > 0)
 
 
-def may_be_gone(passed: PassedParts, segments: np.ndarray | None, settings: MoverSettings) -> bool:
-    """Whether enough of a view is looked past for something of it to be gone, see `gone_since`."""
-    large_enough = segments is not None or passed.largest >= settings.min_pixels
-    return passed.places >= settings.min_pixels / 4 and large_enough
+def which_may_be_gone(passed: PassedParts, has_segments: np.ndarray, settings: MoverSettings) -> list[int]:
+    """The views of which enough is looked past for something to be gone, see `gone_since`; `has_segments`: bool [n]."""
+    large_enough = has_segments | (passed.largest >= settings.min_pixels)
+    return np.flatnonzero((passed.places >= settings.min_pixels / 4) & large_enough).tolist()
 
 
 def gone_since(

@@ -35,27 +35,31 @@ class KeptPlaces:
 
 @dataclass(frozen=True)
 class PassedParts:
-    """What a newer view says of an earlier one of which it looks past places in voxels.
+    """What a newer view says of n earlier ones where it looks past places of theirs in voxels.
 
     Attributes:
-        evidence: as `compare` has it.
-        places: in all parts of which enough lies in the voxels...
-        largest: ...and in the largest one.
+        places: int32 [n], in all parts of each of which enough lies in the voxels...
+        largest: int32 [n], ...and in the largest one.
+        found: bool [n, 5, h, w], see `evidence`.
     """
 
-    evidence: PairEvidence
-    places: int
-    largest: int
+    places: np.ndarray
+    largest: np.ndarray
+    found: np.ndarray
+
+    def evidence(self, view: int) -> PairEvidence:
+        """What is said of a view that has such places, as `compare` has it."""
+        return PairEvidence(*self.found[view])
 
 
 def passed_in_voxels(
     earlier: Sequence[KeptPlaces], T_world_earlier: np.ndarray, newest: CoarseView, keys: np.ndarray, voxel_m: float,
     least_share: float, margin: Margin, context: NativeContext,
-) -> list[PassedParts | None]:  # fmt: skip
+) -> PassedParts:  # fmt: skip
     """What a newer view says of earlier ones, where it looks past some of their places in voxels.
 
     Args:
-        earlier: views of one size.
+        earlier: n views of one size, at least one.
         T_world_earlier: float64 [n, 4, 4], where they are.
         newest: the newer view.
         keys: int64, sorted, see `ggslam.geometry.voxels`.
@@ -64,14 +68,9 @@ def passed_in_voxels(
         margin: see there.
         context: that it is computed in.
 
-    Returns:
-        Of each; None without such a part.
-
     Raises:
         ValueError: an array has another shape than its view's camera.
     """
-    if not earlier:
-        return []
     alive: list[np.ndarray] = []
     views = (PlacesView * len(earlier))(*[one.native for one in earlier])
     T_world = np.ascontiguousarray(T_world_earlier[:, :3], float)
@@ -84,7 +83,4 @@ def passed_in_voxels(
         address(keys), len(keys), voxel_m, least_share, native_rule(margin), address(passed), address(found),
     )  # fmt: skip
     load_library().ggslam_passed_voxels(context.handle, ctypes.byref(job))
-    return [
-        PassedParts(PairEvidence(*found[i]), places, largest) if places else None
-        for i, (places, largest) in enumerate(passed.tolist())
-    ]
+    return PassedParts(passed[:, 0], passed[:, 1], found)

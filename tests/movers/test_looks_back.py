@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import FrameType
 
 import numpy as np
 import pytest
@@ -160,3 +163,32 @@ def test_images_of_several_sizes_are_looked_at_with_their_own() -> None:
     other = Room(1, Camera(64, 48, 50.0, 50.0, 31.5, 23.5)).frame(10, 5, masks=False)
     assert found_by.gone_since(earlier, other, np.eye(4)) == [None] * 6
 
+
+def calls_of(look: Callable[[], object]) -> int:
+    """How many functions of Python it calls."""
+    calls = 0
+
+    def count(_: FrameType, event: str, __: object) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    sys.setprofile(count)
+    try:
+        look()
+    finally:
+        sys.setprofile(None)
+    return calls
+
+
+def test_a_look_calls_no_more_functions_with_more_keyframes() -> None:
+    room, found_by = Room(3), MoverFilter(MoverSettings(), True, CONTEXT)
+    earlier = [room.keyframe(n, 9, masks=False) for n in range(48)]
+    room.add_to(found_by, earlier[0], 9)
+    for k in earlier[1:]:  # all see the trail, and the newest one as well
+        k.depth, k.T_camera_world = earlier[0].depth, earlier[0].T_camera_world
+    newest, T = replace(room.frame(48, 9, masks=False), depth=earlier[0].depth_m()), earlier[0].T_world_camera
+    counts = []
+    for number in (3, 48):
+        assert found_by.gone_since(earlier[:number], newest, T) == [None] * number
+        counts.append(calls_of(lambda n=number: found_by.gone_since(earlier[:n], newest, T)))  # type: ignore[misc]
+    assert 0 < counts[1] <= counts[0]

@@ -15,7 +15,7 @@ from ggslam.movers.keyframe_views import KeyframeViews
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
-from ggslam.movers.trail import TrailTuning, gone_since, may_be_gone
+from ggslam.movers.trail import TrailTuning, gone_since, which_may_be_gone
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse
@@ -190,12 +190,11 @@ class MoverFilter(FrameFilter):
             kept, poses, view, trail.keys, TrailTuning.voxel_m, TrailTuning.min_in_trail, margin, self.context
         )
         found: dict[int, np.ndarray] = {}
-        for k, T_world_camera, one, parts in zip(fitting, poses, kept, passed, strict=True):
-            if parts is not None and may_be_gone(parts, k.mask, settings):
-                old = replace(one.view, T_world_camera=T_world_camera)
-                part = gone_since(old, parts.evidence, trail, k.mask, shape, factor, settings)
-                if part is not None:
-                    found[k.index] = grow(part, DetectorTuning.mask_margin)
+        for i in which_may_be_gone(passed, np.array([k.mask is not None for k in fitting]), settings):
+            k, old = fitting[i], replace(kept[i].view, T_world_camera=poses[i])
+            part = gone_since(old, passed.evidence(i), trail, k.mask, shape, factor, settings)
+            if part is not None:
+                found[k.index] = grow(part, DetectorTuning.mask_margin)
         return [found.get(k.index) for k in earlier]
 
     def notes(self, frames: int) -> list[str]:
