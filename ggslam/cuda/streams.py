@@ -68,16 +68,17 @@ class Pace:
 
     def __init__(self, device: torch.device, ahead: int = 2) -> None:
         self._device, self._ahead = device, ahead
-        self._ends: deque[torch.cuda.Event] = deque()
+        self._ends: deque[torch.cuda.Event] = deque()  # of the pieces under way, the oldest first
+        self._passed: torch.cuda.Event | None = None
 
     def piece_ends(self) -> None:
         """A piece of work has been started. Waits for the one `ahead` pieces before."""
         if self._device.type != "cuda":
             return
-        end = torch.cuda.Event()
+        end = self._passed or torch.cuda.Event()
         end.record(torch.cuda.current_stream(self._device))  # a new thread may be on another device
         self._ends.append(end)
         if len(self._ends) > self._ahead:
-            before = self._ends.popleft()
-            if not before.query():
-                before.synchronize()
+            self._passed = self._ends.popleft()
+            if not self._passed.query():
+                self._passed.synchronize()

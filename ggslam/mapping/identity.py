@@ -307,10 +307,10 @@ class IdentityLearner(ABC):
                 del self._pools[next(iter(self._pools))]
         return pool.take(self.settings.pixels)
 
-    def _pulls(self, gaussians: GaussianMap) -> bool:
-        """Whether this step has the 3-D loss."""
+    def pulls(self, gaussians: GaussianMap) -> bool:
+        """Whether the next step has the 3-D loss."""
         s = self.settings.neighbours
-        return s.weight > 0 and self.times.count % s.every == 0 and len(gaussians) > 1
+        return s.weight > 0 and self.times.count % s.every == 0 and gaussians.count > 1
 
     # --- results ------------------------------------------------------------------------------------------------------
 

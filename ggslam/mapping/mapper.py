@@ -261,10 +261,10 @@ class Mapper(ABC):
         return False
 
     def keep_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:
-        """Keeps a frame that is no keyframe, while there is memory for it, if it can be compared with the map;
-        arguments as the attributes of `BetweenFrame`."""
-        wanted = self.keeps_between and self._is_plain(self.keyframes[keyframe])
-        if wanted and sum(kept.color.nbytes for kept in self.between) < BetweenTuning.kept_bytes:
+        """Where `keeps_between`: keeps a frame that is no keyframe, while there is memory for it, if it can be compared
+        with the map; arguments as the attributes of `BetweenFrame`."""
+        kept_bytes = sum(kept.color.nbytes for kept in self.between)
+        if self._is_plain(self.keyframes[keyframe]) and kept_bytes < BetweenTuning.kept_bytes:
             self._add_between(frame, keyframe, T_keyframe_camera)
 
     def _add_between(self, frame: Frame, keyframe: int, T_keyframe_camera: np.ndarray) -> None:

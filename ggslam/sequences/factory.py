@@ -30,6 +30,7 @@ from ggslam.sequences.formats.stray import StrayFormat
 from ggslam.sequences.formats.transforms_json import TransformsFormat
 from ggslam.sequences.formats.tum import TumFormat
 from ggslam.sequences.formats.vmap import VmapFormat
+from ggslam.sequences.live import is_live
 from ggslam.sequences.masks import find_masks
 from ggslam.sequences.own_camera import read_own_camera, use_own_camera
 from ggslam.sequences.pose_conventions import convert_poses
@@ -237,6 +238,11 @@ def _check_kind(path: Path) -> None:
         if not os.path.isfile(path) and not os.path.isdir(path):  # noqa: PTH112, PTH113
             raise SequenceError(f"{path}: is neither a folder nor a regular file (a pipe, a socket or a device?)")
         return
+    if is_live(path):
+        raise SequenceError(
+            f"{path}: is a live camera, which `ggslam run` and `ggslam volumes --live` take; the former with --record "
+            "FOLDER keeps what it shows"
+        )
     raise SequenceError(f"{path}: {why_missing(path)}")
 
 

@@ -37,8 +37,8 @@ def filter_classes() -> list[type[FrameFilter]]:
 
 @savable()
 class FilterChain(FrameFilter):
-    """Applies filters in a row. Each receives the frame as the previous one returned it. Hooks that every frame goes
-    through are not called where they do nothing.
+    """Applies filters in a row. Each receives the frame as the previous one returned it. Hooks that every frame or
+    keyframe goes through are not called where they do nothing.
 
     Args:
         filters: in their order.
@@ -109,11 +109,13 @@ class FilterChain(FrameFilter):
 
     def before_insertion(self, removal: MapRemoval, newest: Frame, tracking: TrackingResult) -> None:
         for one in self.filters:
-            one.before_insertion(removal, newest, tracking)
+            if type(one).before_insertion is not FrameFilter.before_insertion:
+                one.before_insertion(removal, newest, tracking)
 
     def after_insertion(self, removal: MapRemoval, newest: Frame) -> None:
         for one in self.filters:
-            one.after_insertion(removal, newest)
+            if type(one).after_insertion is not FrameFilter.after_insertion:
+                one.after_insertion(removal, newest)
 
     def loop_closed(self) -> None:
         for one in self.filters:

@@ -19,7 +19,7 @@ from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 _NAMES = {status: status.value for status in TrackingStatus}  # asked for with every frame
 
 
-@savable(growing="frames", check="check")
+@savable(not_saved="_T_anchor_world", growing="frames", check="check", after="_invert_anchor")
 class FramePoses:
     """Poses of the frames so far."""
 
@@ -31,6 +31,7 @@ class FramePoses:
         self.keyframes_made = 0
         """Keyframes so far, those included that still wait for the mapper."""
         self._anchor, self._T_world_anchor = -1, np.eye(4)  # number of a keyframe, its pose as tracked
+        self._invert_anchor()
 
     def check(self) -> None:
         """Raises FormatError if a frame hangs on a keyframe that is not there: it may come from a file."""
@@ -45,6 +46,7 @@ class FramePoses:
     def anchor_to(self, keyframe: int, T_world_camera: np.ndarray) -> None:
         """From now on poses are remembered relative to a keyframe with the pose [4, 4]."""
         self._anchor, self._T_world_anchor = keyframe, T_world_camera.copy()
+        self._invert_anchor()
 
     @property
     def anchor(self) -> tuple[int, np.ndarray]:
@@ -54,10 +56,14 @@ class FramePoses:
     def move(self, T_new_old: np.ndarray) -> None:
         """The world about the camera was moved by a correction [4, 4]."""
         self._T_world_anchor = T_new_old @ self._T_world_anchor
+        self._invert_anchor()
+
+    def _invert_anchor(self) -> None:
+        self._T_anchor_world = inverse(self._T_world_anchor)
 
     def add(self, frame: Frame, tracking: TrackingResult) -> None:
         """Notes the pose of a frame."""
-        T_keyframe_camera = inverse(self._T_world_anchor) @ tracking.T_world_camera
+        T_keyframe_camera = self._T_anchor_world @ tracking.T_world_camera
         self.frames.append(
             TrackedFrame(
                 frame.index, frame.source_index, frame.timestamp, max(0, self._anchor), T_keyframe_camera,

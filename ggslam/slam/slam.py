@@ -313,9 +313,11 @@ class Slam(RunState):
 
     def _keep_between(self, frame: Frame, tracking: TrackingResult) -> None:
         """Keeps the frame that `poses` took last for the final refinement, if it shows the map and nothing else."""
+        if not (self.growing and self.mapper.keeps_between):
+            return
         located = tracking.status in (TrackingStatus.OK, TrackingStatus.RECOVERED) and not tracking.still
         alone = frame.instant is None and (frame.moving is None or not frame.moving.any())
-        if located and alone and self.growing and not self.config.evaluation.is_held_out(frame.index):
+        if located and alone and not self.config.evaluation.is_held_out(frame.index):
             pose = self.poses.frames[-1]
             self.mapper.keep_between(frame, pose.keyframe, pose.T_keyframe_camera)
 

@@ -26,6 +26,8 @@ class SideThread(Generic[Result]):
         self._asked: SimpleQueue[Callable[[], Result] | None] = SimpleQueue()
         self._done: SimpleQueue[tuple[Result | None, BaseException | None]] = SimpleQueue()
         self._work: Callable[[], Result] | None = None
+        self.is_asked = False
+        """Whether there is a result to take."""
 
     def start(self, work: Callable[[], Result]) -> None:
         """Starts a piece of work; its result has to be taken before the next is started."""
@@ -33,17 +35,12 @@ class SideThread(Generic[Result]):
             self._process, self._asked, self._done = os.getpid(), SimpleQueue(), SimpleQueue()
             target = (self._asked, self._done)
             threading.Thread(target=_work, args=target, name=self._name, daemon=True).start()
-        self._work = work
+        self._work, self.is_asked = work, True
         self._asked.put(work)
-
-    @property
-    def is_asked(self) -> bool:
-        """Whether there is a result to take."""
-        return self._work is not None
 
     def take(self) -> Result:
         """The result of the piece that was started; waits for it, and raises what it raised."""
-        work, self._work = self._work, None
+        work, self._work, self.is_asked = self._work, None, False
         assert work is not None
         if self._process != os.getpid():
             return work()

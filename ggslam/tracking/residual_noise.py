@@ -47,7 +47,7 @@ _MEDIAN_OF_NORMAL: Final = 0.6745
 """Median of the absolute value of a standard normal variable."""
 
 
-@savable(not_saved="_known")
+@savable(not_saved="sigma", after="measure")
 @dataclass
 class ResidualNoise:
     """Compares a noise model with the residuals of tracking, frame by frame.
@@ -57,23 +57,18 @@ class ResidualNoise:
             points to the surface, metres.
         frames: seen so far.
         hidden: how many times as large the noise is taken to be as at first.
+        sigma: robust standard deviation in metres of the distances in the latest looks; None: too few so far.
     """
 
     residuals: list[tuple[float, float]] = field(default_factory=list)
     frames: int = 0
     hidden: float = 1.0
-    _known: tuple[list[tuple[float, float]], float | None] | None = None
+    sigma: float | None = None
 
-    @property
-    def sigma(self) -> float | None:
-        """Robust standard deviation in metres of the distances in the latest looks; None: too few so far."""
-        known = self._known
-        if known is not None and known[0] is self.residuals:  # each look makes a new list
-            return known[1]
+    def measure(self) -> None:
+        """Makes `sigma`, of residuals that were given."""
         enough = len(self.residuals) >= ResidualNoiseTuning.min_measurements
-        found = median([sigma for _, sigma in self.residuals]) if enough else None
-        self._known = self.residuals, found
-        return found
+        self.sigma = median([sigma for _, sigma in self.residuals]) if enough else None
 
     def due(self) -> bool:
         """Whether the next frame is looked at; counts it."""
@@ -104,18 +99,16 @@ class ResidualNoise:
             return noise
         sigma = float(np.sqrt(np.float32(found.squared_distance))) / _MEDIAN_OF_NORMAL
         self.residuals = [*self.residuals[1 - ResidualNoiseTuning.latest :], (found.depth, sigma)]
-        if len(self.residuals) < ResidualNoiseTuning.min_measurements:
+        self.measure()
+        if self.sigma is None:
             return noise
-        ratios = [
-            sigma
-            / max(noise.sigma(z), ResidualNoiseTuning.surface_sigma_m * min(1, z / ResidualNoiseTuning.room_depth_m))
-            for z, sigma in self.residuals
-        ]
-        factor = median(ratios)
-        if factor < ResidualNoiseTuning.max_factor:
+        z, sigmas = np.array(self.residuals).T
+        of_surface = ResidualNoiseTuning.surface_sigma_m * np.minimum(1, z / ResidualNoiseTuning.room_depth_m)
+        ratios = sigmas / np.maximum(noise.sigma(z), of_surface)
+        if median(ratios.tolist()) < ResidualNoiseTuning.max_factor:
             return noise
-        depth, shown = (median(values) for values in zip(*self.residuals, strict=True))
-        self.residuals = []
+        depth, shown = median(z.tolist()), self.sigma
+        self.residuals, self.sigma = [], None
         larger = larger_noise(noise, depth, shown)
         self.hidden *= larger.sigma(depth) / noise.sigma(depth)
         return larger

@@ -5,12 +5,15 @@ the scene."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final, Literal, TypeVar
+
+import numpy as np
 
 from ggslam.features.orb import FeatureSettings
 from ggslam.system.savable import savable
 from ggslam.system.settings import Conflict, setting, settings_class, tuning_class
 
+Depths = TypeVar("Depths", float, np.ndarray)
 PhotometricMode = Literal["never", "degenerate", "auto", "always"]
 UNBOUNDED: Final = 1e9
 """A weight that no point has: the closest, at 0.1 m, has at most 10^4 times the weight of one at 1 m."""
@@ -29,8 +32,8 @@ class DepthNoise:
     square: float = setting(0.0019, 0, 1, "1/m")
     """Growth of the standard deviation with the square of the depth."""
 
-    def sigma(self, z: float) -> float:
-        """Standard deviation in metres at depth `z`."""
+    def sigma(self, z: Depths) -> Depths:
+        """Standard deviation in metres at a depth `z`, or at each of an array."""
         return self.constant + self.square * z * z
 
     def in_pixels(self, z: float, focal_length: float) -> float:

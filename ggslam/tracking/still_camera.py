@@ -57,7 +57,7 @@ class StillTuning(Tuning):
     """Share of a run's frames from which the camera is reported as still."""
 
 
-@savable(not_saved="planes", after="prepare")
+@savable(not_saved="planes address", after="prepare")
 @dataclass
 class SmallFrame:
     """A frame at reduced size: grey values float32 [h, w] of 0 to 255, and depth float32 [h, w], metres, 0: unknown.
@@ -65,32 +65,34 @@ class SmallFrame:
     Attributes:
         planes: float32 [5, h, w]: grey values, blurred; their gradients along rows and along columns, grey levels per
             pixel; depth; grey values.
+        address: of these.
     """
 
     grey: DepthImage
     depth: DepthImage
     planes: np.ndarray | None = None
+    address: int | None = None
 
     @staticmethod
     def of(color: np.ndarray, depth: np.ndarray) -> SmallFrame:
         """Of colour uint8 [H, W, 3] and depth float32 [H, W]."""
         width, height = StillTuning.width, max(2, round(color.shape[0] * StillTuning.width / color.shape[1]))
-        planes = np.empty((5, height, width), np.float32)
-        grey, factor = planes[4], color.shape[1] // width
+        planes, factor = np.empty((5, height, width), np.float32), color.shape[1] // width
+        grey, first = planes[4], address(planes)
         if 0 < factor <= 16 and color.shape == (factor * height, factor * width, 3) and color.flags.c_contiguous:
-            load_library().ggslam_shrink_grey(address(color), *color.shape[:2], factor, address(grey))
+            load_library().ggslam_shrink_grey(address(color), *color.shape[:2], factor, first + 4 * grey.nbytes)
         else:
             small = cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA)
             grey[...] = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         cv2.resize(depth, (width, height), dst=planes[3], interpolation=cv2.INTER_NEAREST)
         _fill_planes(planes)
-        return SmallFrame(grey, planes[3], planes)
+        return SmallFrame(grey, planes[3], planes, first)
 
     def prepare(self) -> None:
         """Makes `planes`, where grey values and depth were given."""
         if self.planes is None:
             self.planes = np.empty((5, *self.grey.shape), np.float32)
-            self.planes[3], self.planes[4] = self.depth, self.grey
+            self.planes[3], self.planes[4], self.address = self.depth, self.grey, address(self.planes)
             _fill_planes(self.planes)
 
 
@@ -140,7 +142,7 @@ def is_still(anchor: SmallFrame, now: SmallFrame, noise: DepthNoise) -> bool:
     if anchor.grey.shape != now.grey.shape:
         return False
     assert anchor.planes is not None and now.planes is not None
-    pixels, stays = _pixels_that_stay(anchor.planes, now.planes)
+    pixels, stays = _pixels_that_stay(anchor, now)
     if not len(pixels):
         return False
     rows, columns = np.divmod(pixels, anchor.grey.shape[1])
@@ -154,16 +156,12 @@ def is_still(anchor: SmallFrame, now: SmallFrame, noise: DepthNoise) -> bool:
     return bool(same.mean() >= StillTuning.min_still_depth)
 
 
-def _pixels_that_stay(anchor: np.ndarray, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pixels_that_stay(anchor: SmallFrame, now: SmallFrame) -> tuple[np.ndarray, np.ndarray]:
     """Textured pixels, by their number in the image, int32 [n], and whether each stays, bool [n]. None of them if too
-    few stay, in too few parts of the image, or along one direction.
-
-    Args:
-        anchor, now: `SmallFrame.planes`.
-    """
+    few stay, in too few parts of the image, or along one direction."""
     found = np.empty(2 * StillTuning.max_pixels, np.int32)
     count = load_library().ggslam_still_pixels(StillPixelsJob(
-        address(anchor), address(now), *anchor.shape[1:], StillTuning.min_gradient**2, StillTuning.max_flow_pixels,
+        anchor.address, now.address, *anchor.grey.shape, StillTuning.min_gradient**2, StillTuning.max_flow_pixels,
         StillTuning.min_pixels, StillTuning.max_pixels, StillTuning.cells, StillTuning.min_cell_pixels,
         StillTuning.min_still_cells, StillTuning.min_still_share, StillTuning.across, StillTuning.min_across,
         address(found),

@@ -22,8 +22,9 @@ from torch.utils._pytree import tree_flatten
 
 from ggslam.abi.cuda import AlignResult, PointsHeader, TrackJob
 
-TOOLS = ("/device_watch/", "/torch/utils/_python_dispatch.py", "/torch/overrides.py", "host_counts.py")
-"""Code that only watches: neither it nor what it calls is counted, but for a call of what it stands in for."""
+TOOLS = ("/device_watch/", "/torch/utils/_python_dispatch.py", "/torch/overrides.py", "/weakref.py", "host_counts.py")
+"""Code that only watches (by weak references, which memory is given back): neither it nor what it calls is counted, but
+for a call of what it stands in for."""
 STANDS_IN = ("stand_ins.py", "watch.py")
 ON_HOST = ("_bytes", "_room", "_pairs", "_plan", "_create", "_destroy", "_counts", "_error_text")
 """How functions of the library end that start nothing."""
@@ -31,7 +32,7 @@ NO_OPERATIONS = {"device", "is_pinned"}
 
 
 class CallCounter:
-    """Counts calls of Python and of C functions in all threads that are started within, and in this one."""
+    """Within, counts calls of Python and of C functions, in this thread and in all that are started."""
 
     def __init__(self, found: Counter[str]) -> None:
         self._found, self._inside = found, threading.local()
@@ -52,16 +53,13 @@ class CallCounter:
         elif event == "c_call" and not depth:
             self._found["C calls"] += 1
 
-    @contextmanager
-    def counting(self) -> Iterator[None]:
-        """Within, calls are counted."""
+    def __enter__(self) -> None:
         threading.setprofile(self.profile)
         sys.setprofile(self.profile)
-        try:
-            yield
-        finally:
-            sys.setprofile(None)
-            threading.setprofile(None)  # type: ignore[arg-type]
+
+    def __exit__(self, *_error: object) -> None:
+        sys.setprofile(None)
+        threading.setprofile(None)  # type: ignore[arg-type]
 
 
 class KernelThread:

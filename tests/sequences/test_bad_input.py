@@ -160,6 +160,12 @@ def test_impossible_names(name: str) -> None:
         open_sequence(name)
 
 
+@pytest.mark.parametrize("place", ["ros2://camera/color,camera/depth", "realsense:", "python:module:make"])
+def test_live_cameras_are_named(place: str) -> None:
+    with pytest.raises(SequenceError, match="is a live camera.*--record FOLDER"):
+        open_sequence(place)
+
+
 def test_short_trajectory(make: Make) -> None:
     folder = make("replica")
     lines = (folder / "traj.txt").read_text().splitlines()

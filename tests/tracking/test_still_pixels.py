@@ -32,7 +32,7 @@ def some_frame(seed: int, like: np.ndarray | None = None, noise: float = 0.0, of
 def stay(anchor: SmallFrame, now: SmallFrame) -> tuple[np.ndarray, np.ndarray]:
     """What the core says."""
     assert anchor.planes is not None and now.planes is not None
-    return _pixels_that_stay(anchor.planes, now.planes)
+    return _pixels_that_stay(anchor, now)
 
 
 def pixels_that_stay(anchor: SmallFrame, now: SmallFrame) -> tuple[np.ndarray, np.ndarray, bool]:

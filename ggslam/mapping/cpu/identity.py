@@ -155,7 +155,7 @@ class CpuIdentityLearner(IdentityLearner):
         self.last_loss, gradient, rows = cross_entropy(shown, self.classifier, classes, chosen, rasterizer.context)
         self.table.step(chosen, s.weight * rows, s.classifier_rate)
         out[:, pixels] = s.weight * gradient.T
-        if self._pulls(gaussians):
+        if self.pulls(gaussians):
             rows_pulled, pull = self._pull_together(gaussians)
             terms = CpuPixelTerms.of_gaussians(rows_pulled, 1, rasterizer.context)
             terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
@@ -171,7 +171,7 @@ class CpuIdentityLearner(IdentityLearner):
         chosen = self._choose_competitors(classes[classes >= 0])
         self.last_loss, gradient, rows = cross_entropy(features, self.classifier, classes, chosen, terms.context)
         gradient *= np.float32(s.weight)
-        if self._pulls(gaussians):
+        if self.pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             terms = terms.append(CpuPixelTerms.of_gaussians(pulled, terms.gaussians.shape[1], terms.context))
             gradient = np.concatenate([gradient, pull])

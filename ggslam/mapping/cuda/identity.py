@@ -255,7 +255,7 @@ class CudaIdentityLearner(IdentityLearner):
         losses = torch.empty(len(labels), device=self.device)
         gradient, rows = self.table.cross_entropy(terms.features(gaussians), classes, known, losses, s.weight)
         self._last = losses, known
-        if self._pulls(gaussians):
+        if self.pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             others = CudaPixelTerms.of_gaussians(pulled, terms.capacity, terms.library)
             terms, gradient = terms.append(others), torch.cat([gradient, pull])
@@ -287,7 +287,7 @@ class CudaIdentityLearner(IdentityLearner):
             rows += of_rows
         self._last = losses, known
         self.table.step(rows, known, s.classifier_rate)
-        if self._pulls(gaussians):
+        if self.pulls(gaussians):
             pulled, pull = self._pull_together(gaussians)
             terms = CudaPixelTerms.of_gaussians(pulled, 1, self.library)
             terms.step(gaussians, pull, FeatureAdamSettings(rate=s.rate))
@@ -316,10 +316,6 @@ class CudaIdentityLearner(IdentityLearner):
         """Gaussians that the 3-D loss draws, each with so many neighbours."""
         at_once = CudaIdentityTuning.logits_at_once // 10 // ((neighbours + 1) * self.table.count)
         return min(self.settings.neighbours.samples, max(16, at_once))
-
-    def pulls(self, gaussians: GaussianMap) -> bool:
-        """Whether the next step has the 3-D loss."""
-        return self._pulls(gaussians)
 
     def labels_for_parts(self, gaussians: GaussianMap) -> torch.Tensor | None:
         """The map's labels by votes as of the newest keyframe, int32 [N]; None while no object has parts."""

@@ -117,12 +117,15 @@ class ImageStore:
             if used.is_kept:
                 self._images.move_to_end(used.key)
 
-    def mask_of(self, keyframe: ImageSource, grid: PixelGrid = ALL_PIXELS) -> torch.Tensor | None:
-        """The mask that a keyframe has now, at a grid's pixels."""
+    def mask_of(
+        self, keyframe: ImageSource, grid: PixelGrid = ALL_PIXELS, images: CudaKeyframeImages | None = None
+    ) -> torch.Tensor | None:
+        """The mask that a keyframe has now, at a grid's pixels. `images`: those of the keyframe there, if they are at
+        hand and kept."""
         mask = keyframe.mask
         if mask is None:
             return None
-        images = self.of(keyframe, grid)
+        images = images or self.of(keyframe, grid)
         if images.mask is None or images.mask_of is not mask:
             if images.mask is not None:
                 self._drop(images.mask)

@@ -161,7 +161,9 @@ class KeyframeStates:
 
     def begin_steps(self) -> int | None:
         """Others are about to start steps, with `address` and `totals`; returns the stream for them."""
-        return self._current_stream()
+        if self.library.device_type == "cuda":
+            self._stream = torch.cuda.current_stream(self.device)
+        return self.library.stream(self.device)
 
     def note_steps(self) -> None:
         """They have started them. What another thread reads meanwhile is of before, and not kept for what comes after.
@@ -255,7 +257,7 @@ class KeyframeStates:
         return self.table.data_ptr() + self._check_index(i) * ctypes.sizeof(KeyframeState)
 
     def _write(self, i: int, T_camera_world: np.ndarray, exposure: np.ndarray | None) -> None:
-        job = KeyframeWriteJob(stream=self._current_stream(), device=self.device.index or 0)
+        job = KeyframeWriteJob(stream=self.begin_steps(), device=self.device.index or 0)
         job.state = self.table.data_ptr() + i * ctypes.sizeof(KeyframeState)
         for name, array, shape in (("pose", T_camera_world, (4, 4)), ("exposure", exposure, (3, 2))):
             if array is None:
@@ -280,11 +282,6 @@ class KeyframeStates:
     def in_turn(self) -> AbstractContextManager[object]:
         """Within, this thread works on the stream that the rows are written on: what it reads is between two steps."""
         return nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
-
-    def _current_stream(self) -> int | None:
-        if self.library.device_type == "cuda":
-            self._stream = torch.cuda.current_stream(self.device)
-        return self.library.stream(self.device)
 
     def _pointer_of(self, name: str, tensor: torch.Tensor, dtype: torch.dtype, shape: torch.Size) -> int:
         if tensor.dtype != dtype or tensor.shape != shape or tensor.device != self.device:

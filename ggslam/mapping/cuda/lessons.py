@@ -135,7 +135,7 @@ class CudaLessons:
             self._fill_once(step)
         else:
             self._fill_pixels(step, keyframe.index)
-        step.pulls = learner.table.count > 0 and self._job.samples > 0 and learner.pulls(gaussians)
+        step.pulls = self._job.samples > 0 and learner.pulls(gaussians)  # without classes there are none
         step.pull = learner.times.count
         if self._job.trains:
             learner.note_losses(self._losses, self._known)
@@ -176,7 +176,8 @@ class CudaLessons:
 
     def _fill_in(self, gaussians: GaussianMap, shown: torch.Tensor | None) -> None:
         job, learner, s = self._job, self._learner, self._learner.settings
-        table, near, count = learner.table, learner.settings.neighbours, len(gaussians)
+        table, near, count = learner.table, learner.settings.neighbours, gaussians.count
+        classes = table.count
         storage = gaussians.storage
         job.means, job.gaussians = storage["means"].data_ptr(), count
         job.adam = feature_step(gaussians, FeatureAdamSettings(rate=0.0))
@@ -189,10 +190,10 @@ class CudaLessons:
         job.steps, job.losses, job.known = steps.data_ptr(), self._losses.data_ptr(), self._known.data_ptr()
         job.balance, job.boundary, job.rate, job.classifier_rate = s.balance, s.boundary, s.rate, s.classifier_rate
         job.seed, job.weight, job.min_weight = learner.drawer.seed, s.weight, IdentityTuning.min_weight
-        job.channels, job.classes, job.pixels = IDENTITY_CHANNELS, table.count, s.pixels
-        job.capacity, job.trains = IdentityTuning.max_terms, s.schedule == "sampled" and table.count > 0
+        job.channels, job.classes, job.pixels = IDENTITY_CHANNELS, classes, s.pixels
+        job.capacity, job.trains = IdentityTuning.max_terms, s.schedule == "sampled" and classes > 0
         pulls = job.trains and near.weight > 0 and count > 1
         job.neighbours = min(near.neighbours, count - 1) if pulls else 0
         job.samples = learner.sample_count(job.neighbours) if pulls else 0
-        job.pull_weight = near.weight * near.value / max(1, table.count)
+        job.pull_weight = near.weight * near.value / max(1, classes)
         self._named = (shown, rows, first, second)

@@ -93,11 +93,13 @@ class CudaTraining:
         self.count = count
         return True
 
-    def teach(self, number: int, lessons: CudaLessons, gaussians: GaussianMap, keyframe: Any) -> None:
+    def teach(
+        self, number: int, lessons: CudaLessons, gaussians: GaussianMap, keyframe: Any, mask: torch.Tensor | None
+    ) -> None:
         """On the rendering of a step that was gathered, by its number, a step of identity learning is made, too, with
         a keyframe's mask on its grid. Of several steps, the earlier one is to be told first."""
-        assert self._kind is not None
-        lesson, camera, mask = self._lesson_count, self._kind.camera, keyframe.device_mask
+        assert self._kind is not None and mask is not None
+        lesson, camera = self._lesson_count, self._kind.camera
         size = (camera.height, camera.width)
         self._identity = lessons.fill(self._lessons[lesson], gaussians, keyframe, mask, size, 1.0)
         self._steps[number].lesson = lesson

@@ -51,6 +51,7 @@ class TrainingJobs:
         self._twist = torch.zeros(6, dtype=torch.float64, device=rasterizer.device)
         self._adam_steps = AdamSteps()
         self._kept: dict[StepKind, _KeptJob] = {}
+        self._rateless: tuple[AdamSettings | None, tuple[object, ...]] = None, ()
         self._filled_for: tuple[object, ...] = ()  # map and memory that the jobs name
         self.fillings = 0
         """How often a job was filled."""
@@ -65,7 +66,9 @@ class TrainingJobs:
         rasterizer = self._rasterizer
         if self._places(gaussians) != self._filled_for:
             self._kept = {}  # jobs of what has moved would keep it in memory
-        sources = room, rasterizer.near_plane, *_shape_of(optimizer)
+        if self._rateless[0] is not optimizer:
+            self._rateless = optimizer, _all_but_rates(optimizer)
+        sources = room, rasterizer.near_plane, *self._rateless[1]
         kept = self._kept.pop(kind, None)
         if kept is None or kept.sources != sources:
             rasterizer.low_pass, rasterizer.close_below = kind.low_pass, kind.close_below
@@ -113,8 +116,8 @@ class TrainingJobs:
         return _KeptJob(job, sources, named)
 
 
-def _shape_of(optimizer: AdamSettings) -> tuple[object, ...]:
-    """What the job has of an optimizer: all but its rates."""
+def _all_but_rates(optimizer: AdamSettings) -> tuple[object, ...]:
+    """What the job has of an optimizer."""
     o = optimizer
     times = (o.decay, o.decay_floor, o.decayed_groups, o.fall_updates, o.fall_floor, o.falling_groups)
     return (o.beta1, o.beta2, o.epsilon, *times)

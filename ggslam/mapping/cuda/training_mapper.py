@@ -196,13 +196,15 @@ class TrainingMapper(ComparingMapper):
             self.keyframes[number] for number in self._sampler.choose_many(self._trainable(), iterations)
         ]
         lessons = range(0) if identity is None else identity.due_turns(iterations)
-        together = self._training.add(self._rows_of(keyframes, ALL_PIXELS), optimizer, pose_rate)
-        for turn, keyframe in enumerate(keyframes):
+        rows = self._rows_of(keyframes, ALL_PIXELS)
+        together = self._training.add(rows, optimizer, pose_rate)
+        for turn, (keyframe, row) in enumerate(zip(keyframes, rows, strict=True)):
             if not together:
                 self._gather(keyframe, ALL_PIXELS, optimizer, pose_rate)
             number = turn if together else self._training.count - 1
             if turn in lessons and identity is not None and keyframe.mask is not None:
-                self._training.teach(number, identity.lessons, self.map, keyframe)
+                mask = self._images.mask_of(keyframe, ALL_PIXELS, row.images if row.images.is_kept else None)
+                self._training.teach(number, identity.lessons, self.map, keyframe, mask)
             keyframe.iterations += 1
             self.times.steps += 1
             self.times.iterations += 1
@@ -221,8 +223,9 @@ class TrainingMapper(ComparingMapper):
         pose_rate = self._pose_rate_of(keyframe, grid, pose_factor)
         self._gather(keyframe, grid, self._optimizer(rate_factor, settles), pose_rate)
         if learns and self.identity is not None:
-            masked, last = self._masks_on(keyframe, grid), self._training.count - 1
-            self._training.teach(last, self.identity.lessons, self.map, masked)
+            masked: Any = self._masks_on(keyframe, grid)
+            last = self._training.count - 1
+            self._training.teach(last, self.identity.lessons, self.map, masked, masked.device_mask)
         self.times.steps += 1
         keyframe.iterations += 1
 

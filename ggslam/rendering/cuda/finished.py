@@ -21,6 +21,10 @@ from ggslam.system.tuning import Tuning
 _TARGETS: Final = tuple(field_[0] for field_ in structures.RenderTargets._fields_)
 _MAX_PAIRS: Final = 2**31 - 1
 """Largest number of pairs: kernels number them in 31 bits."""
+_TOO_MANY_PAIRS: Final = (
+    "rendering failed: too many pairs of a Gaussian and an image tile (2^31): "
+    "the Gaussians are far too large for the image"
+)
 
 
 class PairRoomTuning(Tuning):
@@ -58,7 +62,8 @@ class Counter:
         totals = (ctypes.c_int64 * 2)()
         self._library.call("wait", self.handle, totals)
         visible, pairs = totals
-        _check_pairs(pairs)
+        if pairs > _MAX_PAIRS:
+            raise RenderError(_TOO_MANY_PAIRS)
         self.expected_pairs = min(pairs + pairs // 16 + 4096, _MAX_PAIRS)
         return visible, pairs
 
@@ -78,7 +83,8 @@ class Counter:
 
     def room_for(self, recent: int) -> int | None:
         """As `room_without_waiting`, given what `recent_pairs` says."""
-        _check_pairs(recent)
+        if recent > _MAX_PAIRS:
+            raise RenderError(_TOO_MANY_PAIRS)
         self._needed = max(recent, self._needed - (self._needed - recent) // 64 - 1)
         if self._needed == 0:
             return None
@@ -90,14 +96,6 @@ class Counter:
     def __del__(self) -> None:
         if self.handle:
             self._library.functions.ggslam_cuda_counter_destroy(self.handle)
-
-
-def _check_pairs(pairs: int) -> None:
-    if pairs > _MAX_PAIRS:
-        raise RenderError(
-            "rendering failed: too many pairs of a Gaussian and an image tile (2^31): "
-            "the Gaussians are far too large for the image"
-        )
 
 
 @dataclass

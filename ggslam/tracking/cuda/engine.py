@@ -122,7 +122,7 @@ class CudaTrackingEngine:
         if depth.shape != self._depth.staged.shape:
             check_depth(depth, self.camera)
         before = None if self._pending is None else self._pending()
-        if before is not None:
+        if before is not None and not before.is_extracted:
             self._extract(before)
         self._depth.send(depth)
 
@@ -133,7 +133,7 @@ class CudaTrackingEngine:
 
     def note_depth_arrival(self) -> None:
         """The host has waited for the stream that `send_depth` used."""
-        self._depth.note_arrival()
+        self._depth.under_way = False
 
     def align(
         self, source: PointSource, target: GicpTarget, T_world_camera_guess: np.ndarray, settings: AlignSettings,
@@ -164,13 +164,14 @@ class CudaTrackingEngine:
         job.looks = source.looks
         align.stream = self.library.stream(self.device)
         self.library.call("track_wait", self._reference)
-        self._depth.note_arrival()
+        self._depth.under_way = False
         self._target.note_made()
         found = self._found.copy()
         source.note_aligned(int(found[AlignResult.POINT_COUNT]), float(found[AlignResult.MEDIAN_DEPTH]))
         if isinstance(photometric, CudaPhotometricPart):
-            self.greys.color.note_arrival()
-            photometric.textured = int(found[AlignResult.TEXTURED])
+            self.greys.color.under_way = False
+            textured = photometric.textured = int(found[AlignResult.TEXTURED])
+            photometric.has_texture = textured >= photometric.least
         return cuda_alignment(found, matched, max(1, room), source.looks, settings)
 
     def expect_target(self, target: GicpTarget) -> None:
@@ -204,11 +205,11 @@ class CudaTrackingEngine:
             self._grid = columns, rows
 
     def _extract(self, points: CudaPoints) -> None:
-        """Starts to extract the points that `points` got ready last, if that was not done yet."""
+        """Starts to extract the points that were got ready last, if that was not done yet."""
         if not points.is_extracted:
             self._job.points.stream = self.library.stream(self.device)
             self.library.call("depth_points", ctypes.byref(self._job.points))
-            points.note_extracted()
+            points.is_extracted = True
 
     def _set_photometric(self, part: PhotometricSource | None) -> None:
         """Sets what grey values contribute, and what has to be made for that.

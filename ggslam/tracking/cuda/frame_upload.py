@@ -35,13 +35,15 @@ class FrameUpload:
         self.address = self._memory.data_ptr()
         """On the device."""
         self._sent = Marker(device)
-        self._under_way = False
+        self.under_way = False
+        """Whether the last image may still be. Who has waited for the stream that it was sent on says that it is not.
+        """
         self.image: np.ndarray | None = None
         """The very array that was sent last."""
 
     def send(self, image: np.ndarray) -> None:
-        """Starts to send an image. The host waits for the last one, unless `note_arrival` told that it is there."""
-        if self._under_way:
+        """Starts to send an image. The host waits for the last one if that is `under_way`."""
+        if self.under_way:
             self._sent.set()
             self._sent.wait_if_ahead()
         if self._is_depth and image.dtype == np.float32 and image.flags.c_contiguous:
@@ -50,11 +52,7 @@ class FrameUpload:
             self.staged[...] = image
             self.known = int(np.count_nonzero(self.staged > 0)) if self._is_depth else 0
         self._memory.copy_(self._staged, non_blocking=True)
-        self._under_way, self.image = True, image
-
-    def note_arrival(self) -> None:
-        """The host has waited for the stream that the last image was sent on."""
-        self._under_way = False
+        self.under_way, self.image = True, image
 
     def have(self, image: np.ndarray) -> None:
         """The same, unless this very array was sent last."""

@@ -44,11 +44,8 @@ class CudaPhotometricPart:
         self.shrink, self.least = shrink, least
         self.textured: int | None = None
         """How many points are textured; None: no alignment told yet."""
-
-    @property
-    def has_texture(self) -> bool:
+        self.has_texture = True
         """See `PhotometricSource`."""
-        return self.textured is None or self.textured >= self.least
 
     def is_of(self, view: FeatureView, reference: FeatureView, settings: PhotometricSettings, shrink: int) -> bool:
         """Whether it was made of these."""

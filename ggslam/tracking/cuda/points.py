@@ -47,20 +47,13 @@ class CudaPoints:
         """Addresses on the device, while this object is alive."""
         self.looks = False
         """Whether an alignment tells the medians of what was matched, see `expect_look`."""
-        self._extract: Callable[[CudaPoints], None] | None = extract
+        self.is_extracted = False
+        """Whether the device was told to extract them."""
+        self._extract = extract
         self._ring = ring
         self._header: tuple[int, float] | None = None
         self._fetch: Fetch | None = None
         self._points: FramePoints | None = None
-
-    @property
-    def is_extracted(self) -> bool:
-        """Whether the device was told to extract them."""
-        return self._extract is None
-
-    def note_extracted(self) -> None:
-        """The device was told to extract them."""
-        self._extract = None
 
     def expect_look(self) -> None:
         """See `PointSource`."""
@@ -78,7 +71,7 @@ class CudaPoints:
 
     def note_aligned(self, count: int, median_depth: float) -> None:
         """The device has extracted and aligned them, and said this of them."""
-        self._extract, self._header = None, (count, median_depth)
+        self.is_extracted, self._header = True, (count, median_depth)
 
     def __len__(self) -> int:
         """Waits for the device if the points were not aligned yet."""
@@ -121,7 +114,7 @@ class CudaPoints:
         return self.block.memory[: words_for(self.room)].cpu().numpy()
 
     def _ensure(self) -> None:
-        if self._extract is not None:
+        if not self.is_extracted:
             self._extract(self)
 
     def _known_header(self) -> tuple[int, float]:

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from ggslam.abi.arrays import address
-from ggslam.abi.core import LevelChanges, TargetChanges, TargetCopy
-from ggslam.abi.cuda import TrackJob, VoxelLevelJob
+from ggslam.abi.core import TargetChanges, TargetCopy
+from ggslam.abi.cuda import TrackJob
 from ggslam.cuda.transfers import Upload
 from ggslam.native.loader import load_library
 from ggslam.system.tuning import Tuning
@@ -130,20 +130,16 @@ class CudaTarget:
         """Starts to send what was staged, and sets the jobs that make the levels of it."""
         self._memory.use(not staged.changes.whole, job.fine, job.coarse)
         self._upload.send(staged.out, staged.source)
+        first, settings = self._memory.address, staged.settings
         for changes, made, size in (
             (staged.changes.fine, job.fine, np.float32(voxel)),
             (staged.changes.coarse, job.coarse, np.float32(4) * np.float32(voxel)),
         ):
             made.empties, made.device = staged.changes.whole, self._device.index or 0
-            _set_values(made, changes, self._memory.address, staged.settings)
+            made.blocks, made.indices = first + changes.blocks_at, first + changes.indices_at
+            made.block_count, made.voxel_count = changes.block_count, changes.voxel_count
+            values = first + changes.values_at
+            made.new_voxels, made.new_moments = (values, None) if settings is None else (None, values)
+            if settings is not None:
+                made.settings = settings
             made.level.voxels, made.level.size, made.level.inverse_size = made.voxels, size, np.float32(1) / size
-
-
-def _set_values(job: VoxelLevelJob, changes: LevelChanges, first: int, settings: Any) -> None:
-    """Where the kernels find what was sent, from address `first` on."""
-    job.blocks, job.indices = first + changes.blocks_at, first + changes.indices_at
-    job.block_count, job.voxel_count = changes.block_count, changes.voxel_count
-    values = first + changes.values_at
-    job.new_voxels, job.new_moments = (values, None) if settings is None else (None, values)
-    if settings is not None:
-        job.settings = settings
