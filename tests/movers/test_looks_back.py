@@ -58,6 +58,13 @@ def looked_at_one_by_one(
 CONTEXT = NativeContext(2)
 
 
+def look_back(
+    found_by: MoverFilter, earlier: list[Keyframe], newest: Frame, T_world_newest: np.ndarray
+) -> list[np.ndarray | None]:
+    """`MoverFilter.gone_since`."""
+    return found_by.gone_since(earlier, np.array([k.T_world_camera for k in earlier]), newest, T_world_newest)
+
+
 @dataclass
 class Box:
     """The front of something before a wall: its place in the image of a camera at the origin, and its distance."""
@@ -133,7 +140,7 @@ def test_the_same_is_found_as_by_a_look_at_each(threads: int, name: str) -> None
         for n in range(9, 14):
             newest, T = room.frame(n, 9 - seed % 4, masks=False), room.pose()
             expected = looked_at_one_by_one(found_by, earlier, newest, T)
-            assert agree(found_by.gone_since(earlier, newest, T), expected)
+            assert agree(look_back(found_by, earlier, newest, T), expected)
             gone = [part for part in expected if part is not None]
             counts += len(gone), len(expected) - len(gone)
             # What is remembered of keyframes has to follow: the trail grows, depth is blanked, poses and noise change.
@@ -156,12 +163,12 @@ def test_images_of_several_sizes_are_looked_at_with_their_own() -> None:
         room.add_to(found_by, keyframe, 4)
     for n in range(6, 10):
         newest, T = rooms[n % 2].frame(n, 5, masks=False), rooms[n % 2].pose()
-        found = found_by.gone_since(earlier, newest, T)
+        found = look_back(found_by, earlier, newest, T)
         assert agree(found, looked_at_one_by_one(found_by, earlier, newest, T))
         assert any(part is not None for part in found)
         assert all(part is None for part in found[1 - n % 2 :: 2])
     other = Room(1, Camera(64, 48, 50.0, 50.0, 31.5, 23.5)).frame(10, 5, masks=False)
-    assert found_by.gone_since(earlier, other, np.eye(4)) == [None] * 6
+    assert look_back(found_by, earlier, other, np.eye(4)) == [None] * 6
 
 
 def calls_of(look: Callable[[], object]) -> int:
@@ -187,8 +194,8 @@ def test_a_look_calls_no_more_functions_with_more_keyframes() -> None:
     for k in earlier[1:]:  # all see the trail, and the newest one as well
         k.depth, k.T_camera_world = earlier[0].depth, earlier[0].T_camera_world
     newest, T = replace(room.frame(48, 9, masks=False), depth=earlier[0].depth_m()), earlier[0].T_world_camera
-    counts = []
+    counts, poses = [], np.array([k.T_world_camera for k in earlier])
     for number in (3, 48):
-        assert found_by.gone_since(earlier[:number], newest, T) == [None] * number
-        counts.append(calls_of(lambda n=number: found_by.gone_since(earlier[:n], newest, T)))  # type: ignore[misc]
+        assert look_back(found_by, earlier[:number], newest, T) == [None] * number
+        counts.append(calls_of(lambda n=number: found_by.gone_since(earlier[:n], poses[:n], newest, T)))  # type: ignore[misc]
     assert 0 < counts[1] <= counts[0]

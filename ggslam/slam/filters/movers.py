@@ -18,7 +18,6 @@ from ggslam.movers.tracks import MoverTracks
 from ggslam.movers.trail import TrailTuning, gone_since, which_may_be_gone
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sight.margin import Margin
 from ggslam.sight.passed_voxels import passed_in_voxels
@@ -149,12 +148,11 @@ class MoverFilter(FrameFilter):
         keyframe, looks through where it was."""
         if not self.has_trail or removal.is_paged:
             return
-        keyframes = removal.keyframes
-        latest, earlier = (
-            keyframes[-1],
-            [k for k in keyframes[-1 - MoverFilterTuning.max_keyframes : -1] if k.frame_index != FROM_EARLIER_RUN],
-        )
-        gone = self.gone_since(earlier, newest, latest.T_world_camera)
+        keyframes = removal.keyframes[-1 - MoverFilterTuning.max_keyframes :]
+        poses = removal.latest_poses(len(keyframes))
+        own = [i for i, k in enumerate(keyframes[:-1]) if k.frame_index != FROM_EARLIER_RUN]
+        earlier = [keyframes[i] for i in own]
+        gone = self.gone_since(earlier, poses[own], newest, poses[-1])
         parts = [(k, part) for k, part in zip(earlier, gone, strict=True) if part is not None]
         if parts:
             removal.drop_moved(parts)
@@ -165,12 +163,13 @@ class MoverFilter(FrameFilter):
         return self.active and len(self.detector.trail.keys) > 0
 
     def gone_since(
-        self, earlier: Sequence[Keyframe], newest: Frame, T_world_newest: np.ndarray
+        self, earlier: Sequence[Keyframe], T_world_earlier: np.ndarray, newest: Frame, T_world_newest: np.ndarray
     ) -> list[np.ndarray | None]:
         """What earlier views show where something has moved since, and the newest frame looks through.
 
         Args:
-            earlier: keyframes.
+            earlier: n keyframes.
+            T_world_earlier: [n, 4, 4].
             newest: without what moves in it.
             T_world_newest: [4, 4].
 
@@ -179,13 +178,13 @@ class MoverFilter(FrameFilter):
         """
         settings, trail, margin = self.detector.settings, self.detector.trail, self._margin
         camera, shape = newest.camera, newest.depth.shape
-        fitting = [k for k in earlier if k.depth.shape == shape]
-        if not fitting:
+        alike = [i for i, k in enumerate(earlier) if k.depth.shape == shape]
+        if not alike:
             return [None] * len(earlier)
+        fitting, poses = [earlier[i] for i in alike], T_world_earlier[alike]
         factor = coarse_factor(camera, settings)
         view = CoarseView.of(newest.depth, camera, factor, T_world_newest, margin, self.context)
         kept = self._views.of(fitting, camera, factor, margin, self.context)
-        poses = inverse(np.array([k.T_camera_world for k in fitting]))
         passed = passed_in_voxels(
             kept, poses, view, trail.keys, TrailTuning.voxel_m, TrailTuning.min_in_trail, margin, self.context
         )
