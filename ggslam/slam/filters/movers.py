@@ -126,7 +126,7 @@ class MoverFilter(FrameFilter):
         swift = self._is_swift(frame, T_world_camera, result.median_depth_m)
         self.detector.look(shown, T_world_camera, self._margin, self.context, result.status in SURE, swift)
         if known:
-            self.tracks.look(RecentFrame.of(shown, result.T_world_camera, self._margin), self.detector.things)
+            self.tracks.look(RecentFrame(shown, result.T_world_camera, self._margin), self.detector.things)
         else:
             self.tracks.clear()
         mask = self.detector.mask
