@@ -52,7 +52,7 @@ class PassedParts:
         return PairEvidence(*self.found[view])
 
 
-def passed_in_voxels(
+def find_passed_parts(
     earlier: Sequence[KeptPlaces], T_world_earlier: np.ndarray, newest: CoarseView, keys: np.ndarray, voxel_m: float,
     least_share: float, margin: Margin, context: NativeContext,
 ) -> PassedParts:  # fmt: skip

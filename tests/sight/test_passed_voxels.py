@@ -16,7 +16,7 @@ from ggslam.geometry.voxels import voxel_keys
 from ggslam.native.loader import NativeContext, available_instruction_sets
 from ggslam.scene.camera import Camera
 from ggslam.scene.poses import transform_points
-from ggslam.sight.passed_voxels import KeptPlaces, passed_in_voxels
+from ggslam.sight.passed_voxels import KeptPlaces, find_passed_parts
 from ggslam.sight.places import CoarseView, PairEvidence, compare
 
 VOXEL, LEAST_SHARE = 0.1, 0.2
@@ -43,7 +43,7 @@ def test_parts_are_those_of_a_view_by_itself(threads: int, name: str) -> None:
         keys = np.sort(np.random.default_rng(seed).choice(every, len(every) // (40 if seed % 4 else 2), replace=False))
         poses = np.array([view.T_world_camera for view in earlier])
         asked = [KeptPlaces(replace(view, T_world_camera=np.eye(4))) for view in earlier]
-        found = passed_in_voxels(asked, poses, newest, keys, VOXEL, LEAST_SHARE, MARGIN, context)
+        found = find_passed_parts(asked, poses, newest, keys, VOXEL, LEAST_SHARE, MARGIN, context)
         for i, view in enumerate(earlier):
             (evidence,) = compare(view, [newest], MARGIN, context)
             near = np.isin(keys_of(view), keys).reshape(view.depth.shape) & (view.depth > 0)
@@ -61,7 +61,7 @@ def test_without_voxels_nothing_is_found() -> None:
     camera, context = Camera(160, 121, 130.0, 131.0, 79.0, 61.0), NativeContext(1)
     one, newest = views_of(camera, range(2), context)
     nothing = np.empty(0, np.int64)
-    found = passed_in_voxels(
+    found = find_passed_parts(
         [KeptPlaces(one)], one.T_world_camera[None], newest, nothing, VOXEL, LEAST_SHARE, MARGIN, context
     )
     assert found.places.tolist() == [0] and found.largest.tolist() == [0]
@@ -76,9 +76,9 @@ def test_what_cannot_be_is_refused() -> None:
     keys, poses = np.zeros(1, np.int64), np.tile(np.eye(4), (2, 1, 1))
     asked = [KeptPlaces(one), KeptPlaces(other)]
     with pytest.raises(CoreInputError, match="height: expected 60"):
-        passed_in_voxels(asked, poses, one, keys, VOXEL, LEAST_SHARE, MARGIN, context)
+        find_passed_parts(asked, poses, one, keys, VOXEL, LEAST_SHARE, MARGIN, context)
     asked, poses = asked[:1], poses[:1]
     with pytest.raises(CoreInputError, match="voxel: expected"):
-        passed_in_voxels(asked, poses, one, keys, 0.0, LEAST_SHARE, MARGIN, context)
+        find_passed_parts(asked, poses, one, keys, 0.0, LEAST_SHARE, MARGIN, context)
     with pytest.raises(CoreInputError, match="T_world_earlier: expected"):
-        passed_in_voxels(asked, poses * np.nan, one, keys, VOXEL, LEAST_SHARE, MARGIN, context)
+        find_passed_parts(asked, poses * np.nan, one, keys, VOXEL, LEAST_SHARE, MARGIN, context)

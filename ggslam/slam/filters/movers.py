@@ -11,7 +11,6 @@ import numpy as np
 from ggslam.geometry.moved_depth import shift_between
 from ggslam.mapping.keyframe import FROM_EARLIER_RUN, Keyframe
 from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor, grow
-from ggslam.movers.keyframe_views import KeyframeViews
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
@@ -20,9 +19,10 @@ from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sight.margin import Margin
-from ggslam.sight.passed_voxels import passed_in_voxels
+from ggslam.sight.passed_voxels import find_passed_parts
 from ggslam.sight.places import CoarseView
 from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
+from ggslam.slam.filters.keyframe_views import KeyframeViews
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
@@ -185,7 +185,7 @@ class MoverFilter(FrameFilter):
         factor = coarse_factor(camera, settings)
         view = CoarseView.of(newest.depth, camera, factor, T_world_newest, margin, self.context)
         kept = self._views.of(fitting, camera, factor, margin, self.context)
-        passed = passed_in_voxels(
+        passed = find_passed_parts(
             kept, poses, view, trail.keys, TrailTuning.voxel_m, TrailTuning.min_in_trail, margin, self.context
         )
         found: dict[int, np.ndarray] = {}
