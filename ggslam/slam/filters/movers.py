@@ -124,9 +124,11 @@ class MoverFilter(FrameFilter):
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
         T_world_camera = result.T_world_camera if known else None
         swift = self._is_swift(frame, T_world_camera, result.median_depth_m)
-        self.detector.look(shown, T_world_camera, self._margin, self.context, result.status in SURE, swift)
+        view = RecentFrame(shown, result.T_world_camera, self._margin)
+        sure = result.status in SURE
+        self.detector.look(shown, T_world_camera, self._margin, self.context, sure, swift, view.segments)
         if known:
-            self.tracks.look(RecentFrame(shown, result.T_world_camera, self._margin), self.detector.things)
+            self.tracks.look(view, self.detector.things)
         else:
             self.tracks.clear()
         mask = self.detector.mask
