@@ -87,52 +87,26 @@ class CoarseView:
         context: NativeContext,
     ) -> CoarseView:  # fmt: skip
         """Of a depth image float32 [H, W]; rows and columns left over are cut."""
-        return DepthPlaces.of(depth, camera, factor, context).view(T_world_camera, margin)
+        around, window = np.ones((3, 3), np.uint8), window_of(factor)
+        nearest, farthest, least, count, total, squares = _depth_places(depth, factor, window // 2, context)
+        mean = total / np.maximum(count, 1)
+        spread = squares / np.maximum(count, 1) - mean * mean
+        smooth = (count >= PlaceTuning.min_known * window**2) & (
+            spread < (PlaceTuning.smooth_sigmas * margin.sigma(mean)) ** 2
+        )
+        value = np.where(smooth, mean, thin_out(depth, factor))
+        near, far = np.where(smooth, mean, nearest), np.where(smooth, mean, farthest)
+        whole = cv2.erode(((least > 0) | smooth).astype(np.uint8), around) > 0
+        whole[[0, -1]] = whole[:, [0, -1]] = False  # what is about them is not in the image
+        near, far = cv2.erode(near, around), cv2.dilate(far, around)
+        small, T_world_camera = small_camera(camera, factor), np.array(T_world_camera, float)
+        return CoarseView(small, T_world_camera, value, near, far, whole, smooth)
 
     def move(self, T_new_old: np.ndarray) -> CoarseView:
         """The same after the world about it was moved by [4, 4]."""
         return CoarseView(
             self.camera, T_new_old @ self.T_world_camera, self.depth, self.near, self.far, self.whole, self.smooth
         )
-
-
-@dataclass(frozen=True)
-class DepthPlaces:
-    """What a view is made of, wherever it is and whatever the noise.
-
-    Attributes:
-        camera: of the small image.
-        factor: how many times it is smaller.
-        about: float32 [6, h, w], see `DepthPlacesJob`.
-        middle: float32 [h, w], metres, depth of the middle pixels.
-    """
-
-    camera: Camera
-    factor: int
-    about: np.ndarray
-    middle: np.ndarray
-
-    @staticmethod
-    def of(depth: np.ndarray, camera: Camera, factor: int, context: NativeContext) -> DepthPlaces:
-        """Of a depth image float32 [H, W], metres; rows and columns left over are cut."""
-        about = _depth_places(depth, factor, window_of(factor) // 2, context)
-        return DepthPlaces(small_camera(camera, factor), factor, about, thin_out(depth, factor))
-
-    def view(self, T_world_camera: np.ndarray, margin: Margin) -> CoarseView:
-        """The view from a pose [4, 4]."""
-        around, window = np.ones((3, 3), np.uint8), window_of(self.factor)
-        nearest, farthest, least, count, total, squares = self.about
-        mean = total / np.maximum(count, 1)
-        spread = squares / np.maximum(count, 1) - mean * mean
-        smooth = (count >= PlaceTuning.min_known * window**2) & (
-            spread < (PlaceTuning.smooth_sigmas * margin.sigma(mean)) ** 2
-        )
-        value = np.where(smooth, mean, self.middle)
-        near, far = np.where(smooth, mean, nearest), np.where(smooth, mean, farthest)
-        whole = cv2.erode(((least > 0) | smooth).astype(np.uint8), around) > 0
-        whole[[0, -1]] = whole[:, [0, -1]] = False  # what is about them is not in the image
-        near, far = cv2.erode(near, around), cv2.dilate(far, around)
-        return CoarseView(self.camera, np.array(T_world_camera, float), value, near, far, whole, smooth)
 
 
 def thin_out(image: np.ndarray, factor: int) -> np.ndarray:
