@@ -52,7 +52,7 @@ def render(n: int, boxes: list[tuple[np.ndarray, int]], ids: bool = True, noise:
 
 def view_of(frame: Frame) -> RecentFrame:
     """As movers are followed in it."""
-    return RecentFrame.of(frame, camera_pose(frame.index), lambda z: np.full_like(z, 0.006))
+    return RecentFrame(frame, camera_pose(frame.index), lambda z: np.full_like(z, 0.006))
 
 
 def error(T: np.ndarray, T_true: np.ndarray) -> tuple[float, float]:

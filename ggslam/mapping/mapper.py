@@ -307,6 +307,10 @@ class Mapper(ABC):
             at_end: before the final refinement: exposures are measured again first, and every difference counts.
         """
 
+    def latest_poses(self, count: int) -> np.ndarray:
+        """T_world_camera of the latest keyframes, so many or all there are, float64 [n, 4, 4], as refined so far."""
+        return inverse(np.array([keyframe.T_camera_world for keyframe in self.keyframes[-count:]]))
+
     def move_keyframes(self, T_new_old: np.ndarray) -> None:
         """Moves keyframes, and with each the Gaussians that it inserted.
 

@@ -8,6 +8,7 @@ connected; what is seen once, or is too small, is noise.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -89,7 +90,7 @@ class MoverDetector:
 
     def look(
         self, frame: Frame, T_world_camera: np.ndarray | None, margin: Margin, context: NativeContext,
-        sure: bool = True, swift: bool = False,
+        sure: bool = True, swift: bool = False, load_mask: Callable[[], np.ndarray | None] | None = None,
     ) -> None:  # fmt: skip
         """Finds what moves in a frame: `mask`.
 
@@ -101,6 +102,7 @@ class MoverDetector:
             sure: whether the pose is; if it is not, nothing begins to move.
             swift: whether the camera moved so fast that shutters warp its images: nothing begins to move, and no later
                 frame is held to this one.
+            load_mask: gives the frame's masks, if not the frame itself is to read them.
         """
         self.mask = self.things = None
         if T_world_camera is None:
@@ -127,7 +129,7 @@ class MoverDetector:
             return
         rests, judged, shape = stayed & ~left, stayed | left, frame.depth.shape
         places = Gathering(novel, passed > 0, known, rests, judged, view.depth, same > passed, factor, shape)
-        found = gather(places, frame.load_mask, s, moving)
+        found = gather(places, load_mask or frame.load_mask, s, moving)
         most = known if moved is None else view.depth > 0  # what moves may hide most of what was seen before
         if found is None or found.small.sum() > s.max_share * most.sum():
             return

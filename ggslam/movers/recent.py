@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.movers.patches import Patch, patch_of
-from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 
 
@@ -18,47 +17,37 @@ class RecentFrame:
     """A located frame as the movers saw it.
 
     Attributes:
-        index: `Frame.index`.
-        depth, color, camera, load_mask: of the frame.
+        frame: what it holds is not copied.
         T_world_camera: float64 [4, 4].
         margin: metres by which depths of one surface differ there, by depth.
     """
 
-    index: int
-    depth: np.ndarray
-    color: np.ndarray
-    camera: Camera
-    load_mask: Callable[[], np.ndarray | None]
+    frame: Frame
     T_world_camera: np.ndarray
     margin: Callable[[np.ndarray], np.ndarray]
     _segments: np.ndarray | None = None
 
-    @staticmethod
-    def of(frame: Frame, T_world_camera: np.ndarray, margin: Callable[[np.ndarray], np.ndarray]) -> RecentFrame:
-        """Holds what the frame holds, and copies nothing."""
-        return RecentFrame(frame.index, frame.depth, frame.color, frame.camera, frame.load_mask, T_world_camera, margin)
-
     def segments(self) -> np.ndarray | None:
         """The recording's masks, uint16 [H, W], read once."""
         if self._segments is None:
-            self._segments = self.load_mask()
+            self._segments = self.frame.load_mask()
         return self._segments
 
     def show(self, mask: np.ndarray) -> Sight | None:
         """What is on a mask bool [H, W]; None: too little."""
-        patch = patch_of(mask, self.depth, self.color, self.camera)
+        patch = patch_of(mask, self.frame.depth, self.frame.color, self.frame.camera)
         if patch is None:
             return None
         z = float(np.median(patch.points[:, 2]))
-        area = float(mask.sum()) * z * z / (self.camera.fx * self.camera.fy)
+        area = float(mask.sum()) * z * z / (self.frame.camera.fx * self.frame.camera.fy)
         margin = float(self.margin(np.float32(z)))
         return Sight(patch.move(self.T_world_camera), area, margin, float(mask.mean()))
 
     def show_surface(self, points: np.ndarray) -> np.ndarray:
         """Where points of a surface [n, 3], world, would be seen and something is that far: bool [H, W]."""
-        found = np.zeros(self.depth.shape, bool)
+        found = np.zeros(self.frame.depth.shape, bool)
         rows, columns, z = self.project(points)
-        there = np.abs(self.depth[rows, columns] - z) < 2 * self.margin(z.astype(np.float32)) + 0.005
+        there = np.abs(self.frame.depth[rows, columns] - z) < 2 * self.margin(z.astype(np.float32)) + 0.005
         found[rows[there], columns[there]] = True
         return found
 
@@ -66,7 +55,7 @@ class RecentFrame:
         """Rows, columns and depths of those of some points [n, 3], world, that fall into the image."""
         R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         seen = (points - t) @ R
-        rows, columns, inside = self.camera.project(seen, nearest=0.05)
+        rows, columns, inside = self.frame.camera.project(seen, nearest=0.05)
         return rows[inside], columns[inside], seen[inside, 2]
 
 

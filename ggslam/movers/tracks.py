@@ -73,12 +73,12 @@ class Track:
     def follow(self, sight: Sight, view: RecentFrame, detected: bool) -> None:
         """Takes in what a frame shows of it; `detected`: and that it moves."""
         tracker = self.tracker
-        if tracker.follow(sight.patch, sight.area, view.index, sight.margin) is None:
+        if tracker.follow(sight.patch, sight.area, view.frame.index, sight.margin) is None:
             return
         own = sight.patch.move(inverse(tracker.T_world_mover))
         low, high = np.percentile(own.points, [2, 98], axis=0)
         T = inverse(view.T_world_camera) @ tracker.T_world_mover
-        here = MoverSight(view.index, T, low, high, sight.share)
+        here = MoverSight(view.frame.index, T, low, high, sight.share)
         if self.latest is None or not tracker.flexible or len(own) >= len(self.latest):
             self.latest = own
         if tracker.stands:
@@ -155,12 +155,14 @@ class MoverTracks:
             view: the frame.
             things: int32 [H, W], number of the moving thing at each pixel, 0 without one; None: nothing moves.
         """
-        active = [track for track in self.tracks if not track.settled]
-        if things is not None or active:
-            self._follow(view, things, active)
+        if things is not None or self.tracks:
+            self._follow(view, things)
         self.recent = [*self.recent[1 - TrackTuning.remembered_frames :], view]
 
-    def _follow(self, view: RecentFrame, things: np.ndarray | None, active: list[Track]) -> None:
+    def _follow(self, view: RecentFrame, things: np.ndarray | None) -> None:
+        active = [track for track in self.tracks if not track.settled]
+        if things is None and not active:
+            return
         segments = view.segments()
         masks = {} if things is None else self._assign(view, things, segments)
         for track in {id(t): t for t in [*active, *(self.tracks[k] for k in masks)]}.values():
@@ -174,7 +176,7 @@ class MoverTracks:
             sight = view.show(mask)
             if sight is not None:
                 track.follow(sight, view, detected is not None)
-            if detected is None and track.is_over(view.index):
+            if detected is None and track.is_over(view.frame.index):
                 track.finish()
 
     def _assign(self, view: RecentFrame, things: np.ndarray, segments: np.ndarray | None) -> dict[int, np.ndarray]:
@@ -211,7 +213,7 @@ class MoverTracks:
         taken = {track.number for track in self.tracks}
         free = next(n for n in range(1, len(taken) + 2) if n not in taken)
         number = instance if instance is not None and instance not in taken else free
-        track = Track(number, instance, view.index)
+        track = Track(number, instance, view.frame.index)
         self.tracks.append(track)
         if instance is None:
             return
@@ -224,7 +226,7 @@ class MoverTracks:
     @staticmethod
     def _place_of(track: Track, view: RecentFrame) -> np.ndarray:
         """Where a mover without a segment is seen that was not found to move."""
-        points = transform_points(track.tracker.surface.points, track.tracker.predict(view.index))
+        points = transform_points(track.tracker.surface.points, track.tracker.predict(view.frame.index))
         return view.show_surface(points)
 
     def clear(self) -> None:
@@ -250,7 +252,7 @@ class MoverTracks:
 def view_share(view: RecentFrame, track: Track, mask: np.ndarray) -> float:
     """Share of a mover's surface, where it is expected in a view, that is on a mask bool [H, W]."""
     assert track.latest is not None
-    points = transform_points(track.latest.points, track.tracker.predict(view.index))
+    points = transform_points(track.latest.points, track.tracker.predict(view.frame.index))
     rows, columns, _ = view.project(points)
     return float(mask[rows, columns].sum()) / max(1, len(points))
 

@@ -12,10 +12,9 @@ from ggslam.geometry.image_parts import parts_with_seeds
 from ggslam.geometry.voxels import neighbour_step, voxel_keys
 from ggslam.movers.segments import Gathering, gather
 from ggslam.movers.settings import MoverSettings
-from ggslam.native.loader import NativeContext
 from ggslam.scene.poses import transform_points
-from ggslam.sight.margin import Margin
-from ggslam.sight.places import CoarseView, compare
+from ggslam.sight.passed_voxels import PassedParts
+from ggslam.sight.places import CoarseView, PairEvidence
 from ggslam.system.array_forms import Form
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
@@ -63,22 +62,26 @@ class Trail:
         return (self.keys[at] == keys).reshape(view.depth.shape) & (view.depth > 0)
 
 
+def which_may_be_gone(passed: PassedParts, has_segments: np.ndarray, settings: MoverSettings) -> list[int]:
+    """The views of which enough is looked past for something to be gone, see `gone_since`; `has_segments`: bool [n]."""
+    large_enough = has_segments | (passed.largest >= settings.min_pixels)
+    return np.flatnonzero((passed.places >= settings.min_pixels / 4) & large_enough).tolist()
+
+
 def gone_since(
-    earlier: CoarseView, newest: CoarseView, trail: Trail, segments: np.ndarray | None,
-    shape: tuple[int, int], factor: int, margin: Margin, settings: MoverSettings, context: NativeContext,
+    earlier: CoarseView, evidence: PairEvidence, trail: Trail, segments: np.ndarray | None,
+    shape: tuple[int, int], factor: int, settings: MoverSettings,
 ) -> np.ndarray | None:  # fmt: skip
     """What an earlier view shows where a mover has been since, and the newest view looks through.
 
     Args:
         earlier: a view.
-        newest: without what moves in it now.
+        evidence: of the newest view about it, without what moves in that one now.
         trail: of movers.
         segments: ids uint16 [H, W] of the earlier view, or None.
         shape: of its image, (H, W).
         factor: how many times the views are smaller.
-        margin: see there.
         settings: how much of a segment has to be gone.
-        context: that it is computed in.
 
     Returns:
         bool [H, W]; None: nothing.
@@ -86,7 +89,6 @@ def gone_since(
     near = trail.contains(earlier)
     if near.sum() < settings.min_pixels / 4:
         return None
-    (evidence,) = compare(earlier, [newest], margin, context)
     # Movers are found by the side that goes ahead: the rest of what has gone hangs on what lies in their trail.
     passed = parts_with_seeds(evidence.passed & near, evidence.passed, TrailTuning.min_in_trail)
     if passed.sum() < settings.min_pixels / 4:

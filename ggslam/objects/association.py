@@ -19,6 +19,7 @@ from ggslam.objects.consistency import ConsistencyJudge
 from ggslam.objects.evidence import PairEvidence
 from ggslam.objects.fragments import Fragment, FragmentMemory
 from ggslam.objects.overlap import MapView, SegmentOverlap, distinct_ids, overlap_of
+from ggslam.objects.segment_points import SegmentPoints
 from ggslam.objects.settings import IDS, AssociationSettings
 from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import Form, ObjectId
@@ -181,8 +182,9 @@ class Associator:
         parts: dict[int, Fragment] = {}
         planes: dict[int, BoundingPlane] = {}
         if camera is not None and T_world_camera is not None:
-            parts = self._fragments.observe(overlap, best, depth, camera, T_world_camera)
-            planes = self._planes.look(overlap, depth, camera, T_world_camera)
+            points = SegmentPoints(overlap, depth, camera)
+            parts = self._fragments.observe(points, best, T_world_camera)
+            planes = self._planes.look(points, T_world_camera)
         return best, parts, planes
 
     def _own_ids(self, segments: np.ndarray, overlap: SegmentOverlap) -> Association:
@@ -217,14 +219,13 @@ class Associator:
                     self._evidence.take_over(parts[k].parent, int(ids[k]), parts[k].together, parts[k].apart)
                 parts[k].object_id = int(ids[k])
                 covered[k] = False
-        image = ids[overlap.row]
-        self._keep_known(image, overlap, covered, best, parts, planes)
+        labels = self._label_pairs(ids, overlap, covered, best, parts, planes)
         self._evidence.observe(overlap, overlap.touching)
         merges = self._evidence.merges()
         for kept, dropped in merges:
             self._rename(kept, dropped)
         splits = [(part.parent, part.object_id) for part in parts.values() if part.object_id]
-        return Association(self._current[image] if merges else image, merges, created, splits)
+        return Association(overlap.draw(self._current[labels] if merges else labels), merges, created, splits)
 
     def _find_covered(self, overlap: SegmentOverlap) -> np.ndarray:
         """bool [S, O]: objects that a segment has as a whole, or with a large share of both."""
@@ -250,22 +251,23 @@ class Associator:
         best[accepted] = chosen[accepted]
         return best
 
-    def _keep_known(
-        self, image: np.ndarray, overlap: SegmentOverlap, covered: np.ndarray, best: np.ndarray, parts: Collection[int],
+    def _label_pairs(
+        self, ids: np.ndarray, overlap: SegmentOverlap, covered: np.ndarray, best: np.ndarray, parts: Collection[int],
         planes: Collection[int],
-    ) -> None:  # fmt: skip
-        """Where a segment has several objects, the map's labels stand, and new ground is nobody's unless one object
-        dominates, or the segment is a floor or a wall, of which corners were seen before."""
+    ) -> np.ndarray:  # fmt: skip
+        """uint16 [S + 1, O + 1]: the label where segment and object meet, by the ids of segments [S + 1]; the last ones
+        are none. Where a segment has several objects, the map's labels stand, and new ground is nobody's unless one
+        object dominates, or the segment is a floor or a wall, of which corners were seen before."""
         rows = np.array([k for k in np.flatnonzero(best >= 0) if k not in parts], int)
         covered[rows, best[rows]] = True
-        for k in np.flatnonzero(covered.sum(1) > 1):
-            inside = overlap.row == k
-            column = overlap.column[inside]
-            keep = (column >= 0) & covered[k, column]
-            label = np.where(keep, overlap.objects[column], image[inside])
-            if overlap.within[k].max() < MatchTuning.dominant and k not in planes:
-                label[column < 0] = 0
-            image[inside] = label
+        several = covered.sum(1) > 1
+        labels = np.repeat(ids[:, None], len(overlap.objects) + 1, axis=1)
+        labels[:-1, :-1] = np.where(covered & several[:, None], overlap.objects, labels[:-1, :-1])
+        within = overlap.within
+        for k in np.flatnonzero(several).tolist():
+            if within[k].max() < MatchTuning.dominant and k not in planes:
+                labels[k, -1] = 0
+        return labels
 
     def _new_id(self, wanted: int) -> int:
         """The mask's own id if no object ever had it, else the next one free; 0 when none is left."""

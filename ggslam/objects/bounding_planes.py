@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ggslam.objects.overlap import SegmentOverlap
-from ggslam.scene.camera import Camera
+from ggslam.objects.segment_points import SegmentPoints
 from ggslam.system.array_forms import ObjectId, Vector3
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
@@ -59,33 +58,22 @@ class BoundingPlanes:
     def __init__(self) -> None:
         self._of = {}
 
-    def look(
-        self, overlap: SegmentOverlap, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
-    ) -> dict[int, BoundingPlane]:
+    def look(self, points: SegmentPoints, T_world_camera: np.ndarray) -> dict[int, BoundingPlane]:
         """The planes of those segments of a keyframe that bound the room, by number of the segment. Of several on one
         plane only the largest: the others are pictures on the wall or rugs on the floor."""
-        z = depth[::BoundingPlaneTuning.stride, ::BoundingPlaneTuning.stride].ravel()
-        seen = np.flatnonzero(z > 0)
-        rays = camera.rays()[::BoundingPlaneTuning.stride, ::BoundingPlaneTuning.stride].reshape(-1, 3)
-        points = rays[seen].astype(np.float64) * z[seen][:, None]
-        row = overlap.row[::BoundingPlaneTuning.stride, ::BoundingPlaneTuning.stride].ravel()[seen]
+        tuning, R, t = BoundingPlaneTuning, T_world_camera[:3, :3], T_world_camera[:3, 3]
+        area = points.overlap.area
+        order = np.argsort(-area, kind="stable")
+        large = order[area[order] >= tuning.min_area * points.depth.size]
+        planes = points.fit_planes(large, tuning.stride, tuning.flat_m, tuning.min_on_plane, tuning.behind_m)
         found: dict[int, BoundingPlane] = {}
-        order = np.argsort(-overlap.area, kind="stable")
-        for k in order[overlap.area[order] >= BoundingPlaneTuning.min_area * overlap.row.size].tolist():
-            own = points[row == k]
-            plane = _fit(own) if len(own) >= 10 else None
-            if plane is None:
+        for k, plane in zip(large.tolist(), planes, strict=True):
+            if plane is None or plane.behind >= tuning.max_behind:
                 continue
-            normal, offset = plane
-            if (
-                np.mean(points @ normal - offset < -BoundingPlaneTuning.behind_m * np.maximum(1, points[:, 2] / 2))
-                < BoundingPlaneTuning.max_behind
-            ):
-                world = T_world_camera[:3, :3] @ normal
-                middle = T_world_camera[:3, :3] @ own.mean(0) + T_world_camera[:3, 3]
-                bounding = BoundingPlane(world, float(offset + world @ T_world_camera[:3, 3]), middle)
-                if not any(_are_one(bounding, other) for other in found.values()):
-                    found[k] = bounding
+            world = R @ plane.normal
+            bounding = BoundingPlane(world, float(plane.offset + world @ t), R @ plane.middle + t)
+            if not any(_are_one(bounding, other) for other in found.values()):
+                found[k] = bounding
         return found
 
     def object_on(self, plane: BoundingPlane) -> int:
@@ -119,20 +107,3 @@ def _are_one(plane: BoundingPlane, other: BoundingPlane) -> bool:
         plane.normal @ other.normal > BoundingPlaneTuning.same_direction
         and max(here, there) < BoundingPlaneTuning.same_place_m
     )
-
-
-def _fit(points: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Unit normal towards the camera and offset of the plane that most of the points [n, 3] lie on; None: no plane."""
-    near = np.ones(len(points), bool)
-    for _ in range(3):
-        if near.sum() < 10:
-            return None
-        centre = points[near].mean(0)
-        normal = np.linalg.eigh(np.cov((points[near] - centre).T))[1][:, 0]
-        away = np.abs((points - centre) @ normal)
-        near = away <= max(float(np.median(away)) * 3, 1e-3)
-    if np.mean(away < BoundingPlaneTuning.flat_m * np.maximum(1, points[:, 2] / 3)) < BoundingPlaneTuning.min_on_plane:
-        return None
-    if normal @ centre > 0:
-        normal = -normal
-    return normal, float(normal @ centre)

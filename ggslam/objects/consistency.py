@@ -54,8 +54,7 @@ class ConsistencyJudge:
             segments: uint16 [H, W], the mask as stored.
             overlap: of this mask with the map.
         """
-        changed = self._has_changed(segments)
-        if self.consistent is False or not changed:
+        if self.consistent is False or not self._has_changed(segments):
             return self.consistent
         agreement = agreement_of(overlap)
         if agreement is not None:

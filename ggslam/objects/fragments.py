@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ggslam.objects.overlap import SegmentOverlap
+from ggslam.objects.segment_points import SegmentPoints
 from ggslam.objects.settings import AssociationSettings
-from ggslam.scene.camera import Camera
 from ggslam.system.array_forms import ObjectId, Vector3
 from ggslam.system.savable import savable
 from ggslam.system.tuning import Tuning
@@ -74,15 +74,14 @@ class FragmentMemory:
         """Parent -> its fragments."""
 
     def observe(
-        self, overlap: SegmentOverlap, best: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
+        self, points: SegmentPoints, best: np.ndarray, T_world_camera: np.ndarray
     ) -> dict[int, Fragment]:
         """Takes a keyframe into account.
 
         Args:
-            overlap: of its segments with the objects.
+            points: of its segments.
             best: int [S], number of the object each segment belongs to, -1 = none.
-            depth: float32 [H, W], metres.
-            camera, T_world_camera: where the keyframe was taken.
+            T_world_camera: where the keyframe was taken.
 
         Returns:
             Segment number -> fragment, of the segments that are or have become objects of their own
@@ -90,9 +89,11 @@ class FragmentMemory:
         """
         found: dict[int, Fragment] = {}
         seen: list[Fragment] = []
+        overlap = points.overlap
         minor = self._minor_segments(overlap, best)
-        extents = _extents(minor, overlap.row, depth, camera, T_world_camera)
-        for k, (centre, radius) in zip(minor, extents, strict=True):
+        centres, radii = points.find_extents(np.array(minor))
+        centres = centres @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        for k, centre, radius in zip(minor, centres, radii.tolist(), strict=True):
             now = Fragment(int(overlap.objects[best[k]]), centre, radius)
             if radius == 0:
                 continue
@@ -108,7 +109,7 @@ class FragmentMemory:
             seen.append(known)
             if known.object_id or self._is_proven(known):
                 found[k] = known
-        self._note_absent(seen, minor, overlap, best, depth, camera, T_world_camera)
+        self._note_absent(seen, minor, points, best, T_world_camera)
         return found
 
     def rename(self, kept: int, dropped: int) -> None:
@@ -145,10 +146,10 @@ class FragmentMemory:
         ].tolist()
 
     def _note_absent(
-        self, seen: list[Fragment], minor: list[int], overlap: SegmentOverlap, best: np.ndarray, depth: np.ndarray,
-        camera: Camera, T_world_camera: np.ndarray,
-    ) -> None:  # fmt: skip
+        self, seen: list[Fragment], minor: list[int], view: SegmentPoints, best: np.ndarray, T_world_camera: np.ndarray
+    ) -> None:
         """Fragments whose place is in view, but in the segment of the rest of their object."""
+        overlap = view.overlap
         present = {id(fragment) for fragment in seen}
         visible = [f for parent in overlap.objects.tolist() for f in self._of.get(parent, [])]
         absent = [f for f in visible if not f.object_id and id(f) not in present]
@@ -156,27 +157,11 @@ class FragmentMemory:
             return
         R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
         points = (np.stack([f.centre for f in absent]) - t) @ R
-        rows, columns, inside = camera.project(points)
+        rows, columns, inside = view.camera.project(points)
         for k in np.flatnonzero(inside):
             y, x = int(rows[k]), int(columns[k])
             segment, fragment = int(overlap.row[y, x]), absent[k]
-            if segment < 0 or segment in minor or abs(depth[y, x] - points[k, 2]) > 2 * fragment.radius:
+            if segment < 0 or segment in minor or abs(view.depth[y, x] - points[k, 2]) > 2 * fragment.radius:
                 continue
             if best[segment] >= 0 and overlap.objects[best[segment]] == fragment.parent:
                 fragment.together += 1
-
-
-def _extents(
-    segments: list[int], row: np.ndarray, depth: np.ndarray, camera: Camera, T_world_camera: np.ndarray
-) -> list[tuple[np.ndarray, float]]:
-    """Centre (world) and radius of the points of some segments; radius 0: no depth."""
-    place = np.full(int(row.max(initial=0)) + 2, -1)  # the last one: no segment
-    place[segments] = np.arange(len(segments))
-    inside = np.flatnonzero((place[row] >= 0) & (depth > 0))
-    which, n = place[row.ravel()[inside]], len(segments)
-    points = camera.rays().reshape(-1, 3)[inside] * depth.ravel()[inside][:, None].astype(np.float64)
-    count = np.maximum(np.bincount(which, minlength=n), 1)
-    centre = np.stack([np.bincount(which, points[:, k], n) / count for k in range(3)], 1)
-    square = np.bincount(which, ((points - centre[which]) ** 2).sum(1), n) / count
-    world = centre @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-    return list(zip(world, np.sqrt(square).tolist(), strict=True))

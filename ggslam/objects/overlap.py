@@ -70,6 +70,16 @@ class SegmentOverlap:
         """float [S, O]: share of the object's segmented visible pixels that the segment has."""
         return self.shared / np.maximum(self.shared.sum(0), 1)
 
+    def draw(self, labels: np.ndarray) -> np.ndarray:
+        """An image uint16 [H, W] of `labels` uint16 [S + 1, O + 1], by segment and object of each pixel; the last row
+        and column are for none."""
+        labels, image = np.ascontiguousarray(labels, np.uint16), np.empty(self.row.shape, np.uint16)
+        job = core.PairLabelsJob(
+            address(self.row), address(self.column), address(labels), image.size, *self.shared.shape, address(image)
+        )
+        load_library().ggslam_label_pairs(ctypes.byref(job))
+        return image
+
 
 def distinct_ids(ids: np.ndarray) -> np.ndarray:
     """The distinct ids of a uint16 image but 0, ascending."""

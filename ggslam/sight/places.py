@@ -22,6 +22,7 @@ from ggslam.abi.core import (
     DepthPlacesJob,
     OtherPlacesView,
     PlacesEvidenceJob,
+    PlacesRule,
     PlacesView,
 )
 from ggslam.native.loader import NativeContext, load_library
@@ -86,52 +87,26 @@ class CoarseView:
         context: NativeContext,
     ) -> CoarseView:  # fmt: skip
         """Of a depth image float32 [H, W]; rows and columns left over are cut."""
-        return DepthPlaces.of(depth, camera, factor, context).view(T_world_camera, margin)
+        around, window = np.ones((3, 3), np.uint8), window_of(factor)
+        nearest, farthest, least, count, total, squares = _depth_places(depth, factor, window // 2, context)
+        mean = total / np.maximum(count, 1)
+        spread = squares / np.maximum(count, 1) - mean * mean
+        smooth = (count >= PlaceTuning.min_known * window**2) & (
+            spread < (PlaceTuning.smooth_sigmas * margin.sigma(mean)) ** 2
+        )
+        value = np.where(smooth, mean, thin_out(depth, factor))
+        near, far = np.where(smooth, mean, nearest), np.where(smooth, mean, farthest)
+        whole = cv2.erode(((least > 0) | smooth).astype(np.uint8), around) > 0
+        whole[[0, -1]] = whole[:, [0, -1]] = False  # what is about them is not in the image
+        near, far = cv2.erode(near, around), cv2.dilate(far, around)
+        small, T_world_camera = small_camera(camera, factor), np.array(T_world_camera, float)
+        return CoarseView(small, T_world_camera, value, near, far, whole, smooth)
 
     def move(self, T_new_old: np.ndarray) -> CoarseView:
         """The same after the world about it was moved by [4, 4]."""
         return CoarseView(
             self.camera, T_new_old @ self.T_world_camera, self.depth, self.near, self.far, self.whole, self.smooth
         )
-
-
-@dataclass(frozen=True)
-class DepthPlaces:
-    """What a view is made of, wherever it is and whatever the noise.
-
-    Attributes:
-        camera: of the small image.
-        factor: how many times it is smaller.
-        about: float32 [6, h, w], see `DepthPlacesJob`.
-        middle: float32 [h, w], metres, depth of the middle pixels.
-    """
-
-    camera: Camera
-    factor: int
-    about: np.ndarray
-    middle: np.ndarray
-
-    @staticmethod
-    def of(depth: np.ndarray, camera: Camera, factor: int, context: NativeContext) -> DepthPlaces:
-        """Of a depth image float32 [H, W], metres; rows and columns left over are cut."""
-        about = _depth_places(depth, factor, window_of(factor) // 2, context)
-        return DepthPlaces(small_camera(camera, factor), factor, about, thin_out(depth, factor))
-
-    def view(self, T_world_camera: np.ndarray, margin: Margin) -> CoarseView:
-        """The view from a pose [4, 4]."""
-        around, window = np.ones((3, 3), np.uint8), window_of(self.factor)
-        nearest, farthest, least, count, total, squares = self.about
-        mean = total / np.maximum(count, 1)
-        spread = squares / np.maximum(count, 1) - mean * mean
-        smooth = (count >= PlaceTuning.min_known * window**2) & (
-            spread < (PlaceTuning.smooth_sigmas * margin.sigma(mean)) ** 2
-        )
-        value = np.where(smooth, mean, self.middle)
-        near, far = np.where(smooth, mean, nearest), np.where(smooth, mean, farthest)
-        whole = cv2.erode(((least > 0) | smooth).astype(np.uint8), around) > 0
-        whole[[0, -1]] = whole[:, [0, -1]] = False  # what is about them is not in the image
-        near, far = cv2.erode(near, around), cv2.dilate(far, around)
-        return CoarseView(self.camera, np.array(T_world_camera, float), value, near, far, whole, smooth)
 
 
 def thin_out(image: np.ndarray, factor: int) -> np.ndarray:
@@ -192,18 +167,14 @@ def compare(
     alive: list[np.ndarray] = []
     asked = (OtherPlacesView * len(others))()
     for one, other in zip(asked, others, strict=True):
-        one.places = _places(other, alive)
+        one.places = native_places(other, alive)
         T = (inverse(other.T_world_camera) @ view.T_world_camera)[:3].astype(np.float32)
         one.T_this_view[:] = T.ravel().tolist()
     found = np.empty((len(others), 5, *view.depth.shape), bool)
-    job = PlacesEvidenceJob(_places(view, alive), ctypes.addressof(asked), len(others))
+    job = PlacesEvidenceJob(native_places(view, alive), ctypes.addressof(asked), len(others))
     if moved is not None:
         job.moved = address(_of_places(moved, np.uint8, view, alive))
-    job.margin = margin.native()
-    t = PlaceTuning
-    job.rough, job.least_share, job.nearest = t.rough_sigmas, t.min_noise_share, t.nearest_factor
-    job.every, job.fewest = t.stride, t.min_places
-    job.found = address(found)
+    job.rule, job.found = native_rule(margin), address(found)
     load_library().ggslam_places_evidence(context.handle, ctypes.byref(job))
     return [PairEvidence(*images) for images in found]
 
@@ -218,8 +189,20 @@ def _depth_places(depth: np.ndarray, factor: int, reach: int, context: NativeCon
     return found
 
 
-def _places(view: CoarseView, alive: list[np.ndarray]) -> PlacesView:
-    """A view as the core takes it; `alive` gets arrays that must outlive it."""
+def native_rule(margin: Margin) -> PlacesRule:
+    """How views are compared, as the core takes it."""
+    t = PlaceTuning
+    return PlacesRule(
+        margin.native(), t.rough_sigmas, t.min_noise_share, t.nearest_factor, t.stride, t.min_places
+    )  # fmt: skip
+
+
+def native_places(view: CoarseView, alive: list[np.ndarray]) -> PlacesView:
+    """A view as the core takes it; `alive` gets arrays that must outlive it.
+
+    Raises:
+        ValueError: an array has another shape than the view's camera.
+    """
     camera = view.camera
     images = [_of_places(image, np.float32, view, alive) for image in (view.depth, view.near, view.far)]
     images += [_of_places(image, np.uint8, view, alive) for image in (view.whole, view.smooth)]

@@ -40,6 +40,10 @@ class MapRemoval:
         """Of the map so far."""
         return self._mapper.keyframes
 
+    def latest_poses(self, count: int) -> np.ndarray:
+        """T_world_camera of the latest keyframes, so many or all there are, float64 [n, 4, 4]."""
+        return self._mapper.latest_poses(count)
+
     def drop_pixels(self, mask: np.ndarray, nearest: float) -> None:
         """Removes what all keyframes show at the same pixels, or very near.
 

@@ -161,14 +161,16 @@ def test_what_an_earlier_view_shows_at_the_trail_is_gone(ids: bool) -> None:
     settings, trail = MoverSettings(enabled=True), Trail()
     before, now = frame(0, 0.0, ids=ids), frame(20, None)
     old, new = (CoarseView.of(f.depth, CAMERA, 3, pose(f.index), margin, CONTEXT) for f in (before, now))
-    nothing = gone_since(old, new, trail, before.mask, (240, 320), 3, margin, settings, CONTEXT)
+    (evidence,) = compare(old, [new], margin, CONTEXT)
+    nothing = gone_since(old, evidence, trail, before.mask, (240, 320), 3, settings)
     assert nothing is None  # nothing has moved
     trail.add(old, (old.depth < 2))
-    gone = gone_since(old, new, trail, before.mask, (240, 320), 3, margin, settings, CONTEXT)
+    gone = gone_since(old, evidence, trail, before.mask, (240, 320), 3, settings)
     assert overlap(gone, before.depth < 2) > 0.8
     still = replace(now, depth=frame(20, 0.0).depth)
     there = CoarseView.of(still.depth, CAMERA, 3, pose(20), margin, CONTEXT)
-    assert gone_since(old, there, trail, before.mask, (240, 320), 3, margin, settings, CONTEXT) is None
+    (evidence,) = compare(old, [there], margin, CONTEXT)
+    assert gone_since(old, evidence, trail, before.mask, (240, 320), 3, settings) is None
 
 
 KINECT = Margin(0.004, 0.0, 5.0, 0.008)

@@ -198,6 +198,8 @@ def test_a_closed_loop_moves_map_and_keyframes(frames: list[Frame], cuda_library
     slam.mapper.move_keyframes(T)
     after = np.stack([k.T_world_camera for k in slam.mapper.keyframes])
     assert np.allclose(after, T @ before)
+    assert np.array_equal(slam.mapper.latest_poses(2), after[-2:])
+    assert np.array_equal(slam.mapper.latest_poses(9), after)
     moved = slam.map.means.cpu().numpy() - means
     assert np.allclose(moved[birth == len(before) - 1], (0.5, 0, 0), atol=1e-5) and not moved[birth == 0].any()
     count = slam.map.count

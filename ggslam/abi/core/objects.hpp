@@ -219,6 +219,55 @@ struct OverlapJob {
   int64_t touching_count;
 };
 
+// A keyframe that falls into segments, [H, W].
+struct SegmentedDepth {
+  const int32_t* row;   // number of each pixel's segment, below `segments_end`; -1 = none
+  const float* depth;   // metres, 0 = unknown
+  const float* rays_x;  // [W], x / z of each column
+  const float* rays_y;  // [H], y / z of each row
+  int32_t height, width, segments_end;
+};
+
+// Where segments are, in the camera's frame.
+struct ExtentsJob {
+  SegmentedDepth image;
+  const int32_t* asked;  // [count], segments, all different
+  int32_t count;
+  double* centres;  // [count, 3], result: mean point, 0 without depth
+  double* squares;  // [count], result: mean square distance from it
+};
+
+// A segment's plane in the camera's frame.
+struct SegmentPlane {
+  double normal[3];  // unit, towards the camera
+  double offset;     // n . x
+  double middle[3];  // mean point of the segment
+  double behind;     // share of all points of the image that lie behind the plane
+  int32_t is_flat;   // 0: it has no plane, and the rest is 0
+};
+
+// The planes that most points of segments lie on.
+struct SegmentPlanesJob {
+  SegmentedDepth image;
+  int32_t stride;        // every n-th pixel along each axis is used
+  const int32_t* asked;  // [count], segments
+  int32_t count;
+  double flat_m;        // on the plane are points nearer than this up to 3 m of depth, beyond in proportion
+  double min_on_plane;  // smallest share of a flat segment's points there
+  double behind_m;      // behind it are points from this distance on up to 2 m of depth, beyond in proportion
+  SegmentPlane* planes;  // [count], result
+};
+
+// Labels for the pixels of an image [pixels], by the numbers of their segments and objects.
+struct PairLabelsJob {
+  const int32_t* row;      // [pixels], below `rows`; -1 = none, which is the last row of `labels`
+  const int32_t* column;   // [pixels], below `columns`; -1 = none, which is the last column
+  const uint16_t* labels;  // [rows + 1, columns + 1]
+  int64_t pixels;
+  int32_t rows, columns;
+  uint16_t* image;  // [pixels], result
+};
+
 }  // namespace ggslam
 
 // Each works in the calling thread.
@@ -237,4 +286,7 @@ GGSLAM_EXPORT int ggslam_outlier_colors(const ggslam::OutlierColorsJob* job);
 GGSLAM_EXPORT int ggslam_clean_segments(const ggslam::CleaningJob* job);
 GGSLAM_EXPORT int ggslam_trust_borders(const ggslam::TrustJob* job);
 GGSLAM_EXPORT int ggslam_segment_overlap(ggslam::OverlapJob* job);  // what there is no room for is counted, not written
+GGSLAM_EXPORT int ggslam_label_pairs(const ggslam::PairLabelsJob* job);
+GGSLAM_EXPORT int ggslam_segment_extents(const ggslam::ExtentsJob* job);
+GGSLAM_EXPORT int ggslam_segment_planes(const ggslam::SegmentPlanesJob* job);
 GGSLAM_EXPORT int ggslam_mark_ids(const uint16_t* ids, int64_t count, uint8_t* there);  // there [65536]: 1 of each id

@@ -96,20 +96,46 @@ struct OtherPlacesView {
   float T_this_view[12];  // rows of [R t]: from the camera of the view that is asked about to this one's
 };
 
+// How far depths of one surface may differ. Of the noise's part counts a share: `rough` where one of two views is not
+// smooth, else measured: `nearest` times what the median tells of every `every`th place that is smooth in both, within
+// [least_share, rough]; `rough` with fewer than `fewest`.
+struct PlacesRule {
+  SightMargin margin;
+  float rough, least_share, nearest;
+  int32_t every, fewest;
+};
+
 // What other views say of the places of a view.
 struct PlacesEvidenceJob {
   PlacesView view;
   const OtherPlacesView* others;
   int32_t count;  // of them
   const uint8_t* moved;    // [height, width] of `view`, not 0: says nothing of how depths differ; may be null
-  // How far depths of one surface may differ. Of the noise's part counts a share: `rough` where one of the views is not
-  // smooth, else measured: `nearest` times what the median tells of every `every`th smooth place, within
-  // [least_share, rough]; `rough` with fewer than `fewest`.
-  SightMargin margin;
-  float rough, least_share, nearest;
-  int32_t every, fewest;
+  PlacesRule rule;
   // Results [count, 5, height, width], 0 or 1: the other view looked past the place; by twice the margin; this, and both
   // smooth; saw a surface there; sees nothing but others.
+  uint8_t* found;
+};
+
+// Places of a view that another one looks past, in parts of which enough lies in some voxels.
+struct PassedPlaces {
+  int32_t all, largest;  // in all such parts, and in the largest one
+};
+
+// What a newer view says of earlier ones where it looks past places of theirs that lie in some voxels.
+struct PassedVoxelsJob {
+  const PlacesView* earlier;      // [count], all of one size
+  const double* T_world_earlier;  // [count, 12] rows of [R t]
+  const float* T_newest_earlier;  // [count, 12]
+  int32_t count;
+  PlacesView newest;
+  const int64_t* voxels;  // [voxel_count] sorted keys: floor(coordinate / voxel) + 2^20 of x, y, z in 21 bits each, x in
+  int64_t voxel_count;    // the highest
+  double voxel;           // edge, metres
+  double least_seeds;     // share of a part, of connected places that are looked past, that lies in the voxels
+  PlacesRule rule;
+  // Results. [count]; and [count, 5, height, width], as of `PlacesEvidenceJob`, of views with such places.
+  PassedPlaces* passed;
   uint8_t* found;
 };
 
@@ -124,3 +150,4 @@ GGSLAM_EXPORT int ggslam_fixed_to_camera(const ggslam::FixedToCameraJob* job);
 GGSLAM_EXPORT int ggslam_shrink_depth(const float* depth, int32_t height, int32_t width, int32_t factor, float* smaller);
 GGSLAM_EXPORT int ggslam_depth_places(void* context, const ggslam::DepthPlacesJob* job);
 GGSLAM_EXPORT int ggslam_places_evidence(void* context, const ggslam::PlacesEvidenceJob* job);
+GGSLAM_EXPORT int ggslam_passed_voxels(void* context, const ggslam::PassedVoxelsJob* job);

@@ -45,6 +45,7 @@ class MapRows:
         self._memory, self._kept = GrowingMemory(device), Download(1, device, torch.int32)
         self._of: tuple[object, ...] = ()  # map and arrays that are known
         self._arrays: dict[str, _Array] = {}
+        self._workspace_bytes = 0
 
     # --- that come ---------------------------------------------------------------------------------------------------
 
@@ -95,16 +96,10 @@ class MapRows:
         job, count = self._rows, len(gaussians)
         if count == 0:
             return 0
-        job.array_count = 0
-        for array in self._find_arrays(gaussians).values():
-            if array.row_bytes:
-                job.arrays[job.array_count].rows, job.arrays[job.array_count].words = (
-                    array.place, array.row_bytes // _WORD
-                )  # fmt: skip
-                job.array_count += 1
+        self._find_arrays(gaussians)
         job.count, job.stays, job.stream = count, stays.data_ptr(), self._library.stream(self._device)
-        size = self._library.functions.ggslam_cuda_rows_bytes(ctypes.byref(job))
-        job.workspace, job.kept = self._memory.block("rows", size).data_ptr(), self._kept.source.data_ptr()
+        job.workspace = self._memory.block("rows", self._workspace_bytes).data_ptr()
+        job.kept = self._kept.source.data_ptr()
         self._library.call("choose_rows", ctypes.byref(job))
         kept = int(self._kept.fetch()[0])
         if kept < count:
@@ -119,7 +114,19 @@ class MapRows:
             for name, array in gaussians.storage.items():
                 bytes_of_row = array.element_size() * (array.numel() // max(1, array.shape[0]))
                 self._arrays[name] = _Array(array.data_ptr(), bytes_of_row)
+            self._describe(gaussians)
         return self._arrays
+
+    def _describe(self, gaussians: GaussianMap) -> None:
+        """Tells the job that moves rows of these arrays, and how much memory it needs when they are full."""
+        job = self._rows
+        job.count, job.array_count = gaussians.capacity, 0
+        for array in self._arrays.values():
+            if array.row_bytes:
+                row = job.arrays[job.array_count]
+                row.rows, row.words = array.place, array.row_bytes // _WORD
+                job.array_count += 1
+        self._workspace_bytes = self._library.functions.ggslam_cuda_rows_bytes(ctypes.byref(job))
 
 
 def _bits(value: float) -> int:

@@ -80,6 +80,9 @@ class CudaMapper(TrainingMapper):
         self._exposures.load(ours)
         self._exposures_changed()
 
+    def latest_poses(self, count: int) -> np.ndarray:
+        return inverse(self._states.read_poses()[-count:])
+
     def move_keyframes(self, T_new_old: np.ndarray) -> None:
         old = self._states.read_poses()
         for keyframe, T, pose in zip(self.keyframes, T_new_old, old, strict=True):

@@ -14,13 +14,15 @@ from ggslam.movers.detector import DetectorTuning, MoverDetector, coarse_factor,
 from ggslam.movers.recent import RecentFrame
 from ggslam.movers.settings import MoverSettings
 from ggslam.movers.tracks import MoverTracks
-from ggslam.movers.trail import gone_since
+from ggslam.movers.trail import TrailTuning, gone_since, which_may_be_gone
 from ggslam.native.loader import NativeContext
 from ggslam.scene.frame import Frame
 from ggslam.sequences.moving_pixels import MOVERS_FILE, MovingPixels
 from ggslam.sight.margin import Margin
-from ggslam.sight.places import CoarseView, DepthPlaces
+from ggslam.sight.passed_voxels import find_passed_parts
+from ggslam.sight.places import CoarseView
 from ggslam.slam.filters.frame_filter import FilterContext, FrameFilter, InRigs
+from ggslam.slam.filters.keyframe_views import KeyframeViews
 from ggslam.slam.map_removal import MapRemoval
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
@@ -46,7 +48,7 @@ DOUBTFUL = (TrackingStatus.LOST, TrackingStatus.DOUBTED)
 """Where frames are that nothing is said of: their poses may be wrong."""
 
 
-@savable(not_saved="_reads_masks _noise _margin _places context")
+@savable(not_saved="_reads_masks _noise _margin _views context")
 class MoverFilter(FrameFilter):
     """Detects movers in each located frame, if the settings ask for it.
 
@@ -69,7 +71,7 @@ class MoverFilter(FrameFilter):
         """The movers one by one."""
         self._noise: DepthNoise | None = None
         self._margin = _margin(settings, DepthNoise())
-        self._places: dict[int, tuple[np.ndarray, DepthPlaces]] = {}  # of keyframes, and of which depth image
+        self._views = KeyframeViews()
         self._before = None
         """Time of the frame before, seconds, and T_world_camera; None: it was not located."""
 
@@ -122,9 +124,11 @@ class MoverFilter(FrameFilter):
         shown = frame if self._reads_masks else replace(frame, mask=None, mask_loader=None)
         T_world_camera = result.T_world_camera if known else None
         swift = self._is_swift(frame, T_world_camera, result.median_depth_m)
-        self.detector.look(shown, T_world_camera, self._margin, self.context, result.status in SURE, swift)
+        view = RecentFrame(shown, result.T_world_camera, self._margin)
+        sure = result.status in SURE
+        self.detector.look(shown, T_world_camera, self._margin, self.context, sure, swift, view.segments)
         if known:
-            self.tracks.look(RecentFrame.of(shown, result.T_world_camera, self._margin), self.detector.things)
+            self.tracks.look(view, self.detector.things)
         else:
             self.tracks.clear()
         mask = self.detector.mask
@@ -146,12 +150,11 @@ class MoverFilter(FrameFilter):
         keyframe, looks through where it was."""
         if not self.has_trail or removal.is_paged:
             return
-        keyframes = removal.keyframes
-        latest, earlier = (
-            keyframes[-1],
-            [k for k in keyframes[-1 - MoverFilterTuning.max_keyframes : -1] if k.frame_index != FROM_EARLIER_RUN],
-        )
-        gone = self.gone_since(earlier, newest, latest.T_world_camera)
+        keyframes = removal.keyframes[-1 - MoverFilterTuning.max_keyframes :]
+        poses = removal.latest_poses(len(keyframes))
+        own = [i for i, k in enumerate(keyframes[:-1]) if k.frame_index != FROM_EARLIER_RUN]
+        earlier = [keyframes[i] for i in own]
+        gone = self.gone_since(earlier, poses[own], newest, poses[-1])
         parts = [(k, part) for k, part in zip(earlier, gone, strict=True) if part is not None]
         if parts:
             removal.drop_moved(parts)
@@ -162,37 +165,38 @@ class MoverFilter(FrameFilter):
         return self.active and len(self.detector.trail.keys) > 0
 
     def gone_since(
-        self, earlier: Sequence[Keyframe], newest: Frame, T_world_newest: np.ndarray
+        self, earlier: Sequence[Keyframe], T_world_earlier: np.ndarray, newest: Frame, T_world_newest: np.ndarray
     ) -> list[np.ndarray | None]:
         """What earlier views show where something has moved since, and the newest frame looks through.
 
         Args:
-            earlier: keyframes.
+            earlier: n keyframes.
+            T_world_earlier: [n, 4, 4].
             newest: without what moves in it.
             T_world_newest: [4, 4].
 
         Returns:
             Of each, bool [H, W]; None: nothing.
         """
-        settings, camera, trail = self.detector.settings, newest.camera, self.detector.trail
+        settings, trail, margin = self.detector.settings, self.detector.trail, self._margin
+        camera, shape = newest.camera, newest.depth.shape
+        alike = [i for i, k in enumerate(earlier) if k.depth.shape == shape]
+        if not alike:
+            return [None] * len(earlier)
+        fitting, poses = [earlier[i] for i in alike], T_world_earlier[alike]
         factor = coarse_factor(camera, settings)
-        view = CoarseView.of(newest.depth, camera, factor, T_world_newest, self._margin, self.context)
-        found: list[np.ndarray | None] = []
-        places: dict[int, tuple[np.ndarray, DepthPlaces]] = {}
-        for k in earlier:
-            shape = k.depth.shape
-            if shape != newest.depth.shape:
-                found.append(None)
-                continue
-            of, known = self._places.get(k.index, (None, None))
-            if of is not k.depth or known is None or known.camera != view.camera:
-                known = DepthPlaces.of(k.depth_m(), camera, factor, self.context)
-            places[k.index] = k.depth, known
-            old = known.view(k.T_world_camera, self._margin)
-            part = gone_since(old, view, trail, k.mask, shape, factor, self._margin, settings, self.context)
-            found.append(None if part is None else grow(part, DetectorTuning.mask_margin))
-        self._places = places
-        return found
+        view = CoarseView.of(newest.depth, camera, factor, T_world_newest, margin, self.context)
+        kept = self._views.of(fitting, camera, factor, margin, self.context)
+        passed = find_passed_parts(
+            kept, poses, view, trail.keys, TrailTuning.voxel_m, TrailTuning.min_in_trail, margin, self.context
+        )
+        found: dict[int, np.ndarray] = {}
+        for i in which_may_be_gone(passed, np.array([k.mask is not None for k in fitting]), settings):
+            k, old = fitting[i], replace(kept[i].view, T_world_camera=poses[i])
+            part = gone_since(old, passed.evidence(i), trail, k.mask, shape, factor, settings)
+            if part is not None:
+                found[k.index] = grow(part, DetectorTuning.mask_margin)
+        return [found.get(k.index) for k in earlier]
 
     def notes(self, frames: int) -> list[str]:
         """What the user should know of a run of so many frames."""

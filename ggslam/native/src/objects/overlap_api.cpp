@@ -100,6 +100,27 @@ GGSLAM_EXPORT int ggslam_segment_overlap(ggslam::OverlapJob* job_) try {
   return 0;
 } GGSLAM_CATCH_ALL
 
+GGSLAM_EXPORT int ggslam_label_pairs(const ggslam::PairLabelsJob* job_) try {
+  using namespace ggslam;
+  const PairLabelsJob& job = object_of<PairLabelsJob>(job_);
+  check_array("row", job.row, job.pixels), check_array("column", job.column, job.pixels);
+  check_array("image", job.image, job.pixels);
+  const std::int64_t across = std::int64_t{job.columns} + 1;
+  check_array("labels", job.labels, static_cast<std::int64_t>(elements(std::int64_t{job.rows} + 1, across)));
+  std::int32_t row = 0, column = 0;  // of the pixel before: neighbours are mostly alike
+  std::uint16_t label = 0;
+  for (std::int64_t i = 0; i < job.pixels; ++i) {
+    if (i == 0 || job.row[i] != row || job.column[i] != column) {
+      row = job.row[i], column = job.column[i];
+      if (row < -1 || row >= job.rows || column < -1 || column >= job.columns)
+        refuse("expected numbers below %d and %d, found %d and %d", job.rows, job.columns, row, column);
+      label = job.labels[(row < 0 ? job.rows : row) * across + (column < 0 ? job.columns : column)];
+    }
+    job.image[i] = label;
+  }
+  return 0;
+} GGSLAM_CATCH_ALL
+
 GGSLAM_EXPORT int ggslam_mark_ids(const uint16_t* ids, int64_t count, uint8_t* there) try {
   using namespace ggslam;
   check_array("ids", ids, count), check_array("there", there, kIds);

@@ -16,10 +16,9 @@ void check_margin(const SightMargin& margin) {
   for (const double number : numbers) check_range("margin", number, 0.0, 1e9);
 }
 
-namespace {
-
-constexpr std::size_t kRows = 4, kPoints = 4096;  // handed out at once
-constexpr float kNormal = 0.6745f;  // the median of a normal distribution's absolute values
+void check_rule(const PlacesRule& rule) {
+  check_margin(rule.margin), check_range("every", rule.every, 1, 1 << 20);
+}
 
 void check_view(const char* name, const PlacesView& view) {
   check_range(name, view.height, 1, kMostPixelsAlong), check_range(name, view.width, 1, kMostPixelsAlong);
@@ -29,8 +28,13 @@ void check_view(const char* name, const PlacesView& view) {
   for (const void* array : arrays) check_array(name, array, 1);
 }
 
+namespace {
+
+constexpr std::size_t kRows = 4, kPoints = 4096;  // handed out at once
+constexpr float kNormal = 0.6745f;  // the median of a normal distribution's absolute values
+
 // How far depth at a place of the other view, between its four pixels, is from that of the point there.
-float off_by(const PlacesEvidenceJob& job, const PlacesView& other, float u, float v, float z) {
+float off_by(const SightMargin& margin, const PlacesView& other, float u, float v, float z) {
   const int left = std::clamp(static_cast<int>(u), 0, std::max(0, other.width - 2));
   const int top = std::clamp(static_cast<int>(v), 0, std::max(0, other.height - 2));
   const int right = std::min(left + 1, other.width - 1), low = std::min(top + 1, other.height - 1);
@@ -39,43 +43,27 @@ float off_by(const PlacesEvidenceJob& job, const PlacesView& other, float u, flo
   const float* lower_row = other.depth + static_cast<std::size_t>(low) * other.width;
   const float upper = (1 - a) * upper_row[left] + a * upper_row[right];
   const float lower = (1 - a) * lower_row[left] + a * lower_row[right];
-  return std::fabs((1 - b) * upper + b * lower - z) / sigma_at(job.margin, z);
+  return std::fabs((1 - b) * upper + b * lower - z) / sigma_at(margin, z);
 }
 
-// How large differences between means of depth are, in standard deviations of a pixel, as most of them are.
-float measured_share(const PlacesEvidenceJob& job, const PlacesView& other, const ProjectedPlaces& places,
-                     std::size_t count) {
+}  // namespace
+
+float measured_share(const PlacesRule& rule, const uint8_t* moved, const PlacesView& other,
+                     const ProjectedPlaces& places, std::size_t count) {
   std::vector<float> off;
   int seen = 0;
   for (std::size_t i = 0; i < count; ++i) {
-    if (!places.smooth[i] || (job.moved != nullptr && job.moved[i])) continue;
-    if (seen++ % job.every == 0) off.push_back(off_by(job, other, places.u[i], places.v[i], places.z[i]));
+    if (!places.smooth[i] || (moved != nullptr && moved[i])) continue;
+    if (seen++ % rule.every == 0) off.push_back(off_by(rule.margin, other, places.u[i], places.v[i], places.z[i]));
   }
-  if (off.empty() || off.size() < static_cast<std::size_t>(job.fewest)) return job.rough;
+  if (off.empty() || off.size() < static_cast<std::size_t>(rule.fewest)) return rule.rough;
   const auto middle = off.begin() + static_cast<std::ptrdiff_t>(off.size() / 2);
   std::nth_element(off.begin(), middle, off.end());
   float median = *middle;
   if (off.size() % 2 == 0) median = (median + *std::max_element(off.begin(), middle)) / 2;
-  return std::clamp(job.nearest * median / kNormal, job.least_share, job.rough);
+  return std::clamp(rule.nearest * median / kNormal, rule.least_share, rule.rough);
 }
 
-// One thread's places of a view in another one.
-class Scratch {
- public:
-  ProjectedPlaces places(std::size_t count) {
-    floats_.resize(5 * count), where_.resize(count), flags_.resize(2 * count);
-    float* f = floats_.data();
-    return {f, f + count, f + 2 * count, f + 3 * count, f + 4 * count, where_.data(), flags_.data(),
-            flags_.data() + count};
-  }
-
- private:
-  std::vector<float> floats_;
-  std::vector<int> where_;
-  std::vector<uint8_t> flags_;
-};
-
-}  // namespace
 }  // namespace ggslam
 
 GGSLAM_EXPORT int ggslam_depth_places(void* context_, const ggslam::DepthPlacesJob* job_) try {
@@ -105,22 +93,22 @@ GGSLAM_EXPORT int ggslam_places_evidence(void* context_, const ggslam::PlacesEvi
   using namespace ggslam;
   Context& context = object_of<Context>(context_);
   const PlacesEvidenceJob& job = object_of<PlacesEvidenceJob>(job_);
-  check_view("view", job.view), check_margin(job.margin);
+  check_view("view", job.view), check_rule(job.rule);
   check_array("others", job.others, job.count), check_array("found", job.found, job.count);
   for (int i = 0; i < job.count; ++i) {
     check_view("other view", job.others[i].places);
     check_within("T_this_view", job.others[i].T_this_view, 12, 1e9);
   }
-  check_range("every", job.every, 1, 1 << 20);
   const std::size_t count = static_cast<std::size_t>(job.view.width) * static_cast<std::size_t>(job.view.height);
   const auto project = GGSLAM_DISPATCH(context.isa, project_places);
+  const auto look_up = GGSLAM_DISPATCH(context.isa, look_up_places);
   const auto judge = GGSLAM_DISPATCH(context.isa, judge_places);
-  std::vector<Scratch> scratch(static_cast<std::size_t>(context.pool.size()));
+  std::vector<PlacesScratch> scratch(static_cast<std::size_t>(context.pool.size()));
   context.pool.parallel_for(static_cast<std::size_t>(job.count), 1, [&](std::size_t i, std::size_t, int thread) {
     const ProjectedPlaces places = scratch[static_cast<std::size_t>(thread)].places(count);
-    project(job.view, job.others[i], places);
-    const float share = measured_share(job, job.others[i].places, places, count);
-    judge(job, share, count, places, job.found + 5 * count * i);
+    project(job.view, job.others[i], places), look_up(job.view, job.others[i].places, places);
+    const float share = measured_share(job.rule, job.moved, job.others[i].places, places, count);
+    judge(job.rule, share, count, places, job.found + 5 * count * i);
   });
   return 0;
 } GGSLAM_CATCH_ALL

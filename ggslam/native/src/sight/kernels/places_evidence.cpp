@@ -1,15 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
 // Places of one view in another: where they fall, and what that says of them.
+#include <algorithm>
+
 #include "sight/places.hpp"
 
 namespace ggslam::GGSLAM_ISA {
 namespace {
 
 constexpr float kNearest = 1e-3f;  // metres before the camera
+constexpr float kRounding = 0.999f;  // a margin that rounding does not make larger than another one
 
 }  // namespace
 
-void project_places(const PlacesView& a, const OtherPlacesView& other, const ProjectedPlaces& out) {
+void project_places(const PlacesView& view, const OtherPlacesView& other_, const ProjectedPlaces& places) {
+  // Copies, which nothing that is written can be a part of: the compiler takes many places at once.
+  const PlacesView a = view;
+  const OtherPlacesView other = other_;
+  const ProjectedPlaces out = places;
   const PlacesView& b = other.places;
   const float* T = other.T_this_view;
   const float right = static_cast<float>(b.width) - 0.5f, low = static_cast<float>(b.height) - 0.5f;
@@ -34,6 +41,9 @@ void project_places(const PlacesView& a, const OtherPlacesView& other, const Pro
       where[x] = inside ? i * b.width + j : -1;
     }
   }
+}
+
+void look_up_places(const PlacesView& a, const PlacesView& b, const ProjectedPlaces& out) {
   const std::size_t count = static_cast<std::size_t>(a.height) * a.width;
   for (std::size_t i = 0; i < count; ++i) {
     const int at = out.where[i] < 0 ? 0 : out.where[i];
@@ -43,9 +53,23 @@ void project_places(const PlacesView& a, const OtherPlacesView& other, const Pro
   }
 }
 
-void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count, const ProjectedPlaces& places,
+void flag_perhaps_passed(const PlacesRule& rule, const PlacesView& a, const float* beyond,
+                         const ProjectedPlaces& places, uint8_t* flags) {
+  const SightMargin margin = rule.margin;  // copies: what is written may not change them
+  const ProjectedPlaces out = places;
+  const uint8_t* smooth = a.smooth;
+  const std::size_t count = static_cast<std::size_t>(a.height) * a.width;
+  const float least = kRounding * std::min(rule.least_share, rule.rough), rough = kRounding * rule.rough;
+  for (std::size_t i = 0; i < count; ++i) out.near[i] = out.where[i] < 0 ? 0.f : beyond[out.where[i]];
+  for (std::size_t i = 0; i < count; ++i) {
+    const float z = out.z[i], slack = kRounding * margin_at(margin, z, smooth[i] ? least : rough);
+    flags[i] = (z > 0) & (out.near[i] > z + slack);
+  }
+}
+
+void judge_places(const PlacesRule& rule, float share, std::size_t count, const ProjectedPlaces& places,
                   uint8_t* found) {
-  const SightMargin margin = job.margin;  // a copy: what is written may not change it
+  const SightMargin margin = rule.margin;  // a copy: what is written may not change it
   uint8_t* passed = found;
   uint8_t* clearly = passed + count;
   uint8_t* surely = clearly + count;
@@ -53,7 +77,7 @@ void judge_places(const PlacesEvidenceJob& job, float share, std::size_t count, 
   uint8_t* otherwise = same + count;
   for (std::size_t i = 0; i < count; ++i) {
     const float z = places.z[i], near = places.near[i], far = places.far[i];
-    const float slack = margin_at(margin, z, places.smooth[i] ? share : job.rough);
+    const float slack = margin_at(margin, z, places.smooth[i] ? share : rule.rough);
     const uint8_t known = places.known[i], there = places.where[i] >= 0;
     const uint8_t beyond = known & (near > z + 2 * slack);
     const uint8_t surface = there & (near < z + slack) & (far > z - slack);
