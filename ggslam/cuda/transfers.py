@@ -66,14 +66,13 @@ class Upload:
         """What was filled in, or its beginning, uint8 [size]; to be sent before the next `begin`."""
         return self._buffer[:size]
 
-    def send(self, out: torch.Tensor, source: torch.Tensor | None = None) -> None:
-        """Starts the copy of what was filled in to the beginning of it, as long as `out`, uint8 [n].
+    def send(self, out: torch.Tensor) -> None:
+        """Starts the copy of the beginning of what was filled in to `out`, uint8 [n], all of it."""
+        self.send_part(self._buffer[: out.numel()], out)
 
-        Args:
-            out: where to.
-            source: `filled_part` of its size, if that was made before.
-        """
-        out.copy_(self.filled_part(out.numel()) if source is None else source, non_blocking=True)
+    def send_part(self, filled: torch.Tensor, out: torch.Tensor) -> None:
+        """The same for a `filled_part`, which another thread may have made, and `out` of its size."""
+        out.copy_(filled, non_blocking=True)
         self._sent.set()
 
 

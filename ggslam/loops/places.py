@@ -126,6 +126,11 @@ class PlaceIndex:
         landmarks = view.landmarks(camera or self.camera, self.settings.features)
         return Place(landmarks, self._words(landmarks.descriptors), self._fern_codes(view))
 
+    def empty_place(self) -> Place:
+        """What a view without a feature is known by: no query finds it."""
+        nothing = Landmarks(np.zeros((0, 32), np.uint8), np.zeros((0, 3), np.float32))
+        return Place(nothing, np.zeros(0, np.int64), np.zeros(self.settings.ferns, np.uint8))
+
     def add(self, number: int, place: Place) -> None:
         """Keyframe `number` sees `place`. Numbers next to each other are next in time.
 

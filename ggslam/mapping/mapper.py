@@ -316,10 +316,15 @@ class Mapper(ABC):
 
         Args:
             T_new_old: [K, 4, 4], for each keyframe what moves the world about it.
+
+        Raises:
+            ValueError: there are not as many keyframes.
         """
+        if len(T_new_old) != len(self.keyframes):
+            raise ValueError(f"T_new_old: expected [{len(self.keyframes)}, 4, 4], found {list(np.shape(T_new_old))}")
+        move_with_keyframes(self.map, T_new_old)  # first: where memory is short this fails, and then nothing has moved
         for keyframe, T in zip(self.keyframes, T_new_old, strict=True):
             keyframe.T_camera_world = inverse(T @ keyframe.T_world_camera)
-        move_with_keyframes(self.map, T_new_old)
 
     def leave_out(self, numbers: set[int]) -> None:
         """Takes the Gaussians of some keyframes out of the map, which is all in memory, and trains on these no more."""

@@ -18,6 +18,7 @@ from ggslam.slam.left_parts import LeftParts
 from ggslam.slam.loop_closing import LoopCloser
 from ggslam.slam.part_start import PartStart, pose_apart
 from ggslam.slam.parts import RunParts
+from ggslam.slam.relocalization import Relocalizer
 from ggslam.system.savable import savable
 from ggslam.tracking.gicp import GicpTarget
 from ggslam.tracking.keyframes import KeyframePolicy
@@ -46,7 +47,7 @@ class Located:
         return self.joint.status is TrackingStatus.LOST
 
 
-@savable(not_saved="before_search _config _surface _masks _tracker _loops _pager _policy _poses _filters")
+@savable(not_saved="before_search _config _surface _masks _tracker _relocalizer _pager _policy _poses _filters")
 class FrameLocator:
     """Locates the frames of a camera.
 
@@ -62,7 +63,8 @@ class FrameLocator:
         self, config: Config, parts: RunParts, policy: KeyframePolicy, poses: FramePoses, filters: FrameFilter
     ) -> None:
         self._config, self._surface, self._masks = config, parts.surface, parts.masks
-        self._tracker, self._loops, self._pager = parts.tracker, parts.loops, parts.pager
+        self._tracker, self._pager = parts.tracker, parts.pager
+        self._relocalizer = None if parts.loops is None else Relocalizer(parts.loops, parts.tracker)
         self._policy, self._poses, self._filters = policy, poses, filters
         self.color_poses = ColorPoses(parts.mapper, poses, parts.tracker.state)
         self.part_start, self.left_parts = PartStart(), LeftParts()
@@ -92,14 +94,14 @@ class FrameLocator:
         (frame,) = frames
         expected = self._filters.expect(frame)
         result, early = self._tracker.track(expected), list[tuple[Frame, TrackingResult]]()
-        if result.status is TrackingStatus.LOST and self._loops is not None and self._tracker.target is not None:
+        if result.status is TrackingStatus.LOST and self._relocalizer is not None and self._tracker.target is not None:
             for T_new_old in self.before_search():
                 result = replace(result, T_world_camera=T_new_old @ result.T_world_camera)
-            found = self._find_again(frame, expected, result, self._loops)
+            found = self._find_again(frame, expected, result, self._relocalizer)
             if found is not None:
                 result = found
             elif growing and self._tracker.settings.recovery.new_part_after > 0 and self._pager is None:
-                result, early = self._try_new_part(frame, result, self._loops, takes_keyframes)
+                result, early = self._try_new_part(frame, result, self._relocalizer.loops, takes_keyframes)
         if result.status is not TrackingStatus.LOST:
             self.part_start.forget()
             self.left_parts.forget_targets()
@@ -115,11 +117,11 @@ class FrameLocator:
         self.color_poses.note(frame, tracking)
 
     def _find_again(
-        self, frame: Frame, expected: Frame, lost: TrackingResult, loops: LoopCloser
+        self, frame: Frame, expected: Frame, lost: TrackingResult, relocalizer: Relocalizer
     ) -> TrackingResult | None:  # fmt: skip
         """What tracking says of a lost frame that shows a known place, or what was in sight when the camera was lost
         before; None: neither."""
-        found = loops.find(frame, lost)
+        found, loops = relocalizer.find(frame, lost), relocalizer.loops
         if found is None and self.left_parts.parts:
             found = self.left_parts.find(expected, self._poses.anchor[0], self._tracker, loops)
         if found is None:

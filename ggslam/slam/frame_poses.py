@@ -81,6 +81,19 @@ class FramePoses:
         ]  # fmt: skip
         self.frames = [*self.frames[: len(self.frames) - count], *located]  # checkpoints know a list that only grows
 
+    def leave_missing(self, keyframes: Sequence[Keyframe]) -> None:
+        """For the end: frames that hang on the newest keyframe hang on the last of these, if an error has kept that one
+        from them."""
+        last, missing = len(keyframes) - 1, self._anchor
+        if not 0 <= last < missing:
+            return
+        T_last_missing = inverse(keyframes[last].T_world_camera) @ self._T_world_anchor
+        self.frames = [
+            replace(frame, keyframe=last, T_keyframe_camera=T_last_missing @ frame.T_keyframe_camera)
+            if frame.keyframe == missing else frame for frame in self.frames
+        ]  # fmt: skip
+        self.anchor_to(last, keyframes[last].T_world_camera)
+
     def as_tracked(self, frame: TrackedFrame) -> np.ndarray:
         """T_world_camera [4, 4] of a frame that was just added as tracked."""
         return self._T_world_anchor @ frame.T_keyframe_camera

@@ -27,9 +27,10 @@ STEPS_BESIDE = 1
 
 @dataclass(frozen=True)
 class _UnderWay(Generic[Found]):
-    """What to do with what was found, and the step before which it is done."""
+    """What to do with what was found, or if nothing was for an error, and the step before which it is done."""
 
     finish: Callable[[Found], None]
+    give_up: Callable[[], None]
     due: int
 
 
@@ -53,21 +54,34 @@ class Joining(Generic[Found]):
         if self._under_way is not None and self._step >= self._under_way.due:
             self.end()
 
-    def start(self, work: Callable[[], Found], finish: Callable[[Found], None]) -> None:
-        """Starts `work` in the other thread, if none is under way; `finish` is given its result in this one."""
+    def start(
+        self, work: Callable[[], Found], finish: Callable[[Found], None], give_up: Callable[[], None]
+    ) -> None:  # fmt: skip
+        """Starts `work` in the other thread, if none is under way. In this one `finish` is given its result, or
+        `give_up` is called if it raised something."""
         assert self._under_way is None
-        self._under_way = _UnderWay(finish, self._step + STEPS_BESIDE + 1)
+        self._under_way = _UnderWay(finish, give_up, self._step + STEPS_BESIDE + 1)
         self._thread.start(work)
 
     def drop(self) -> None:
         """Waits for what is under way, if anything is, and forgets it, whatever it found or raised."""
         if self._under_way is not None:
-            self._under_way = None
+            self._under_way = _UnderWay(lambda found: None, lambda: None, self._step)
             with suppress(Exception):
-                self._thread.take()
+                self.end()
 
     def end(self) -> None:
-        """Waits for what is under way, if anything is, and takes it over; raises what it raised."""
-        under_way, self._under_way = self._under_way, None
-        if under_way is not None:
-            under_way.finish(self._thread.take())
+        """Waits for what is under way, if anything is, and takes it over; raises what it raised, once. If waiting is
+        interrupted, it stays under way."""
+        under_way = self._under_way
+        if under_way is None:
+            return
+        try:
+            found = self._thread.take()
+        except BaseException:
+            if not self._thread.is_asked:  # the work raised it
+                self._under_way = None
+                under_way.give_up()
+            raise
+        self._under_way = None
+        under_way.finish(found)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loop closing: `Slam` calls it after each keyframe and when the camera is lost."""
+"""Closing loops: `Slam` adds each keyframe, and gets a correction when one shows a known place."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,19 +16,25 @@ from ggslam.errors import FormatError
 from ggslam.features.orb import FeatureView
 from ggslam.loops.activity import ActiveKeyframes
 from ggslam.loops.agreement import GroundLink
-from ggslam.loops.condensed import Link
 from ggslam.loops.parts import KeyframeParts
 from ggslam.loops.places import Place, PlaceIndex
 from ggslam.loops.pose_graph import SURE_INFORMATION, GraphResult, PoseGraph
 from ggslam.loops.revisits import Revisits
 from ggslam.loops.uncertainty import information_in_frame
 from ggslam.loops.verification import Verification
+from ggslam.mapping.keyframe import Keyframe
 from ggslam.native.loader import NativeContext
 from ggslam.scene.camera import Camera
 from ggslam.scene.frame import Frame
 from ggslam.scene.poses import inverse, separation
+from ggslam.slam.loop_results import Correction, LoopEvent
 from ggslam.slam.loop_settings import LoopSettings
-from ggslam.slam.part_joining import find_links, links_between
+from ggslam.slam.part_joining import (
+    closures_between_others,
+    find_links,
+    links_between,
+    poses_brought_together,
+)  # fmt: skip
 from ggslam.slam.place_comparison import PlaceComparison
 from ggslam.system.array_forms import Form, Pose, PoseForm, check_arrays, check_indices
 from ggslam.system.savable import savable
@@ -36,48 +43,6 @@ from ggslam.tracking.points import PointSource
 from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.surface import MeasuredSurface
 from ggslam.tracking.tracker import Tracker, TrackingResult
-
-
-@savable()
-@dataclass(frozen=True)
-class LoopEvent:
-    """The outcome for a candidate, or for a lost frame.
-
-    Attributes:
-        kind: "closed", "verified" (believed later or never), "refused", "found again"; "new part", "joined",
-            "left out" (see `slam.map_parts`).
-        frame: index of the frame.
-        keyframe: number of the newer keyframe (of the one it would become, for a frame found again).
-        old_keyframe: the one it was compared with.
-        reason: in words, with numbers.
-        moved_m: how far the newer end was moved, metres (closed only).
-    """
-
-    kind: str
-    frame: int
-    keyframe: int
-    old_keyframe: int
-    reason: str
-    moved_m: float = 0.0
-
-
-@dataclass(frozen=True)
-class Correction:
-    """New keyframe poses after a loop was closed.
-
-    Attributes:
-        T_world_camera: float64 [K, 4, 4].
-        T_new_old: float64 [K, 4, 4], what moves the world about each keyframe.
-        kept: numbers of the keyframes at the older end, whose map stays.
-        doubted: numbers of those that may have mapped the same surface again.
-        active: numbers of the keyframes that the tracker relies on now.
-    """
-
-    T_world_camera: np.ndarray
-    T_new_old: np.ndarray
-    kept: set[int]
-    doubted: set[int]
-    active: set[int]
 
 
 @savable()
@@ -93,10 +58,10 @@ class _Found:
 
 
 @savable(
-    not_saved="settings comparison _camera _surface _tracker _lock _helper _begun", growing="events", check="check"
+    not_saved="settings comparison _camera _surface _lock _helper _begun", growing="events", check="check"
 )
 class LoopCloser:
-    """Stores the place and odometry of every keyframe, and finds loops and lost frames.
+    """Stores the place and odometry of every keyframe, and finds loops. `Relocalizer` finds lost frames with it.
 
     All methods may be called from tracker and mapper thread.
 
@@ -120,7 +85,7 @@ class LoopCloser:
         self.settings = settings
         self.events = []
         self.seconds = 0.0
-        """Spent here, verification and graph included."""
+        """Spent here, verification and graph included, and on finding lost frames."""
         self.graph = PoseGraph(settings.graph, surface.poses)
         self.places = PlaceIndex(camera, settings.places)
         self.activity = ActiveKeyframes(settings.activity, surface.poses)
@@ -131,7 +96,7 @@ class LoopCloser:
         self.comparison = PlaceComparison(
             settings.verification, settings.neighbourhood, surface, tracker, context
         )
-        self._camera, self._surface, self._tracker = camera, surface, tracker
+        self._camera, self._surface = camera, surface
         self._verified = []
         self._found_at = None
         """When a lost camera was found (see `_moment`), and the keyframe it was found at; until its first keyframe is
@@ -187,15 +152,14 @@ class LoopCloser:
         Returns:
             The correction if this closes a loop. `apply` it.
         """
-        start = time.perf_counter()
-        with self._lock, self.comparison.noise_as(noise):
+        with self.work(), self.comparison.noise_as(noise):
             T = tracking.T_world_camera
             place = self._describe(frame, T)
             # In real time, keyframes from before the camera was lost may still come after it was found.
             belated = self._found_at is not None and _moment(frame) < self._found_at[0]
             before, rigid = self._came_from(frame)
             begins = _moment(frame) in self._parts_begin
-            self._connect(tracking, belated, before, rigid, begins)
+            self._connect(T, tracking.information, before, belated, rigid, begins)
             if begins:
                 self._leave_behind(frame, belated)
             self.activity.add(T, tracking.median_depth_m, None if rigid or begins else before)
@@ -206,8 +170,31 @@ class LoopCloser:
             correction = None if belated else self._look_back(frame, place, tracking)
             if correction is None and (self.activity.update() or belated or begins):
                 self._surface.arrange(self.activity.active)
-        self.seconds += time.perf_counter() - start
         return correction
+
+    def add_unseen(self, keyframe: Keyframe) -> None:
+        """A keyframe was made of which nothing is known but its pose, which `poses` has: no frame is ever found at it,
+        and it closes no loop."""
+        with self._lock:
+            T, (before, rigid), self._begun = self.poses[keyframe.index], self._came_from(keyframe), None
+            moment = keyframe.frame_index if keyframe.instant is None else keyframe.instant
+            begins = moment in self._parts_begin
+            self._connect(T, None, before, rigid=rigid, begins=begins)
+            self._parts_begin.discard(moment)
+            median_depth_m = float(self.activity.median_depths[before]) if len(self) else 1.0
+            self.activity.add(T, median_depth_m, None if rigid or begins else before)
+            self._taken.append((keyframe.instant, keyframe.camera_number))
+            self.places.add(keyframe.index, self.places.empty_place())
+
+    @contextmanager
+    def work(self) -> Iterator[None]:
+        """The block uses what is known of the keyframes, while no other thread does; it counts for `seconds`."""
+        start = time.perf_counter()
+        with self._lock:
+            try:
+                yield
+            finally:
+                self.seconds += time.perf_counter() - start
 
     def apply(self, correction: Correction) -> None:
         """Moves the tracked surface to the poses of a correction."""
@@ -215,7 +202,7 @@ class LoopCloser:
             self._surface.arrange(correction.active, correction.T_world_camera)
             self._verified.clear()
 
-    def _came_from(self, frame: Frame) -> tuple[int, bool]:
+    def _came_from(self, frame: Frame | Keyframe) -> tuple[int, bool]:
         """The keyframe before that of a new frame, -1 without one, and whether it is of the same instant. In a rig that
         is one of this instant, else the same camera's of the instant before, else any of that."""
         newest = len(self) - 1
@@ -236,10 +223,13 @@ class LoopCloser:
             self.activity.leave()
             self._verified.clear()
 
-    def _connect(self, tracking: TrackingResult, belated: bool, before: int, rigid: bool, begins: bool) -> None:
-        """The new keyframe's node, tied to the one before it, or to where a lost camera was found again; where a part
-        begins, by a motion that nothing is known of."""
-        T, number = tracking.T_world_camera, len(self)
+    def _connect(
+        self, T: np.ndarray, alignment: np.ndarray | None, before: int, belated: bool = False, rigid: bool = False,
+        begins: bool = False,
+    ) -> None:  # fmt: skip
+        """The new keyframe's node, at T_world_camera `T` by an alignment's information, tied to the one before it, or
+        to where a lost camera was found again; where a part begins, by a motion that nothing is known of."""
+        number = len(self)
         self.graph.add_node(T)
         found = self._found_at is not None and not belated
         if self._found_at is not None and found:
@@ -248,8 +238,8 @@ class LoopCloser:
         if before >= 0:
             T_before_world = inverse(self.poses[before])
             information = SURE_INFORMATION  # without an alignment, what drift allows for is all that is unsure
-            if tracking.information is not None:
-                information = information_in_frame(tracking.information, T_before_world)
+            if alignment is not None:
+                information = information_in_frame(alignment, T_before_world)
             self.graph.add_odometry(before, number, T_before_world @ T, information, found, rigid, unknown=begins)
         if begins:
             self.parts.begin()
@@ -266,7 +256,7 @@ class LoopCloser:
             return self._revisit(frame, place, tracking, near, T)
         if len(known) < len(self):  # there is something to come back to
             for match in self.places.query(place, s.candidates, known.__contains__):
-                found, _ = self._compare(frame.camera, tracking.points, place, match.number)
+                found, _ = self.compare(frame.camera, tracking.points, place, match.number)
                 if found.accepted:
                     return self._believe(frame, match.number, found)
                 if found.inliers >= s.verification.min_inliers:  # others were never likely
@@ -320,11 +310,12 @@ class LoopCloser:
             return self.comparison.confirm(
                 source, place, self.places, self.poses, old, camera, matches, T_old_new, needed
             )
-        return self._compare(camera, source, place, old)[0]
+        return self.compare(camera, source, place, old)[0]
 
-    def _compare(
+    def compare(
         self, camera: Camera, source: PointSource, place: Place, old: int
     ) -> tuple[Verification, AlignmentResult | None]:
+        """Whether a frame sees what keyframe `old` saw, see `PlaceComparison.find`."""
         return self.comparison.find(source, place, self.places, self.poses, old, camera)
 
     def _is_confirmed(self) -> bool:
@@ -363,8 +354,9 @@ class LoopCloser:
     def _optimise(self, frame_index: int, number: int) -> GraphResult | None:
         """The graph with a closure that is to be believed; None if it is not."""
         loop = self.graph.loops[number]
-        start = None if self.parts.together(loop.i, loop.j) else self._poses_brought_together(loop)
-        result = self.graph.optimise(self._between_other_parts(loop), start)
+        joins = not self.parts.together(loop.i, loop.j)
+        start = poses_brought_together(loop, self.parts, self.poses) if joins else None
+        result = self.graph.optimise(closures_between_others(loop, self.graph.loops, self.parts), start)
         if number not in result.rejected:
             return result
         reason = f"the pose graph does not believe it: {result.rejected[number]}"
@@ -372,16 +364,15 @@ class LoopCloser:
         self.revisits.pause()
         return None
 
-    # --- parts -------------------------------------------------------------------------------------------------------
+    # --- parts, and where a lost camera goes on -----------------------------------------------------------------------
 
     def common_places(self) -> list[GroundLink]:
         """Places that parts have in common, as far as one finds them when there are no more frames."""
-        start = time.perf_counter()
-        links = find_links(
-            self.parts, self.poses, self.places, self._surface, self.comparison, self._camera, self.settings.candidates
-        )  # fmt: skip
-        self.seconds += time.perf_counter() - start
-        return links
+        with self.work():
+            return find_links(
+                self.parts, self.poses, self.places, self._surface, self.comparison, self._camera,
+                self.settings.candidates,
+            )  # fmt: skip
 
     def join(self, older: int, younger: int, links: Sequence[GroundLink]) -> Correction | None:
         """Makes one part of two, each given as its oldest keyframe, by places that parts have in common.
@@ -413,58 +404,12 @@ class LoopCloser:
         with self._lock:
             self._surface.arrange(self.activity.active, np.array([T_new_old @ T for T in self.poses]))
 
-    def _between_other_parts(self, loop: Link) -> list[int]:
-        """Numbers of the closures between parts that will not be one by this closure either: nothing but one another
-        could contradict them."""
-        parts = {self.parts.of[loop.i], self.parts.of[loop.j]}
-        ends = [(self.parts.of[other.i], self.parts.of[other.j]) for other in self.graph.loops]
-        return [k for k, (i, j) in enumerate(ends) if i != j and {i, j} != parts]
-
-    def _poses_brought_together(self, loop: Link) -> list[np.ndarray]:
-        """All poses [4, 4], those of the younger of two parts where a loop has them: the optimisation starts near its
-        end."""
-        old, new, T_old_new = loop.i, loop.j, loop.T_i_j
-        if self.parts.of[new] < self.parts.of[old]:
-            old, new, T_old_new = new, old, inverse(T_old_new)
-        T = self.poses[old] @ T_old_new @ inverse(self.poses[new])
-        younger = self.parts.members(new)
-        return [T @ pose if k in younger else pose for k, pose in enumerate(self.poses)]
-
     def _note_joined(self, frame_index: int, old: int, new: int) -> None:
         """Two parts are one."""
         older, younger = sorted((old, new), key=lambda k: self.parts.of[k])
         names = [self.parts.name(self.parts.members(k)) for k in (younger, older)]
         self.events.append(LoopEvent("joined", frame_index, new, old, f"{names[0]} was joined to {names[1]}"))
         self.parts.join(old, new)
-
-    # --- lost frames -------------------------------------------------------------------------------------------------
-
-    def find(self, frame: Frame, lost: TrackingResult) -> tuple[TrackingResult, int] | None:
-        """Looks a lost frame up among all keyframes; the tracker goes on from there.
-
-        Returns:
-            What tracking says now, and the number of the keyframe it was found at; None if none leads to a pose.
-        """
-        if len(lost.points) < self._tracker.settings.align.min_matches:
-            return None
-        start = time.perf_counter()
-        with self._lock:
-            result = self._found_among(frame, lost)
-        self.seconds += time.perf_counter() - start
-        return result
-
-    def _found_among(self, frame: Frame, lost: TrackingResult) -> tuple[TrackingResult, int] | None:
-        view = FeatureView(frame.color, frame.depth, lost.T_world_camera)
-        place = self.places.describe(view, frame.camera)
-        for match in self.places.query(place, self.settings.candidates):
-            found, alignment = self._compare(frame.camera, lost.points, place, match.number)
-            if not found.accepted or alignment is None:
-                continue
-            old = match.number
-            reason = f"keyframe {old}: {found.inliers} features, {found.overlap:.0%} of the voxels"
-            self.go_on_at(frame, old, reason)
-            return self._tracker.relocate(view, lost.points, alignment, reason), old
-        return None
 
     def go_on_at(self, frame: Frame, old: int, reason: str) -> None:
         """A lost frame was found about keyframe `old`; `reason` says how."""

@@ -10,7 +10,8 @@ import numpy as np
 
 from ggslam.mapping.mapper import Mapper
 from ggslam.objects.same_object import LabelledVoxels, SameObjectTuning
-from ggslam.slam.loop_closing import Correction, LoopCloser
+from ggslam.slam.loop_closing import LoopCloser
+from ggslam.slam.loop_results import Correction
 from ggslam.slam.map_paging import MapPager
 from ggslam.slam.object_masks import ObjectMasks
 from ggslam.system.array_forms import Pose
@@ -82,12 +83,14 @@ class MapCorrections:
         and trains both ends of the loop."""
         ends = correction.kept & correction.active
         self._mapper.move_keyframes(correction.T_new_old)
-        if self._pager is not None:
-            self._pager.move_keyframes(correction.T_new_old)
-            self._pager.bring_ends(ends)
-        with self.publishing:
-            loops.apply(correction)
-            self.moves.append(correction.T_new_old[-1])
+        try:
+            if self._pager is not None:
+                self._pager.move_keyframes(correction.T_new_old)
+                self._pager.bring_ends(ends)
+        finally:  # the map has moved: whatever fails, everything else follows
+            with self.publishing:
+                self.moves.append(correction.T_new_old[-1])
+                loops.apply(correction)
         self._unite_objects(correction)
         self._mapper.retrain_loop_ends(sorted(ends), sorted(correction.doubted), loops.settings.repair_iterations)
 

@@ -23,7 +23,8 @@ from ggslam.movers.mover_table import FoundMover
 from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.poses import inverse
 from ggslam.slam.frame_poses import FramePoses
-from ggslam.slam.loop_closing import LoopCloser, LoopEvent
+from ggslam.slam.loop_closing import LoopCloser
+from ggslam.slam.loop_results import LoopEvent
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.result import TrackedFrame
 from ggslam.system.savable import savable

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ggslam.loops.agreement import GroundLink, agreeing_links
+from ggslam.loops.condensed import Link
 from ggslam.loops.parts import KeyframeParts
 from ggslam.loops.places import PlaceIndex
 from ggslam.loops.settings import GraphSettings
@@ -85,6 +86,27 @@ def links_between(
     own = [np.array([poses[n] for n in part]) for part in numbers]
     local = [replace(link, old=numbers[0].index(link.old), new=numbers[1].index(link.new)) for link in ours]
     return [ours[k] for k in agreeing_links(local, own[0], own[1], settings)]
+
+
+def closures_between_others(closure: Link, closures: Sequence[Link], parts: KeyframeParts) -> list[int]:
+    """Numbers of the closures between parts that will not be one by this closure either: nothing but one another could
+    contradict them."""
+    own = {parts.of[closure.i], parts.of[closure.j]}
+    ends = [(parts.of[other.i], parts.of[other.j]) for other in closures]
+    return [k for k, (i, j) in enumerate(ends) if i != j and {i, j} != own]
+
+
+def poses_brought_together(
+    closure: Link, parts: KeyframeParts, poses: Sequence[np.ndarray]
+) -> list[np.ndarray]:  # fmt: skip
+    """All poses [4, 4], those of the younger of two parts where a closure has them: the optimisation starts near its
+    end."""
+    old, new, T_old_new = closure.i, closure.j, closure.T_i_j
+    if parts.of[new] < parts.of[old]:
+        old, new, T_old_new = new, old, inverse(T_old_new)
+    T = poses[old] @ T_old_new @ inverse(poses[new])
+    younger = parts.members(new)
+    return [T @ pose if k in younger else pose for k, pose in enumerate(poses)]
 
 
 def _turn(link: GroundLink) -> GroundLink:

@@ -20,7 +20,7 @@ from ggslam.scene.gaussian_map import GaussianMap
 from ggslam.scene.identity import IdentityClassifier
 from ggslam.sequences.moving_pixels import MovingPixels
 from ggslam.slam.config import Config
-from ggslam.slam.loop_closing import LoopEvent
+from ggslam.slam.loop_results import LoopEvent
 from ggslam.submaps.gaussian_cells import GaussianCells
 from ggslam.system.array_forms import Pose
 from ggslam.system.savable import savable
@@ -77,7 +77,7 @@ class StepReport:
     T_world_camera: np.ndarray = field(default_factory=lambda: np.full((4, 4), np.nan))
 
 
-@savable(not_saved="_started", growing="tracking_by_frame", after="resume")
+@savable(not_saved="_started beside", growing="tracking_by_frame", after="resume")
 @dataclass
 class SlamTimes:
     """Seconds of wall time.
@@ -86,7 +86,11 @@ class SlamTimes:
         wall: from the first step's begin to the last step's end: reading, tracking, mapping.
         tracking: spent tracking.
         tracking_by_frame: the same, frame by frame, so that growth with the map shows.
-        loops: spent looking for places, closing loops and finding lost frames; mostly part of `tracking` or mapping.
+        loops: spent looking for places, closing loops and finding lost frames; part of `tracking` or mapping, or of
+            `beside`.
+        beside: spent in another thread beside the frames, while the parts above go on, on what a keyframe's frames do
+            not wait for: its points join what they are aligned to, and loops are searched. Runs whose state can be
+            saved have none.
         refinement: spent on the final refinement, not part of `wall`.
         checkpoints: spent on saving the state, part of `wall` or of `refinement`.
         saved: how many times that was.
@@ -95,6 +99,7 @@ class SlamTimes:
     wall: float = 0.0
     tracking: float = 0.0
     loops: float = 0.0
+    beside: float = 0.0
     refinement: float = 0.0
     checkpoints: float = 0.0
     saved: int = 0

@@ -38,7 +38,7 @@ class DarkImageTuning(Tuning):
 
 
 @savable(
-    not_saved="before_search _config _surface _masks _tracker _loops _pager _policy _poses _filters "
+    not_saved="before_search _config _surface _masks _tracker _relocalizer _pager _policy _poses _filters "
     "_rig _engine _chains"
 )
 class RigLocator(FrameLocator):
@@ -96,16 +96,16 @@ class RigLocator(FrameLocator):
             told = (estimate_noise(frame.depth, frame.camera) for frame in frames)
             self._tracker.noise = next((noise for noise in told if noise is not None), None)
         joint = self._tracker.track(lead)
-        if joint.status is not TrackingStatus.LOST or self._loops is None or self._tracker.target is None:
+        if joint.status is not TrackingStatus.LOST or self._relocalizer is None or self._tracker.target is None:
             return joint
         now = frames[0].timestamp
         for frame, part in zip(frames, self._engine.parts, strict=True):
             T_first_camera = self._T_first_of(frame, now)
             T_lost = joint.T_world_camera @ T_first_camera
-            found = self._loops.find(frame, replace(joint, points=part, T_world_camera=T_lost))
+            found = self._relocalizer.find(frame, replace(joint, points=part, T_world_camera=T_lost))
             if found is not None:
                 result, keyframe = found
-                self._poses.anchor_to(keyframe, self._loops.poses[keyframe])
+                self._poses.anchor_to(keyframe, self._relocalizer.loops.poses[keyframe])
                 T = result.T_world_camera @ inverse(T_first_camera)
                 view, motion = FeatureView(lead.color, lead.depth, T), self._tracker.state.motion
                 motion.restart(view, T)

@@ -21,8 +21,9 @@ from ggslam.system.savable import savable
 
 
 @savable(
-    not_saved="camera rig config context pager start_notes schedule joining", after="use_scale_again", check="check"
-)
+    not_saved="camera rig config context pager start_notes end_notes schedule joining", after="use_scale_again",
+    check="check",
+)  # fmt: skip
 class RigSlam(Slam):
     """See `Slam`; `step_together` takes the frames of all cameras at one instant. Every frame has a pose and may be a
     keyframe; the keyframes of an instant keep to one another as the rig has them.

@@ -77,7 +77,7 @@ def _notes(slam: RunState) -> list[str]:
     frames = len(slam.frames)
     still = still_notes(slam.tracker.state.still.frames, frames)
     budget = [] if slam.pager is None else slam.pager.budget.notes
-    return [*slam.start_notes, *still, *slam.filters.notes(frames), *budget]
+    return [*slam.start_notes, *still, *slam.filters.notes(frames), *budget, *slam.end_notes]
 
 
 def _places(slam: RunState, gaussians: GaussianMap, cells: GaussianCells | None) -> bytes | None:

@@ -24,7 +24,7 @@ from ggslam.slam.filters.movers import MoverFilter
 from ggslam.slam.frame_locator import FrameLocator
 from ggslam.slam.frame_poses import FramePoses
 from ggslam.slam.joining import Joining
-from ggslam.slam.loop_closing import Correction
+from ggslam.slam.loop_results import Correction
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.map_parts import MapParts
 from ggslam.slam.map_removal import MapRemoval
@@ -62,6 +62,8 @@ class RunState:
         self.mapper, self.pager, self.loops = parts.mapper, parts.pager, parts.loops
         self.start_notes = [*parts.notes, *notes(modes_of(self.config, self.is_rig, parts.on_device), self.config)]
         """What the user should know before the first frame: what the settings chose, and what such runs leave out."""
+        self.end_notes = list[str]()
+        """What errors have kept from the result."""
         self.mapper.extra_loss = extra_loss
         self.policy = KeyframePolicy(self.config.keyframes)
         self.scale = 1.0
@@ -174,8 +176,34 @@ class RunState:
         self.filters.use_context(self.tracker.context)
 
     def end_joining(self) -> None:
-        """Waits for the newest keyframe, if it still joins what frames are aligned to."""
+        """Waits for the newest keyframe, if it still joins what frames are aligned to; raises what that raised."""
         self.joining.end()
+
+    def give_up_joining(self) -> None:
+        """The newest keyframe could not join what frames are aligned to: they see what that is without it."""
+        self.corrections.show_target()
+        self._complete_keyframes()
+
+    def _complete_keyframes(self) -> None:
+        """Where an error has kept keyframes of the map from surface and places, they are there without points and
+        features, so that the numbers of keyframes, and corrections of all of them, are the same everywhere."""
+        for keyframe in self.mapper.keyframes[len(self.surface) :]:
+            self.surface.add_unseen(keyframe.T_world_camera)
+        if self.loops is not None:
+            for keyframe in self.mapper.keyframes[len(self.loops) :]:
+                self.loops.add_unseen(keyframe)
+
+    def settle(self) -> None:
+        """What a step has left is done as far as it can be, for the end of a run or after an error: the newest keyframe
+        has joined, and everything has followed all corrections. What joining raises is noted, not raised: the error
+        that ended the run is known, and the result does not depend on this one."""
+        try:
+            self.end_joining()
+        except Exception as error:
+            self.end_notes.append(f"the newest keyframe did not join what frames are aligned to: {error!r}")
+        self._complete_keyframes()
+        self.follow_corrections()
+        self.poses.leave_missing(self.mapper.keyframes)
 
     def catch_up(self) -> list[np.ndarray]:
         """The newest keyframe has joined, if it was at it, and everything that knows a pose of the camera has followed;

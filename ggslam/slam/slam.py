@@ -28,15 +28,15 @@ from ggslam.scene.frame_checks import check_frame
 from ggslam.slam.filters.depth_edges import DepthEdges
 from ggslam.slam.frame_locator import Located
 from ggslam.slam.joining import JoiningTuning
-from ggslam.slam.loop_closing import Correction
+from ggslam.slam.loop_results import Correction
 from ggslam.slam.result import SlamResult, StepReport
 from ggslam.slam.run_end import refine, result_of
 from ggslam.slam.run_state import RunState
 from ggslam.slam.schedules import NewKeyframe
-from ggslam.system.opencv import opencv_errors
+from ggslam.system.opencv import opencv_errors, raise_as_ours
 from ggslam.system.process_memory import trim
 from ggslam.system.savable import savable
-from ggslam.system.spent import part
+from ggslam.system.spent import count_beside, part
 from ggslam.system.tuning import Tuning
 from ggslam.tracking.scale import scale_settings
 from ggslam.tracking.settings import DepthNoise
@@ -52,7 +52,7 @@ class TrimTuning(Tuning):
     """Keyframes between two calls that return freed memory. A call takes milliseconds."""
 
 
-@savable(not_saved="camera config context pager start_notes schedule joining", after="use_scale_again")
+@savable(not_saved="camera config context pager start_notes end_notes schedule joining", after="use_scale_again")
 class Slam(RunState):
     """Synchronous SLAM: each step tracks one frame, maybe makes a keyframe of it, and trains the map a fixed number
     of iterations. Deterministic for a given configuration and machine.
@@ -93,9 +93,8 @@ class Slam(RunState):
         """
         try:
             return self._step(frames)
-        except cv2.error:
-            with opencv_errors(f"frame {frames[0].index}"):
-                raise
+        except cv2.error as error:
+            raise_as_ours(error, f"frame {frames[0].index}")
 
     def _step(self, frames: Sequence[Frame]) -> list[StepReport]:
         start = time.perf_counter()
@@ -194,9 +193,13 @@ class Slam(RunState):
         tracking.points.read()  # what waits for the GPU is done in this thread
         noise = self.tracker.noise  # frames change it
 
+        @opencv_errors(f"frame {frame.index}")
         def join() -> Correction | None:
+            start = time.perf_counter()
             self.corrections.add_points(tracking)
-            return self._look_for_loop(frame, tracking, noise)
+            correction = self._look_for_loop(frame, tracking, noise)
+            self.times.beside += time.perf_counter() - start  # no other thread writes it
+            return correction
 
         def finish(correction: Correction | None) -> None:
             self.corrections.show_target()
@@ -207,7 +210,7 @@ class Slam(RunState):
         shown = 0.0 if self.tracker.target is None else tracking.overlap
         waits = shown < JoiningTuning.min_overlap or self.locator.part_start.target is not None
         self.corrections.hold_target()
-        self.joining.start(join, finish)
+        self.joining.start(count_beside(join, "mapping"), finish, self.give_up_joining)
         train()
         if waits:
             self.end_joining()
@@ -340,6 +343,6 @@ class Slam(RunState):
         return self.result()
 
     def result(self) -> SlamResult:
-        """What there is so far. The first call settles the objects: it is for the end."""
-        self.end_joining()
+        """What there is so far, also after an error. The first call settles the objects: it is for the end."""
+        self.settle()
         return result_of(self)

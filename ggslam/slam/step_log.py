@@ -32,9 +32,9 @@ COLUMNS = (
 )  # fmt: skip
 """frame: its index; end_s: when its step ended, seconds after the first one began; step_ms: how long the step took;
 *_ms: milliseconds spent in each part since the step before (in a real-time run also by the mapper's thread; loops are
-part of tracking or of the rest); iterations: of the mapper since then; keyframe: 0 or 1; gaussians of the map;
-resident_mb: resident memory of the process, 10^6 bytes; loss_*: means over their steps, see `LossSums`; NaN if
-there were none."""
+part of tracking or of the rest, on a GPU mostly beside both); iterations: of the mapper since then; keyframe: 0 or 1;
+gaussians of the map; resident_mb: resident memory of the process, 10^6 bytes; loss_*: means over their steps, see
+`LossSums`; NaN if there were none."""
 
 
 @savable(check="check")

@@ -40,11 +40,13 @@ class SideThread(Generic[Result]):
 
     def take(self) -> Result:
         """The result of the piece that was started; waits for it, and raises what it raised."""
-        work, self._work, self.is_asked = self._work, None, False
+        work = self._work
         assert work is not None
         if self._process != os.getpid():
+            self._work, self.is_asked = None, False
             return work()
         result, error = self._done.get()
+        self._work, self.is_asked = None, False  # not if waiting was interrupted: the result is still to be taken
         if error is not None:
             raise error
         return result  # type: ignore[return-value]

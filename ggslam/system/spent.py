@@ -7,17 +7,19 @@
             ...
 
 Whatever runs inside a part counts for that part and no other, so parts add up to the whole. `part` does nothing in a
-program, or a thread, that is not counted.
+program, or a thread, that is not counted. What another thread does beside the counted one has parts of its own
+(`count_beside`), which do not join that sum.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ContextDecorator, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, TypeVar
 
 from ggslam.system.energy import EnergyMeter
 
@@ -32,18 +34,11 @@ class Used:
     joules: float = 0.0
 
 
-class Spent:
-    """Counts what the parts use.
+class ThreadParts:
+    """Counts what the parts of one thread use, its own processor seconds alone and no joules."""
 
-    Attributes:
-        meter: where joules come from.
-
-    Args:
-        meter: see above.
-    """
-
-    def __init__(self, meter: EnergyMeter) -> None:
-        self.meter, self._parts = meter, dict[str, Used]()
+    def __init__(self) -> None:
+        self._parts = dict[str, Used]()
         self._open: list[str] = []
         self._last = (0.0, 0.0, 0.0)
 
@@ -54,14 +49,13 @@ class Spent:
         Args:
             rest: the part of what is in no other.
         """
-        with self.meter.watch():
-            self._last = self._now()
-            token = _COUNTED.set(self)
-            try:
-                with self.part(rest):
-                    yield
-            finally:
-                _COUNTED.reset(token)
+        self._last = self._now()
+        token = _COUNTED.set(self)
+        try:
+            with self.part(rest):
+                yield
+        finally:
+            _COUNTED.reset(token)
 
     @contextmanager
     def part(self, name: str, whole: bool = False) -> Iterator[None]:
@@ -93,11 +87,58 @@ class Spent:
             used.joules += now[2] - self._last[2]
         self._last = now
 
+    @cached_property
+    def beside(self) -> ThreadParts:
+        """What another thread uses beside this one, see `count_beside`; read it while that does nothing. Of this
+        thread's processor seconds and joules, if these are of the whole process or machine, it is a share."""
+        return ThreadParts()
+
+    def _now(self) -> tuple[float, float, float]:
+        """Seconds, processor seconds and joules so far."""
+        return time.perf_counter(), time.thread_time(), 0.0
+
+
+class Spent(ThreadParts):
+    """Counts what the parts use, whatever threads work meanwhile.
+
+    Attributes:
+        meter: where joules come from.
+
+    Args:
+        meter: see above.
+    """
+
+    def __init__(self, meter: EnergyMeter) -> None:
+        super().__init__()
+        self.meter = meter
+
+    @contextmanager
+    def count_parts(self, rest: str) -> Iterator[None]:
+        """See `ThreadParts`."""
+        with self.meter.watch(), super().count_parts(rest):
+            yield
+
     def _now(self) -> tuple[float, float, float]:
         return time.perf_counter(), time.process_time(), self.meter.joules() or 0.0
 
 
-_COUNTED: ContextVar[Spent | None] = ContextVar("counted", default=None)
+_COUNTED: ContextVar[ThreadParts | None] = ContextVar("counted", default=None)
+Result = TypeVar("Result")
+
+
+def count_beside(work: Callable[[], Result], rest: str) -> Callable[[], Result]:
+    """Work for another thread, one piece at a time, whose parts count for `ThreadParts.beside` of this thread, if it is
+    counted. `rest` is the part of what is in no other."""
+    counted = _COUNTED.get()
+    if counted is None:
+        return work
+    beside = counted.beside
+
+    def count() -> Result:
+        with beside.count_parts(rest):
+            return work()
+
+    return count
 
 
 class part(ContextDecorator):

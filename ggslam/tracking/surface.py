@@ -187,6 +187,10 @@ class MeasuredSurface:
         self._append(read.points.copy(), read.normals.copy(), np.array(T_world_camera, float))
         return self._join([number])
 
+    def add_unseen(self, T_world_camera: np.ndarray) -> None:
+        """Adds a keyframe [4, 4] without points; the target stays."""
+        self._append(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), T_world_camera)
+
     def _join(self, numbers: list[int]) -> GicpTarget:
         """These keyframes take part, too."""
         return self._note_joined(numbers, self._gather(self._parts_with_poses(numbers), self.target))

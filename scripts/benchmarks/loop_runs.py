@@ -21,7 +21,8 @@ from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
 from ggslam.sequences.sequence import Sequence
 from ggslam.slam.config import Config, load_config
-from ggslam.slam.loop_closing import Correction, LoopCloser
+from ggslam.slam.loop_closing import LoopCloser
+from ggslam.slam.loop_results import Correction
 from ggslam.slam.map_corrections import MapCorrections
 from ggslam.slam.slam import Slam
 

@@ -77,6 +77,7 @@ FAULTS = (
           ("tracking/test_still_pixels.py",)),
     Fault("joining", "ggslam/slam/joining.py", "self._step + STEPS_BESIDE + 1", "self._step + STEPS_BESIDE",
           ("slam/test_joining.py",)),
+    Fault("joining-failed", "ggslam/slam/joining.py", "under_way.give_up()", "pass", ("slam/test_joining_errors.py",)),
     Fault("rasterizer", "ggslam/native/src/rendering/kernels/tiles_backward.cpp",
           "weight = odds * t, G = odds * (t * dot - behind);", "weight = odds * t, G = odds * (t * dot + behind);",
           ("rendering/test_cpu_gradients.py",)),

@@ -21,7 +21,7 @@ from ggslam.scene.frame import Frame
 from ggslam.scene.poses import se3_exp
 from ggslam.sequences import open_sequence
 from ggslam.sequences.moving_pixels import MovingPixels
-from ggslam.slam.loop_closing import LoopEvent
+from ggslam.slam.loop_results import LoopEvent
 from ggslam.slam.result import StepReport, TrackedFrame
 from ggslam.volumes.maps import VolumeMaps
 from ggslam.volumes.mesh import extract_mesh

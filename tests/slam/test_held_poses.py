@@ -16,7 +16,8 @@ from ggslam.scene.poses import inverse, se3_exp
 from ggslam.sequences import open_sequence
 from ggslam.sequences.rig import RigSequence
 from ggslam.slam.config import load_config
-from ggslam.slam.loop_closing import Correction, LoopCloser
+from ggslam.slam.loop_closing import LoopCloser
+from ggslam.slam.loop_results import Correction
 from ggslam.slam.rig_slam import RigSlam
 from ggslam.slam.slam import Slam
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus

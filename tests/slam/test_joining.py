@@ -7,44 +7,26 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
+from joining_runs import start, there_and_back
 
-from ggslam.loops.activity import ActivitySettings
 from ggslam.scene.frame import Frame
-from ggslam.scene.poses import inverse, se3_exp
+from ggslam.scene.poses import se3_exp
 from ggslam.sequences import open_sequence
-from ggslam.slam.config import load_config
 from ggslam.slam.joining import Joining
 from ggslam.slam.loop_closing import LoopCloser
-from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.map_corrections import MapCorrections
-from ggslam.slam.schedules import BesideTraining
-from ggslam.slam.slam import Slam
+from ggslam.slam.relocalization import Relocalizer
 from ggslam.tracking.gicp import GicpTarget
-from ggslam.tracking.points import extract_points
-from ggslam.tracking.settings import DepthNoise
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
-
-CHEAP = ["mapping.iterations_per_frame=1", "mapping.first_frame_iterations=4", "identity.enabled=false",
-         "evaluation.held_out_every=0", "refine_iterations=2"]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def frames(room: Path) -> list[Frame]:
     return list(open_sequence(room, scale=0.5).stream())
-
-
-def start(frames: list[Frame], *settings: str, loops: LoopSettings | None = None) -> Slam:
-    config = load_config(None, [*CHEAP, *settings])
-    if loops is not None:
-        config = dataclasses.replace(config, loops=loops)
-    slam = Slam(frames[0].camera, config, has_masks=False)
-    slam.schedule = BesideTraining(nullcontext())
-    return slam
 
 
 class TestJoining:
@@ -56,13 +38,13 @@ class TestJoining:
             return "found"
 
         joining.begin_step()
-        joining.start(work, done.append)
+        joining.start(work, done.append, done.clear)
         joining.begin_step()
         assert joining.is_under_way and not done
         threading.Timer(0.05, may_end.set).start()
         joining.begin_step()
         assert done == ["found"] and not joining.is_under_way
-        joining.start(lambda: "at once", done.append)
+        joining.start(lambda: "at once", done.append, done.clear)
         time.sleep(0.05)
         joining.begin_step()
         assert done == ["found"]
@@ -72,12 +54,31 @@ class TestJoining:
         assert done == ["found", "at once"]
 
     def test_errors_are_raised_where_it_is_taken_over(self) -> None:
-        joining, done = Joining[float](), list[float]()
-        joining.start(lambda: 1 / 0, done.append)
+        joining, done, given_up = Joining[float](), list[float](), list[bool]()
+        joining.start(lambda: 1 / 0, done.append, lambda: given_up.append(True))
         joining.begin_step()
         with pytest.raises(ZeroDivisionError):
             joining.begin_step()
-        assert not joining.is_under_way and not done
+        assert not joining.is_under_way and not done and given_up == [True]
+        joining.end()
+        assert given_up == [True]
+
+    def test_interrupted_waiting_leaves_it_under_way(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        joining, done, given_up = Joining[str](), list[str](), list[bool]()
+        joining.start(lambda: "found", done.append, lambda: given_up.append(True))
+        queue = joining._thread._done
+
+        class Interrupted:
+            def get(self) -> None:
+                joining._thread._done = queue  # once
+                raise KeyboardInterrupt
+
+        joining._thread._done = Interrupted()  # type: ignore[assignment]
+        with pytest.raises(KeyboardInterrupt):
+            joining.end()
+        assert joining.is_under_way and not done and not given_up
+        joining.end()
+        assert done == ["found"] and not joining.is_under_way and not given_up
 
 
 def test_the_next_frame_is_aligned_to_what_there_was_before(frames: list[Frame]) -> None:
@@ -137,7 +138,7 @@ def test_a_lost_frame_goes_along_with_a_loop_that_is_closed_before_it_is_looked_
     track, apply, lost = slam.tracker.track, slam.corrections.apply, list[np.ndarray]()
     T_new_old, status = se3_exp(np.array([0.1, 0, 0, 0, 0.05, 0])), TrackingStatus.OK
 
-    def find(loops: LoopCloser, frame: Frame, tracking: TrackingResult) -> None:
+    def find(relocalizer: Relocalizer, frame: Frame, tracking: TrackingResult) -> None:
         lost.append(tracking.T_world_camera)
 
     def close(correction: object, loops: LoopCloser) -> None:
@@ -152,7 +153,7 @@ def test_a_lost_frame_goes_along_with_a_loop_that_is_closed_before_it_is_looked_
     with monkeypatch.context() as patch:
         patch.setattr(LoopCloser, "add", lambda *_: "a correction")
         patch.setattr(slam.corrections, "apply", close)
-        patch.setattr(LoopCloser, "find", find)
+        patch.setattr(Relocalizer, "find", find)
         slam.step(frames[2])
         assert slam.joining.is_under_way and not len(slam.corrections)
         status, before = TrackingStatus.LOST, slam.tracker.state.motion.T_world_camera.copy()
@@ -192,10 +193,10 @@ def test_a_lost_camera_is_looked_for_at_all_keyframes(frames: list[Frame], monke
     slam = start(frames, "keyframes.max_gap=1", "keyframes.min_overlap=0.01")
     known, track, status = list[int](), slam.tracker.track, TrackingStatus.OK
 
-    def find(loops: LoopCloser, *_: object) -> None:
-        known.append(len(loops))
+    def find(relocalizer: Relocalizer, *_: object) -> None:
+        known.append(len(relocalizer.loops))
 
-    monkeypatch.setattr(LoopCloser, "find", find)
+    monkeypatch.setattr(Relocalizer, "find", find)
     slam.tracker.track = lambda frame: dataclasses.replace(  # type: ignore[method-assign]
         track(frame), overlap=0.9, status=status
     )
@@ -207,37 +208,9 @@ def test_a_lost_camera_is_looked_for_at_all_keyframes(frames: list[Frame], monke
     assert known == [3] and not slam.joining.is_under_way
 
 
-class Drifting:
-    """Gives a run's tracker the true motion with drift."""
-
-    def __init__(self, slam: Slam, frames: list[Frame], drift: np.ndarray) -> None:
-        self.slam, self.step, self.T = slam, se3_exp(drift / len(frames)), np.eye(4)
-        self.before: Frame | None = None
-        slam.tracker.track = self.track  # type: ignore[method-assign]
-        slam.tracker.move = self.move  # type: ignore[method-assign]
-
-    def track(self, frame: Frame) -> TrackingResult:
-        if self.before is not None:
-            assert self.before.T_world_camera is not None
-            self.T = self.T @ inverse(self.before.T_world_camera) @ frame.T_world_camera @ self.step
-        self.before, slam = frame, self.slam
-        slam.tracker.noise = DepthNoise()
-        points = extract_points(frame.depth, slam.camera, slam.config.tracking.points, DepthNoise(), slam.context)
-        return TrackingResult(self.T.copy(), TrackingStatus.OK, 1.0, 0.0, "", points)
-
-    def move(self, T_new_old: np.ndarray) -> None:
-        self.T = T_new_old @ self.T
-
-
 @pytest.mark.parametrize("gap", [1, 2])
 def test_a_loop_that_is_found_beside_frames_moves_them_all(room: Path, gap: int) -> None:
-    frames = list(open_sequence(room).stream())
-    stride = 2 // gap
-    order = [*range(0, 24, stride), *range(22, -1, -stride)]
-    forgetful = LoopSettings(activity=ActivitySettings(forget_after=0.05, near=0.15, batch=1, spread=0))
-    walk = [dataclasses.replace(frames[i], index=k) for k, i in enumerate(order)]
-    slam = start(walk, f"keyframes.max_gap={gap}", "movers.enabled=false", loops=forgetful)
-    camera = Drifting(slam, walk, np.array([0.15, 0.06, -0.09, 0.0, np.radians(4), 0.0]))
+    slam, camera, walk = there_and_back(room, gap)
     for frame in walk:
         slam.step(frame)
     slam.end_joining()

@@ -16,7 +16,7 @@ from ggslam.objects.same_object import LabelledVoxels
 from ggslam.scene.frame import Frame
 from ggslam.sequences import open_sequence
 from ggslam.slam.config import load_config
-from ggslam.slam.loop_closing import LoopSettings
+from ggslam.slam.loop_settings import LoopSettings
 from ggslam.slam.object_masks import MaskSettings, ObjectMasks
 from ggslam.slam.slam import Slam
 

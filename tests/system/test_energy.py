@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from ggslam.system.energy import EnergyMeter, EnergyTuning
-from ggslam.system.spent import Spent, part
+from ggslam.system.side_thread import SideThread
+from ggslam.system.spent import Spent, count_beside, part
 from ggslam.system.tuning import overridden
 
 
@@ -261,6 +262,33 @@ def test_what_runs_side_by_side_is_one_part_and_other_threads_are_not_split(tmp_
         thread.join()
     used = spent.so_far()
     assert list(used) == ["rest", "both"] and used["both"].cpu_s >= took[0] + 0.9 * own and used["both"].joules == 0
+
+
+def test_what_another_thread_does_beside_is_counted_apart(tmp_path: Path) -> None:
+    spent = Spent(EnergyMeter(tmp_path))
+
+    def work() -> str:
+        with part("loops"):
+            burn(0.04)
+            time.sleep(0.03)
+        burn(0.02)
+        return "done"
+
+    assert count_beside(work, "mapping") is work  # nothing is counted
+    side = SideThread[str]("beside")
+    with spent.count_parts("rest"):
+        for _ in range(2):
+            side.start(count_beside(work, "mapping"))
+            with part("tracking"):
+                assert side.take() == "done"
+    used, beside = spent.so_far(), spent.beside.so_far()
+    assert list(used) == ["rest", "tracking"] and list(beside) == ["mapping", "loops"]
+    assert 0.08 <= beside["loops"].cpu_s < 0.14 <= beside["loops"].seconds and beside["mapping"].cpu_s >= 0.04
+    assert beside["loops"].seconds + beside["mapping"].seconds <= used["tracking"].seconds + used["rest"].seconds
+    assert used["tracking"].cpu_s >= 0.12  # of the whole process
+    side.start(count_beside(work, "mapping"))
+    side.take()
+    assert spent.beside.so_far() == beside
 
 
 def test_an_error_closes_its_part(tmp_path: Path) -> None:

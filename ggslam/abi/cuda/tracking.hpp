@@ -65,7 +65,7 @@ struct VoxelLevelJob {
   const std::int32_t* indices;      // [voxel_count] of their voxels, block by block
   const VoxelMoments* new_moments;  // [voxel_count] of their voxels, which get their shapes on the device; or null and
   const Voxel* new_voxels;          // [voxel_count] the voxels with their shapes
-  const VoxelSlot* old_slots;       // a smaller table, whose blocks move to that of the level; null: they are there
+  const VoxelSlot* old_slots;       // the one before, no larger, whose blocks move to the level's; null: they are there
   std::uint64_t old_mask;           // of that, as slot_mask
   VoxelLevel level;
   VoxelMoments* moments;            // of the level's voxels

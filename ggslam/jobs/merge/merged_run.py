@@ -44,7 +44,7 @@ _STACKED = (
     "loops_places_counts", "loops_places_descriptors", "loops_places_points", "loops_places_codes",
 )  # fmt: skip
 """Arrays of places.npz that do not change when runs are put behind one another."""
-_SUMS = ("wall_s", "tracking_s", "loops_s", "refinement_s", "checkpoints_s")
+_SUMS = ("wall_s", "tracking_s", "loops_s", "beside_s", "refinement_s", "checkpoints_s")
 _MAPPING_SUMS = ("insertion", "forward", "loss", "backward", "identity", "identity_finish", "iterations", "keyframes")
 
 

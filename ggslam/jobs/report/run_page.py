@@ -220,7 +220,19 @@ def _time(run: RunData) -> Html:
     ]  # fmt: skip
     listed = p.table(["stage", "seconds", "ms a frame", "%", ""], rows, text_columns=(4,))
     course = p.figures(time_plots([run])) if run.steps else p.tag("p", _NO_STEPS)
-    return p.join([bar, listed, *latency_part(run.timing), *_energy(run), course])
+    return p.join([bar, listed, *_beside(run), *latency_part(run.timing), *_energy(run), course])
+
+
+def _beside(run: RunData) -> list[Html]:
+    """What another thread did beside the stages, if one did."""
+    timing = run.timing
+    if timing is None or not timing.beside_s:
+        return []
+    words = (
+        f"Beside these stages another thread worked for {timing.beside_s:.2f} s: keyframes joined what frames are "
+        "aligned to, and loops were searched. The stages do not contain it."
+    )
+    return [p.tag("p", words, class_="note")]
 
 
 def _energy(run: RunData) -> list[Html]:
@@ -234,7 +246,14 @@ def _energy(run: RunData) -> list[Html]:
         [name, f"{used.seconds:.2f}", f"{used.cpu_s:.2f}", *[f"{used.joules or 0:.1f}" for _ in known]]
         for name, used in [*energy.parts.items(), ("in all", energy.whole)]
     ]
-    note = p.tag("p", f"{words} What is in one part is in no other.", class_="note")
+    rows += [
+        [f"{name}, beside the frames", f"{used.seconds:.2f}", f"{used.cpu_s:.2f}", *["-" for _ in known]]
+        for name, used in energy.beside.items()
+    ]
+    words += " What is in one part is in no other."
+    if energy.beside:
+        words += " What another thread did beside the frames is within what the parts used meanwhile."
+    note = p.tag("p", words, class_="note")
     return [note, p.table(["part", "seconds", "processor seconds", *known], rows)]
 
 

@@ -12,7 +12,7 @@ from ggslam.system.plurals import quantity
 
 
 class LoopEventRecord(Record):
-    """See `slam.loop_closing.LoopEvent`."""
+    """See `slam.loop_results.LoopEvent`."""
 
     kind: str
     frame: int

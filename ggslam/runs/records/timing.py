@@ -38,21 +38,25 @@ class UsedRecord(Record):
 
 class EnergyRecord(Record):
     """What a run used, in all and part by part: what is in one part is in no other. `source` says what was read (null:
-    nothing), `note` why nothing could be."""
+    nothing), `note` why nothing could be. `beside`: parts of another thread beside the frames; `cpu_s` is of that
+    thread alone, and within what the parts used meanwhile."""
 
     source: str | None = None
     note: str = ""
     whole: UsedRecord = UsedRecord()
     parts: dict[str, UsedRecord] = {}
+    beside: dict[str, UsedRecord] = {}
 
     @staticmethod
     def of_spent(spent: Spent) -> EnergyRecord:
         """Of what was counted so far."""
         known = bool(spent.meter.source)
         parts = {name: {**asdict(used), **({} if known else {"joules": None})} for name, used in spent.so_far().items()}
+        beside = {name: {**asdict(used), "joules": None} for name, used in spent.beside.so_far().items()}
         whole = {key: sum(used[key] for used in parts.values()) for key in ("seconds", "cpu_s", *["joules"][:known])}
         return EnergyRecord.of({
             "source": spent.meter.source or None, "note": spent.meter.note, "whole": whole, "parts": parts,
+            "beside": beside,
         })  # fmt: skip
 
     def text(self) -> str:
@@ -60,6 +64,9 @@ class EnergyRecord(Record):
         key, unit = ("cpu_s", "s") if self.source is None else ("joules", "J")
         words = ", ".join(f"{name} {used.number(key) or 0:.1f} {unit}" for name, used in self.parts.items())
         total = f"{self.whole.number(key) or 0:.1f} {unit}"
+        if self.beside:
+            beside = ", ".join(f"{name} {used.seconds:.1f} s" for name, used in self.beside.items())
+            words = f"{words}; in another thread beside the frames: {beside}"
         if self.source is None:
             return f"{self.note}; processor time {total}: {words}"
         return f"energy {total} ({self.source}, the whole machine): {words}"
@@ -137,9 +144,9 @@ SINCE: Final = {
 
 
 class TimingRecord(RecordFile):
-    """Seconds by part; see `slam.result.SlamTimes`. `peak_rss_mb` is in MB (10^6 bytes). Of a merged run they are the
-    sums over its runs, and `merge_s` says what merging took, `seam_iterations` the steps it made. `energy` is there
-    if it was asked for, `latency` of cameras and of runs in real time."""
+    """Seconds by part; see `slam.result.SlamTimes`, whose `beside` is `beside_s`. `peak_rss_mb` is in MB (10^6 bytes).
+    Of a merged run they are the sums over its runs, and `merge_s` says what merging took, `seam_iterations` the steps
+    it made. `energy` is there if it was asked for, `latency` of cameras and of runs in real time."""
 
     FILE: ClassVar[str] = "timing.json"
     frames: int = 0
@@ -148,6 +155,7 @@ class TimingRecord(RecordFile):
     wall_s: Number = 0.0
     tracking_s: Number = 0.0
     loops_s: Number = 0.0
+    beside_s: Number = 0.0
     refinement_s: Number = 0.0
     checkpoints_s: Number = 0.0
     checkpoints: int = 0
@@ -171,8 +179,8 @@ class TimingRecord(RecordFile):
         return TimingRecord.of({
             "frames": len(result.frames), "dropped_frames": result.dropped_frames,
             "frames_per_s": result.frames_per_second(),
-            "wall_s": t.wall, "tracking_s": t.tracking, "loops_s": t.loops, "refinement_s": t.refinement,
-            "checkpoints_s": t.checkpoints, "checkpoints": t.saved,
+            "wall_s": t.wall, "tracking_s": t.tracking, "loops_s": t.loops, "beside_s": t.beside,
+            "refinement_s": t.refinement, "checkpoints_s": t.checkpoints, "checkpoints": t.saved,
             "tracking_ms_per_frame": 1e3 * t.tracking / frames,
             "tracking_ms_per_100_frames": t.tracking_ms_by_window(), "mapping_ms_per_iteration": m.iteration_ms,
             "refine_iterations": result.refine_iterations, "mapping": asdict(m), "gaussians": result.gaussian_count,

@@ -129,7 +129,7 @@ class CudaTarget:
     def _send(self, staged: _Staged, voxel: float, job: TrackJob) -> None:
         """Starts to send what was staged, and sets the jobs that make the levels of it."""
         self._memory.use(not staged.changes.whole, job.fine, job.coarse)
-        self._upload.send(staged.out, staged.source)
+        self._upload.send_part(staged.source, staged.out)
         first, settings = self._memory.address, staged.settings
         for changes, made, size in (
             (staged.changes.fine, job.fine, np.float32(voxel)),
