@@ -41,12 +41,12 @@ GGSLAM_FORMULA void order_pair(double (&values)[3], double (&v)[3][3]) {
   }
 }
 
-// Eigenvalues, largest first, and unit eigenvectors (columns of v) by cyclic Jacobi rotations, until the squares off the
-// diagonal are `rest` of the squared trace.
-GGSLAM_FORMULA void eigen_symmetric3(const double (&packed)[6], double rest, double (&found)[3], double (&v)[3][3]) {
+// Eigenvalues, largest first, and unit eigenvectors (axes[i] belongs to values[i]) by cyclic Jacobi rotations, until the
+// squares off the diagonal are `rest` of the squared trace.
+template <class Number>
+GGSLAM_FORMULA void eigen_symmetric3(const Number (&packed)[6], double rest, Number (&values)[3], Number (&axes)[3][3]) {
   double a[3][3] = {{packed[0], packed[1], packed[2]}, {packed[1], packed[3], packed[4]}, {packed[2], packed[4], packed[5]}};
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) v[i][j] = i == j;
+  double v[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
   const double scale = a[0][0] + a[1][1] + a[2][2];
   for (int sweep = 0; sweep < 8; ++sweep) {
     const double off = a[0][1] * a[0][1] + a[0][2] * a[0][2] + a[1][2] * a[1][2];
@@ -55,21 +55,18 @@ GGSLAM_FORMULA void eigen_symmetric3(const double (&packed)[6], double rest, dou
     jacobi_rotation<0, 2>(a, v);
     jacobi_rotation<1, 2>(a, v);
   }
-  for (int i = 0; i < 3; ++i) found[i] = a[i][i];
+  double found[3] = {a[0][0], a[1][1], a[2][2]};
   order_pair<0, 1>(found, v);
   order_pair<1, 2>(found, v);
   order_pair<0, 1>(found, v);
+  for (int i = 0; i < 3; ++i) {
+    values[i] = static_cast<Number>(found[i]);
+    for (int j = 0; j < 3; ++j) axes[i][j] = static_cast<Number>(v[j][i]);
+  }
 }
 
-// The same for floats; axes[i] belongs to values[i].
 GGSLAM_FORMULA void eigen_symmetric3(const float (&packed)[6], float (&values)[3], float (&axes)[3][3]) {
-  double wide[6], found[3], v[3][3];
-  for (int k = 0; k < 6; ++k) wide[k] = packed[k];
-  eigen_symmetric3(wide, 1e-16, found, v);
-  for (int i = 0; i < 3; ++i) {
-    values[i] = static_cast<float>(found[i]);
-    for (int j = 0; j < 3; ++j) axes[i][j] = static_cast<float>(v[j][i]);
-  }
+  eigen_symmetric3(packed, 1e-16, values, axes);
 }
 
 // Regularised eigenvalues S' = S / median(S) (GS-ICP, equation 1; S are variances, largest first) with bounds that

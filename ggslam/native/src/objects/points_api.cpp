@@ -118,7 +118,7 @@ class PlaneFit {
         for (int b = a; b < 3; ++b, ++k) moments[k] += d[a] * d[b];
     }
     plain::eigen_symmetric3(moments, 0, values, axes);
-    normal_ = {{axes[0][2], axes[1][2], axes[2][2]}};
+    normal_ = {{axes[2][0], axes[2][1], axes[2][2]}};
     for (std::size_t i = 0; i < count_; ++i) away_[i] = std::fabs(dot(points_[i] - centre_, normal_));
   }
 
