@@ -322,9 +322,14 @@ class Mapper(ABC):
         """
         if len(T_new_old) != len(self.keyframes):
             raise ValueError(f"T_new_old: expected [{len(self.keyframes)}, 4, 4], found {list(np.shape(T_new_old))}")
-        move_with_keyframes(self.map, T_new_old)  # first: where memory is short this fails, and then nothing has moved
-        for keyframe, T in zip(self.keyframes, T_new_old, strict=True):
-            keyframe.T_camera_world = inverse(T @ keyframe.T_world_camera)
+        poses = self._poses_to_move()
+        move_with_keyframes(self.map, T_new_old)  # first: where memory is short it is this that fails
+        for keyframe, T, T_world_camera in zip(self.keyframes, T_new_old, poses, strict=True):
+            keyframe.T_camera_world = inverse(T @ T_world_camera)
+
+    def _poses_to_move(self) -> list[np.ndarray]:
+        """T_world_camera [4, 4] of each keyframe."""
+        return [keyframe.T_world_camera for keyframe in self.keyframes]
 
     def leave_out(self, numbers: set[int]) -> None:
         """Takes the Gaussians of some keyframes out of the map, which is all in memory, and trains on these no more."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -16,10 +17,12 @@ from ggslam.system.array_forms import Pose, check_indices
 from ggslam.system.savable import savable
 from ggslam.tracking.tracker import TrackingResult, TrackingStatus
 
+_LATEST: Final = 64
+"""Keyframes whose poses are remembered: more than ever wait for the mapper."""
 _NAMES = {status: status.value for status in TrackingStatus}  # asked for with every frame
 
 
-@savable(not_saved="_T_anchor_world", growing="frames", check="check", after="_invert_anchor")
+@savable(not_saved="_T_anchor_world _latest", growing="frames", check="check", after="_invert_anchor")
 class FramePoses:
     """Poses of the frames so far."""
 
@@ -31,6 +34,7 @@ class FramePoses:
         self.keyframes_made = 0
         """Keyframes so far, those included that still wait for the mapper."""
         self._anchor, self._T_world_anchor = -1, np.eye(4)  # number of a keyframe, its pose as tracked
+        self._latest: dict[int, np.ndarray] = {}  # poses as tracked, by number
         self._invert_anchor()
 
     def check(self) -> None:
@@ -41,6 +45,8 @@ class FramePoses:
     def add_keyframe(self, T_world_camera: np.ndarray) -> None:
         """From now on poses are remembered relative to this keyframe, the newest."""
         self.anchor_to(self.keyframes_made, T_world_camera)
+        self._latest[self.keyframes_made] = self._T_world_anchor
+        self._latest.pop(self.keyframes_made - _LATEST, None)
         self.keyframes_made += 1
 
     def anchor_to(self, keyframe: int, T_world_camera: np.ndarray) -> None:
@@ -56,6 +62,7 @@ class FramePoses:
     def move(self, T_new_old: np.ndarray) -> None:
         """The world about the camera was moved by a correction [4, 4]."""
         self._T_world_anchor = T_new_old @ self._T_world_anchor
+        self._latest = {number: T_new_old @ T for number, T in self._latest.items()}
         self._invert_anchor()
 
     def _invert_anchor(self) -> None:
@@ -82,17 +89,19 @@ class FramePoses:
         self.frames = [*self.frames[: len(self.frames) - count], *located]  # checkpoints know a list that only grows
 
     def leave_missing(self, keyframes: Sequence[Keyframe]) -> None:
-        """For the end: frames that hang on the newest keyframe hang on the last of these, if an error has kept that one
-        from them."""
-        last, missing = len(keyframes) - 1, self._anchor
-        if not 0 <= last < missing:
+        """For the end: frames that hang on keyframes that an error has kept from these hang on the last of these."""
+        last = len(keyframes) - 1
+        if not 0 <= last < self.keyframes_made - 1:
             return
-        T_last_missing = inverse(keyframes[last].T_world_camera) @ self._T_world_anchor
+        T_last_world = inverse(keyframes[last].T_world_camera)
+        T_last = {number: T_last_world @ T for number, T in self._latest.items() if number > last}
         self.frames = [
-            replace(frame, keyframe=last, T_keyframe_camera=T_last_missing @ frame.T_keyframe_camera)
-            if frame.keyframe == missing else frame for frame in self.frames
+            replace(frame, keyframe=last, T_keyframe_camera=T_last[frame.keyframe] @ frame.T_keyframe_camera)
+            if frame.keyframe in T_last else frame for frame in self.frames
         ]  # fmt: skip
-        self.anchor_to(last, keyframes[last].T_world_camera)
+        self.keyframes_made = last + 1
+        if self._anchor > last:
+            self.anchor_to(last, keyframes[last].T_world_camera)
 
     def as_tracked(self, frame: TrackedFrame) -> np.ndarray:
         """T_world_camera [4, 4] of a frame that was just added as tracked."""

@@ -200,7 +200,7 @@ class RunState:
         try:
             self.end_joining()
         except Exception as error:
-            self.end_notes.append(f"the newest keyframe did not join what frames are aligned to: {error!r}")
+            self.end_notes.append(f"the newest keyframe was not taken over as a whole: {error!r}")
         self._complete_keyframes()
         self.follow_corrections()
         self.poses.leave_missing(self.mapper.keyframes)

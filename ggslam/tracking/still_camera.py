@@ -92,8 +92,9 @@ class SmallFrame:
         """Makes `planes`, where grey values and depth were given."""
         if self.planes is None:
             self.planes = np.empty((5, *self.grey.shape), np.float32)
-            self.planes[3], self.planes[4], self.address = self.depth, self.grey, address(self.planes)
+            self.planes[3], self.planes[4] = self.depth, self.grey
             _fill_planes(self.planes)
+        self.address = address(self.planes)
 
 
 def _fill_planes(planes: np.ndarray) -> None:

@@ -207,6 +207,31 @@ def test_a_closed_loop_moves_map_and_keyframes(frames: list[Frame], cuda_library
     assert slam.map.count <= count
 
 
+def test_a_correction_without_memory_moves_nothing(
+    frames: list[Frame], cuda_library: CudaLibrary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = ["mapping.iterations_per_frame=1", "mapping.first_frame_iterations=2", "identity.enabled=false"]
+    slam = Slam(frames[0].camera, config("keyframes.max_gap=1", *few), has_masks=True, library=cuda_library)
+    for frame in frames[:3]:
+        slam.step(frame)
+    slam.end_joining()
+    T = np.tile(np.eye(4), (3, 1, 1))
+    T[:, 0, 3] = 0.5
+
+    def fail(*_: object) -> None:
+        raise MemoryError("no memory")
+
+    before, means = slam.mapper.latest_poses(3), slam.map.means.cpu().numpy().copy()
+    with monkeypatch.context() as patch:
+        patch.setattr("ggslam.mapping.mapper.move_with_keyframes", fail)
+        with pytest.raises(MemoryError):
+            slam.mapper.move_keyframes(T)
+    with pytest.raises(ValueError, match="T_new_old"):
+        slam.mapper.move_keyframes(T[:2])
+    assert np.array_equal(slam.mapper.latest_poses(3), before)
+    assert np.array_equal(slam.map.means.cpu().numpy(), means)
+
+
 @pytest.fixture
 def short_run(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRequest:
     """Of three frames; it stops at the second call of the mapper."""

@@ -129,7 +129,7 @@ def test_the_first_error_is_raised_and_the_other_noted(room: Path, monkeypatch: 
     assert slam.joining.is_under_way
     result = slam.result()
     (note,) = [note for note in result.notes if "InjectedError" in note]
-    assert note == "the newest keyframe did not join what frames are aligned to: InjectedError('add')"
+    assert note == "the newest keyframe was not taken over as a whole: InjectedError('add')"
     assert slam.result().notes.count(note) == 1
     assert len(slam.surface) == len(result.keyframes) == FAILING + 1
     assert max(distances(slam, camera).values()) < 0.015

@@ -26,7 +26,6 @@ from ggslam.mapping.cuda.keyframe_look import Explained, KeyframeLook
 from ggslam.mapping.cuda.look_memory import LookKind, LookMemory
 from ggslam.mapping.cuda.shown_gaussians import mark_shown
 from ggslam.mapping.cuda.training_mapper import TrainingMapper
-from ggslam.mapping.deformation import move_with_keyframes
 from ggslam.mapping.keyframe import Keyframe, make_keyframe
 from ggslam.mapping.labelling import Labeller
 from ggslam.mapping.pixel_grid import ALL_PIXELS, PixelGrid
@@ -83,11 +82,8 @@ class CudaMapper(TrainingMapper):
     def latest_poses(self, count: int) -> np.ndarray:
         return inverse(self._states.read_poses()[-count:])
 
-    def move_keyframes(self, T_new_old: np.ndarray) -> None:
-        old = self._states.read_poses()
-        for keyframe, T, pose in zip(self.keyframes, T_new_old, old, strict=True):
-            keyframe.T_camera_world = inverse(T @ inverse(pose))
-        move_with_keyframes(self.map, T_new_old)
+    def _poses_to_move(self) -> list[np.ndarray]:
+        return list(map(inverse, self._states.read_poses()))
 
     # --- growth ------------------------------------------------------------------------------------------------------
 
