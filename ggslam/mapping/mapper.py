@@ -309,7 +309,7 @@ class Mapper(ABC):
 
     def latest_poses(self, count: int) -> np.ndarray:
         """T_world_camera of the latest keyframes, so many or all there are, float64 [n, 4, 4], as refined so far."""
-        return inverse(np.array([keyframe.T_camera_world for keyframe in self.keyframes[-count:]]))
+        return inverse(np.array([keyframe.T_camera_world for keyframe in self.keyframes[-count:]]).reshape(-1, 4, 4))
 
     def move_keyframes(self, T_new_old: np.ndarray) -> None:
         """Moves keyframes, and with each the Gaussians that it inserted.
@@ -322,14 +322,10 @@ class Mapper(ABC):
         """
         if len(T_new_old) != len(self.keyframes):
             raise ValueError(f"T_new_old: expected [{len(self.keyframes)}, 4, 4], found {list(np.shape(T_new_old))}")
-        poses = self._poses_to_move()
+        poses = self.latest_poses(len(self.keyframes))
         move_with_keyframes(self.map, T_new_old)  # first: where memory is short it is this that fails
         for keyframe, T, T_world_camera in zip(self.keyframes, T_new_old, poses, strict=True):
             keyframe.T_camera_world = inverse(T @ T_world_camera)
-
-    def _poses_to_move(self) -> list[np.ndarray]:
-        """T_world_camera [4, 4] of each keyframe."""
-        return [keyframe.T_world_camera for keyframe in self.keyframes]
 
     def leave_out(self, numbers: set[int]) -> None:
         """Takes the Gaussians of some keyframes out of the map, which is all in memory, and trains on these no more."""

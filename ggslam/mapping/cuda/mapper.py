@@ -82,9 +82,6 @@ class CudaMapper(TrainingMapper):
     def latest_poses(self, count: int) -> np.ndarray:
         return inverse(self._states.read_poses()[-count:])
 
-    def _poses_to_move(self) -> list[np.ndarray]:
-        return list(map(inverse, self._states.read_poses()))
-
     # --- growth ------------------------------------------------------------------------------------------------------
 
     def _new_keyframe(self, frame: Frame, T_world_camera: np.ndarray) -> CudaKeyframe:
